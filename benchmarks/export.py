@@ -35,8 +35,8 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.episode.episode import EpisodeInfo, Frame, Outcome
-from demorec.mcap import EpisodeWriter
+from demorec.episode.episode import Frame, Outcome, SimulatedInfo
+from demorec.mcap import SimulatedWriter
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -89,7 +89,7 @@ def scene_pictures(frames: int, width: int, height: int, seed: int) -> list[NDAr
     return result
 
 
-def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
+def made_up(pictures: Pictures, episode: int) -> tuple[SimulatedInfo, list[Frame], Outcome]:
     """An episode of made-up numbers and the given pictures."""
     from support.recording import make_episode
 
@@ -108,9 +108,9 @@ def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame],
     return replace(info, scene=replace(info.scene, cameras=cameras)), frames, outcome
 
 
-def record(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
+def record(path: Path, episode: tuple[SimulatedInfo, list[Frame], Outcome]) -> None:
     info, frames, outcome = episode
-    with EpisodeWriter(path, info) as writer:
+    with SimulatedWriter(path, info) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

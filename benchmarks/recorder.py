@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from demorec import Recorder
 from demorec.core.config import VideoConfig
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 
 HEIGHT, WIDTH = 480, 640
 NUM_PICTURES = 64
@@ -87,7 +87,7 @@ def lost_seconds(folder: Path, args: argparse.Namespace) -> float:
         last = max([last, *map(int, victim.stdout)])
     with Recorder(folder, robot="any", fps=args.hz, task="measure") as recorder:
         (kept,) = recorder.recovered
-    with CollectedRecording(kept) as recording:
+    with Recording(kept) as recording:
         there = float(recording.columns().features["observation.state"][-1, 0])
     return (last - there) / float(args.hz)
 

@@ -3,7 +3,7 @@
     python benchmarks/recording.py [--episodes 3] [--size 224] [--renderer raster]
 
 Every stage of every episode is measured in the same run, in CPU time of this process; the recorder's share is what
-`EpisodeWriter` takes less its video encoders. Bytes are those of the same episode recorded in several ways, against
+`SimulatedWriter` takes less its video encoders. Bytes are those of the same episode recorded in several ways, against
 raw pictures and float64 numbers.
 """
 
@@ -20,9 +20,9 @@ import numpy as np
 
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.core.geometry import Array
-from demorec.episode.episode import CameraImages, EpisodeInfo, Frame, Outcome
+from demorec.episode.episode import CameraImages, Frame, Outcome, SimulatedInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.mcap import EpisodeWriter, video
+from demorec.mcap import SimulatedWriter, video
 from demorec.render import Renderer, RenderSetup
 
 WAYS = [VideoConfig(codec=codec, gop=gop) for codec in ("h264", "av1") for gop in (2, 10, 30)]
@@ -91,13 +91,13 @@ def timed_encoders(clock: Clock) -> None:
 
 def measure(
     plan: EpisodePlan, folder: Path, clock: Clock, kept: list[Frame] | None = None
-) -> tuple[EpisodeInfo, Outcome]:
+) -> tuple[SimulatedInfo, Outcome]:
     """Simulate, draw and record one episode; its frames are kept in `kept` where that is given."""
     episode = prepare(plan)
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
         session = Session.of_episode(world, episode, TimedRenderer(renderer, clock) if renderer else None)
         path = folder / f"{plan.episode_index}.mcap"
-        with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
+        with SimulatedWriter(path, episode.info, video=plan.config.video) as writer:
             iterator = session.run(ScriptAgent(episode))
             while True:
                 with clock.stage("simulation"):
@@ -166,7 +166,7 @@ def main() -> None:
         )
         for way in [*WAYS, VideoConfig(codec="jpeg")] if frames[0].images else [VideoConfig()]:
             clock.seconds.clear()
-            with EpisodeWriter(folder / f"{way.codec}-{way.gop}.mcap", info, video=way) as writer:
+            with SimulatedWriter(folder / f"{way.codec}-{way.gop}.mcap", info, video=way) as writer:
                 for frame in frames:
                     writer.write(frame)
                 stats = writer.finish(outcome)
@@ -181,10 +181,10 @@ def main() -> None:
 
 def psnr(path: Path, frames: list[Frame]) -> float:
     """Of the decoded pictures, all cameras together."""
-    from demorec.mcap import Recording
+    from demorec.mcap import SimulatedRecording
 
     errors = []
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         for camera in recording.cameras:
             for frame, picture in zip(frames, recording.images(camera), strict=True):
                 errors.append(np.mean((picture.astype(np.float64) - frame.images[camera].color) ** 2))

@@ -25,7 +25,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import RenderError
 from demorec.core.geometry import Array, Pose
 from demorec.core.tables import RENDERERS
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.render import Renderer
 from demorec.render.painter import Painter
@@ -69,7 +69,7 @@ def run_episode(world: World, episode: Episode) -> list[State]:
 
 
 def painter_for(
-    renderer: Renderer, world: World, cameras: tuple[Camera, ...], *, antialias: bool, everything: bool
+    renderer: Renderer, world: World, cameras: tuple[SceneCamera, ...], *, antialias: bool, everything: bool
 ) -> Painter:
     painter = Painter(renderer, cameras, depth=everything, segmentation=everything, antialias=antialias)
     painter.setup(world)

@@ -20,7 +20,7 @@ from pathlib import Path
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.render.warm import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
@@ -29,7 +29,7 @@ from demorec.replay.rerender import RerenderOptions, rerender
 def generate(path: Path, config: GenerateConfig, index: int, workshop: Workshop) -> None:
     episode = prepare(EpisodePlan(config=config, episode_index=index))
     world, renderer = workshop.equip(episode.info)
-    with EpisodeWriter(path, episode.info, video=config.video) as writer:
+    with SimulatedWriter(path, episode.info, video=config.video) as writer:
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
@@ -69,7 +69,7 @@ def main() -> None:
             [(replayed, _)] = replay_all([open_file(path, ReplayOptions())], ReplayOptions())
             timed("replay", start)
             identical += replayed.is_identical
-            with Recording(path) as recording:
+            with SimulatedRecording(path) as recording:
                 simulated += recording.num_frames / recording.info.fps
         config = GenerateConfig(
             task=arguments.task, cameras=("front", "wrist"), width=arguments.size, height=arguments.size
@@ -98,7 +98,7 @@ def main() -> None:
                 start = time.process_time()
                 check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=pictures))
                 timed("check with pictures" if pictures else "check, not decoding", start)
-            with Recording(path) as recording:
+            with SimulatedRecording(path) as recording:
                 filmed += recording.num_frames / recording.info.fps
     count = arguments.episodes
     print(f"{identical} of {count} replays identical to the bit, {same_pictures} of {arguments.pictures} drawings")

@@ -24,7 +24,7 @@ from demorec.core.errors import ConfigError, SceneError
 from demorec.core.registry import check_choice
 from demorec.core.tables import CAMERAS, TASKS, environment_name
 from demorec.episode import features
-from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, EpisodeInfo, Frame, Observation, SuccessCheck
+from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SimulatedInfo, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import ObservationRows
@@ -179,7 +179,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return {name: _KEYS[name] for name in self._vector_lengths}
 
     @property
-    def info(self) -> EpisodeInfo:
+    def info(self) -> SimulatedInfo:
         """Of the present episode."""
         return self.episode.info
 
@@ -336,12 +336,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return observation
 
 
-def _lengths(info: EpisodeInfo, *, privileged: bool, state: StateKind = "joint") -> dict[str, int]:
+def _lengths(info: SimulatedInfo, *, privileged: bool, state: StateKind = "joint") -> dict[str, int]:
     names = features.observation_names(info.robot, info.scene, privileged=privileged, state=state)
     return {name: len(components) for name, components in names.items()}
 
 
-def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
+def _observation_space(info: SimulatedInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
     found: dict[str, spaces.Space[Any]] = {
         _KEYS[name]: spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         for name, length in vector_lengths.items()

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.episode.scene import Camera
-from demorec.mcap import Recording
+from demorec.episode.scene import SceneCamera
+from demorec.mcap import SimulatedRecording
 
 MIN_PIXELS = 10
 """Pixels below which a thing is too hidden, or too far, to be spoken of."""
@@ -53,7 +53,7 @@ class Seen:
         return int(self._labels[y, x]) == self._label
 
 
-def spoken_bodies(recording: Recording) -> tuple[str, ...]:
+def spoken_bodies(recording: SimulatedRecording) -> tuple[str, ...]:
     """Names of the bodies that are spoken of in pictures: all but what only carries the scene."""
     return tuple(body.name for body in recording.info.scene.bodies if body.role in ("object", "target", "distractor"))
 
@@ -62,7 +62,7 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
     """Name -> what a picture shows of it; things that no pixel shows are left out.
 
     Args:
-        labels: (H, W) as of `Recording.segmentation_at`.
+        labels: (H, W) as of `SimulatedRecording.segmentation_at`.
         numbers: Name of a body -> its label.
     """
     counts = {name: int(np.count_nonzero(labels == number)) for name, number in numbers.items()}
@@ -73,7 +73,7 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
     }
 
 
-def body_labels(recording: Recording) -> dict[str, int]:
+def body_labels(recording: SimulatedRecording) -> dict[str, int]:
     """Name of each body that is spoken of -> its label in the segmentation pictures.
 
     Raises:
@@ -83,7 +83,7 @@ def body_labels(recording: Recording) -> dict[str, int]:
     return {name: label for label, name in recording.segment_labels().items() if name in spoken}
 
 
-def project(camera: Camera, world_from_camera: Array, points: Array) -> Array:
+def project(camera: SceneCamera, world_from_camera: Array, points: Array) -> Array:
     """(N, 2) where points in the world, (N, 3) metres, are in a picture, px; NaN for those behind the camera.
 
     Args:
@@ -94,7 +94,7 @@ def project(camera: Camera, world_from_camera: Array, points: Array) -> Array:
     return np.asarray(project_each(camera, world_from_camera[np.newaxis], points[np.newaxis])[0])
 
 
-def project_each(camera: Camera, world_from_camera: Array, points: Array) -> Array:
+def project_each(camera: SceneCamera, world_from_camera: Array, points: Array) -> Array:
     """(T, N, 2) the same of T moments at once: poses (T, 7), points (T, N, 3)."""
     x, y, z, w = (world_from_camera[:, index, np.newaxis] for index in range(3, 7))
     # Of the conjugate quaternion; sums written out, as in demorec.core.geometry, and to the same bit.
@@ -114,7 +114,7 @@ def project_each(camera: Camera, world_from_camera: Array, points: Array) -> Arr
     return np.stack([k[0, 0] * seen[0] / depth + k[0, 2], k[1, 1] * seen[1] / depth + k[1, 2]], axis=-1)
 
 
-def pixels_of(camera: Camera, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def pixels_of(camera: SceneCamera, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The pixels that contain points (..., 2) px, and whether they are in the picture at all; (0, 0) where not."""
     x, y = points[..., 0], points[..., 1]
     # NaN is not inside either.

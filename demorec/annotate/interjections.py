@@ -9,8 +9,8 @@ import numpy as np
 
 from demorec.annotate.referring import phrases_for
 from demorec.annotate.situation import Surroundings
-from demorec.episode.episode import INTERJECTION_EVENT, EpisodeColumns
-from demorec.mcap import Recording
+from demorec.episode.episode import INTERJECTION_EVENT, SimulatedColumns
+from demorec.mcap import SimulatedRecording
 
 _SAID = (
     "No, {wanted} is meant.",
@@ -46,7 +46,7 @@ class Correction:
     mistaken: str
 
 
-def correction_of(recording: Recording, columns: EpisodeColumns) -> Correction | None:
+def correction_of(recording: SimulatedRecording, columns: SimulatedColumns) -> Correction | None:
     """The interjection of a recording; None without one.
 
     Raises:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from demorec.annotate.grounding import body_labels, project, seen_things
 from demorec.annotate.situation import nouns_of
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import EpisodeColumns
-from demorec.episode.scene import Camera, Shape
-from demorec.mcap import Recording
+from demorec.episode.episode import SimulatedColumns
+from demorec.episode.scene import SceneCamera, Shape
+from demorec.mcap import SimulatedRecording
 
 _ROUND = 48
 """Points on the rim of what is round."""
@@ -47,7 +47,7 @@ class SeenObject:
 
 
 def seen_objects(
-    recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], camera: Camera
+    recording: SimulatedRecording, columns: SimulatedColumns, rows: NDArray[np.intp], camera: SceneCamera
 ) -> Iterator[SeenObject]:
     """Everything that a camera with segmentation sees in the given frames, row by row.
 
@@ -99,7 +99,7 @@ def run_lengths(pixels: NDArray[np.intp], size: int) -> tuple[int, ...]:
     return tuple([*lengths, size - int(ends[-1])] if ends[-1] < size else lengths)
 
 
-def outline_area(camera: Camera, world_from_camera: Array, shape: Shape, world_from_body: Array) -> float | None:
+def outline_area(camera: SceneCamera, world_from_camera: Array, shape: Shape, world_from_body: Array) -> float | None:
     """Area, px, of the whole outline of a convex body, as if nothing hid it and the picture went on for ever.
 
     None for a mesh or a URDF, and for a body that is not wholly before the camera.

@@ -19,9 +19,9 @@ from demorec.annotate.tries import Story, story_of
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
-from demorec.episode.episode import MISTAKEN_PHASE, EpisodeColumns
+from demorec.episode.episode import MISTAKEN_PHASE, SimulatedColumns
 from demorec.episode.scene import Scene
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +44,8 @@ class Statement:
 
 
 def narrate(
-    recording: Recording,
-    columns: EpisodeColumns,
+    recording: SimulatedRecording,
+    columns: SimulatedColumns,
     rows: NDArray[np.intp],
     kinds: Collection[LanguageKind],
     cameras: Sequence[str] = (),
@@ -85,7 +85,9 @@ def narrate(
 class _Told:
     """The sentences of one episode, kind by kind."""
 
-    def __init__(self, recording: Recording, columns: EpisodeColumns, rows: NDArray[np.intp], story: Story) -> None:
+    def __init__(
+        self, recording: SimulatedRecording, columns: SimulatedColumns, rows: NDArray[np.intp], story: Story
+    ) -> None:
         self._recording = recording
         self._info, self._columns, self._rows, self._story = recording.info, columns, rows, story
         self._scene: Scene = recording.info.scene

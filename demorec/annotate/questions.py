@@ -19,9 +19,9 @@ from demorec.annotate.grounding import MIN_PIXELS, Seen, body_labels, pixels_of,
 from demorec.annotate.referring import each_phrase
 from demorec.annotate.situation import NamedThing, Situations, Surroundings
 from demorec.core.geometry import Array
-from demorec.episode.episode import EpisodeColumns
-from demorec.episode.scene import Camera
-from demorec.mcap import Recording
+from demorec.episode.episode import SimulatedColumns
+from demorec.episode.scene import SceneCamera
+from demorec.mcap import SimulatedRecording
 
 ANSWERS = {
     "bbox": {"detections"},
@@ -87,7 +87,7 @@ class _Moment:
 class _View:
     """One picture with all that is known of it; `middles` are where those of the things are in it, px."""
 
-    camera: Camera
+    camera: SceneCamera
     seen: dict[str, Seen]
     moment: _Moment
     middles: dict[str, Array]
@@ -110,8 +110,8 @@ def asked_rows(num_rows: int, fps: int) -> dict[int, int]:
 
 
 def questions(
-    recording: Recording,
-    columns: EpisodeColumns,
+    recording: SimulatedRecording,
+    columns: SimulatedColumns,
     rows: NDArray[np.intp],
     cameras: Sequence[str],
     asked: Mapping[int, int],
@@ -264,8 +264,8 @@ _KINDS: tuple[Callable[[_View, int], tuple[str, dict[str, Any]] | None], ...] = 
 
 
 def traces(
-    recording: Recording,
-    columns: EpisodeColumns,
+    recording: SimulatedRecording,
+    columns: SimulatedColumns,
     rows: NDArray[np.intp],
     cameras: Sequence[str],
     asked: Mapping[int, int],

@@ -14,9 +14,9 @@ import numpy as np
 
 from demorec.annotate.interjections import Correction, correction_of
 from demorec.core.geometry import Pose
-from demorec.episode.episode import EpisodeColumns
+from demorec.episode.episode import SimulatedColumns
 from demorec.episode.scene import Goal, Scene
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 
 TryEnd = Literal["placed", "missed", "dropped", "misplaced", "unfinished"]
 _TROUBLE: dict[str, TryEnd] = {"miss": "missed", "drop": "dropped"}
@@ -82,7 +82,7 @@ class Story:
         return "release" in phases and "lower" not in phases and "carry" in phases
 
 
-def story_of(recording: Recording, columns: EpisodeColumns) -> Story:
+def story_of(recording: SimulatedRecording, columns: SimulatedColumns) -> Story:
     """Tries and stretches of a recording.
 
     A try begins where the script announced a grasp; a recording without such events is one try at its only goal.
@@ -108,7 +108,7 @@ def story_of(recording: Recording, columns: EpisodeColumns) -> Story:
     return Story(tries=tuple(tries), stretches=tuple(stretches), correction=correction_of(recording, columns))
 
 
-def _tries(recording: Recording, columns: EpisodeColumns, scene: Scene) -> list[Try]:
+def _tries(recording: SimulatedRecording, columns: SimulatedColumns, scene: Scene) -> list[Try]:
     tries: list[Try] = []
     for time_ns, event in recording.events():
         frame = int(np.searchsorted(columns.time_ns, time_ns))
@@ -147,7 +147,7 @@ def _goal_of(name: str, goals: Sequence[Goal], first: int) -> int | None:
     return next((index for index in range(first, len(goals)) if goals[index].object == name), None)
 
 
-def _lies_at(goal: Goal, scene: Scene, columns: EpisodeColumns) -> bool:
+def _lies_at(goal: Goal, scene: Scene, columns: SimulatedColumns) -> bool:
     """Whether the object is at its goal in the last frame, seen from above."""
     onto = columns.object_poses.get(goal.onto)
     if onto is not None:

@@ -243,7 +243,7 @@ alignment_check = partial(check, group="alignment")
 calibration_check = partial(check, group="calibration")
 picture_check = partial(check, group="pictures", needs_pictures=True)
 outcome_check = partial(check, group="outcome")
-collected_check = partial(check, scope="collected")
+external_check = partial(check, scope="collected")
 run_check = partial(check, group="run", scope="run")
 dataset_check = partial(check, group="dataset", scope="dataset")
 

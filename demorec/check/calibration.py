@@ -25,7 +25,7 @@ from demorec.check.rows import displacement, matrices
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.episode.camera_error import told_error
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.mcap import channels
 
 UNRELATED = 16.0
@@ -77,7 +77,7 @@ def extrinsics(episode: CheckedEpisode) -> Iterator[Found]:
         yield worst_frame(off, f"camera {camera.name}")
 
 
-def _expected(episode: CheckedEpisode, camera: Camera) -> Array:
+def _expected(episode: CheckedEpisode, camera: SceneCamera) -> Array:
     mounted = camera.mount_from_camera.matrix()[None]
     if camera.mount == "world":
         return np.broadcast_to(mounted, (episode.num_frames, 4, 4))
@@ -89,7 +89,7 @@ def _expected(episode: CheckedEpisode, camera: Camera) -> Array:
         return np.full((episode.num_frames, 4, 4), np.inf)
 
 
-def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
+def _allowance(episode: CheckedEpisode, camera: SceneCamera) -> float:
     """By how much pictures may be shifted, of their height: older recordings do not tell how they are turned."""
     if told_error(camera.name, episode.info.behaviour) is not None:
         return 0.0
@@ -109,7 +109,7 @@ def _allowance(episode: CheckedEpisode, camera: Camera) -> float:
     ),
 )
 @of_each_camera
-def projection(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
+def projection(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
     """Recorded poses, projected with K and extrinsics, fall where the picture has them.
 
     The pictures are drawn anew from joints, objects, K and mounts, and the shift that fits best is measured over all
@@ -136,7 +136,7 @@ def projection(episode: CheckedEpisode, camera: Camera, compared: PictureCompari
     ),
 )
 @of_each_camera
-def projected_size(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
+def projected_size(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
     """Things are as large in the picture as their distance and K make them: catches a wrong focal length or scale."""
     told = float(episode.recording.calibration(camera.name).intrinsics[1, 1] / camera.intrinsics[1, 1])
     size = (1 + compared.scale) / told

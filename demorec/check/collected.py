@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, collected_check, worst_frame
+from demorec.check.base import Found, Measurement, NotMeasured, check, external_check, worst_frame
 from demorec.check.file import complete
-from demorec.episode.collected import COLLECTED_VERSION, NO_PICTURE
-from demorec.mcap import CollectedRecording
+from demorec.episode.external import COLLECTED_VERSION, NO_PICTURE
+from demorec.mcap import Recording
 from demorec.mcap.container import Container
 from demorec.mcap.external.streams import SUBTASK
 from demorec.mcap.video import decode
-from demorec.runs.collected import load_collected_run
+from demorec.runs.external import load_external_run
 from demorec.runs.run_file import EPISODES, sha256_of
 
 NOT_APPLICABLE = "not applicable: the episode was collected, and this needs the scene of a simulated one"
@@ -32,22 +32,22 @@ _STILL_FRAMES = 20
 """Of an episode with fewer frames nobody can tell a stuck sensor from a still robot."""
 
 
-@collected_check(
+@external_check(
     group="file",
     measures="collected episodes that cannot be opened (index, metadata, format version)",
     reads=("metadata demorec.collected",),
 )
-def collected_opens(recording: CollectedRecording) -> Measurement:
+def collected_opens(recording: Recording) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
     return Measurement(value=0, detail=f"format {recording.info.format_version} of {COLLECTED_VERSION}")
 
 
-@collected_check(
+@external_check(
     group="file",
     measures="topics whose message count differs from the index; every chunk passes its CRC",
     reads=("metadata demorec.collected",),
 )
-def collected_checksums(recording: CollectedRecording) -> Measurement:
+def collected_checksums(recording: Recording) -> Measurement:
     """Every byte that holds a message passes its checksum, and the index counts the messages right."""
     with closing(Container(recording.path)) as container:
         counts = Counter(message.topic for message in container.messages(tuple(container.channels)))
@@ -55,12 +55,12 @@ def collected_checksums(recording: CollectedRecording) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{sum(counts.values())} messages")
 
 
-@collected_check(
+@external_check(
     group="file",
     measures="streams that do not decode into numbers, or into words",
     reads=("/frames", "/{feature}", SUBTASK),
 )
-def collected_readable(recording: CollectedRecording) -> Measurement:
+def collected_readable(recording: Recording) -> Measurement:
     """Every message has the layout that the metadata promises, at its frame's time."""
     said = f", {len(recording.subtasks)} subtasks" if recording.subtasks else ""
     return Measurement(value=0, detail=f"{recording.columns().num_frames} frames{said}")
@@ -69,13 +69,13 @@ def collected_readable(recording: CollectedRecording) -> Measurement:
 collected_complete = replace(complete, name="collected_complete", scope="collected")
 
 
-@collected_check(
+@external_check(
     group="time",
     measures="frames and pictures that were dropped while recording",
     fail=float("inf"),
     reads=("metadata demorec.outcome",),
 )
-def collected_drops(recording: CollectedRecording) -> Found:
+def collected_drops(recording: Recording) -> Found:
     """What came could be taken."""
     outcome = recording.outcome
     if outcome is None:
@@ -84,14 +84,14 @@ def collected_drops(recording: CollectedRecording) -> Found:
     return Measurement(value=sum(outcome.drops.values()), detail=lost)
 
 
-@collected_check(
+@external_check(
     group="time",
     measures="how much the frames' mean rate differs from the nominal one, as a share of it",
     warn=0.05,
     fail=0.5,
     reads=("/frames",),
 )
-def collected_rate(recording: CollectedRecording) -> Found:
+def collected_rate(recording: Recording) -> Found:
     """The frames came at the rate that the episode names, by which datasets and policies go."""
     times, fps = recording.columns().time_ns, recording.info.fps
     if len(times) < 2:
@@ -100,14 +100,14 @@ def collected_rate(recording: CollectedRecording) -> Found:
     return Measurement(value=abs(rate / fps - 1), detail=f"{rate:.4g} Hz instead of {fps} Hz")
 
 
-@collected_check(
+@external_check(
     group="time",
     measures="the longest time between two frames, in nominal periods",
     warn=2.5,
     fail=30,
     reads=("/frames",),
 )
-def collected_gaps(recording: CollectedRecording) -> Found:
+def collected_gaps(recording: Recording) -> Found:
     """No frames are missing between others."""
     steps = np.diff(recording.columns().time_ns)
     if not len(steps):
@@ -117,7 +117,7 @@ def collected_gaps(recording: CollectedRecording) -> Found:
     return Measurement(value=periods, frame=frame + 1, detail=f"{steps[frame] / 1e6:.4g} ms after the frame before")
 
 
-@collected_check(
+@external_check(
     group="alignment",
     unit="s",
     measures="the largest distance between the stamps of a frame and of a sample that it holds",
@@ -125,14 +125,14 @@ def collected_gaps(recording: CollectedRecording) -> Found:
     fail=1.0,
     reads=("/frames",),
 )
-def collected_sample_age(recording: CollectedRecording) -> Iterator[Found]:
+def collected_sample_age(recording: Recording) -> Iterator[Found]:
     """What a frame holds was sensed at about its time."""
     columns = recording.columns()
     for name in columns.stamps:
         yield worst_frame(np.abs(columns.age_ns(name)) / _NANOSECONDS, name)
 
 
-@collected_check(
+@external_check(
     group="alignment",
     unit="s",
     measures="the largest distance between the stamps of a frame and of a picture that it holds",
@@ -140,7 +140,7 @@ def collected_sample_age(recording: CollectedRecording) -> Iterator[Found]:
     fail=1.0,
     reads=("/frames", "/camera/{camera}/h264"),
 )
-def collected_picture_age(recording: CollectedRecording) -> Iterator[Found]:
+def collected_picture_age(recording: Recording) -> Iterator[Found]:
     """The pictures that a frame holds were taken at about its time."""
     columns = recording.columns()
     for camera, numbers in columns.pictures.items():
@@ -148,13 +148,13 @@ def collected_picture_age(recording: CollectedRecording) -> Iterator[Found]:
         yield worst_frame(np.abs(columns.picture_age_ns(camera)) / _NANOSECONDS, f"camera {camera}", frames=frames)
 
 
-@collected_check(
+@external_check(
     group="pictures",
     measures="the share of frames that have no picture of a camera",
     fail=0.5,
     reads=("/frames",),
 )
-def collected_missing_pictures(recording: CollectedRecording) -> Iterator[Found]:
+def collected_missing_pictures(recording: Recording) -> Iterator[Found]:
     """Every frame has a picture of every camera."""
     for camera, numbers in recording.columns().pictures.items():
         without = np.flatnonzero(numbers == NO_PICTURE)
@@ -164,13 +164,13 @@ def collected_missing_pictures(recording: CollectedRecording) -> Iterator[Found]
             yield Measurement(value=len(without) / len(numbers), frame=first, detail=told)
 
 
-@collected_check(
+@external_check(
     group="physics",
     measures="observed features that never change while the actions do",
     fail=1,
     reads=("/{feature}",),
 )
-def collected_stuck(recording: CollectedRecording) -> Found:
+def collected_stuck(recording: Recording) -> Found:
     """Sensors are alive: no feature of the observations stays at one value, in all elements, while commands change."""
     features = recording.columns().features
     if recording.columns().num_frames < _STILL_FRAMES:
@@ -182,14 +182,14 @@ def collected_stuck(recording: CollectedRecording) -> Found:
     return Measurement(value=len(stuck), detail=", ".join(stuck))
 
 
-@collected_check(
+@external_check(
     group="pictures",
     measures="cameras whose pictures do not decode, are of another size, or show one colour, or no distance, in more "
     "than half of them",
     needs_pictures=True,
     reads=("/camera/{camera}/h264", "/camera/{camera}/depth"),
 )
-def collected_pictures(recording: CollectedRecording) -> Found:
+def collected_pictures(recording: Recording) -> Found:
     """Every picture decodes and shows something."""
     if not recording.info.cameras:
         return None
@@ -207,12 +207,12 @@ def collected_pictures(recording: CollectedRecording) -> Found:
     return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))
 
 
-@collected_check(
+@external_check(
     group="pictures",
     measures="pairs of cameras with the same coded pictures",
     reads=("/camera/{camera}/h264",),
 )
-def collected_distinct_cameras(recording: CollectedRecording) -> Found:
+def collected_distinct_cameras(recording: Recording) -> Found:
     """No two cameras give the very same pictures, as when one is plugged in under two names."""
     digests = dict.fromkeys(recording.cameras, 0)
     for camera in digests:
@@ -233,7 +233,7 @@ def collected_distinct_cameras(recording: CollectedRecording) -> Found:
 )
 def collected_run_files(folder: Path) -> Measurement:
     """run.json lists exactly the recordings that are there, by their SHA-256."""
-    lines = {line.file: line for line in load_collected_run(folder).episodes}
+    lines = {line.file: line for line in load_external_run(folder).episodes}
     there = {f"{EPISODES}/{file.name}": file for file in (folder / EPISODES).glob("*.mcap")}
     wrong = [f"{name} is missing" for name in lines if name not in there]
     wrong += [f"{name} is not listed" for name in sorted(there) if name not in lines]

@@ -26,7 +26,7 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import (
     ACTION,
     IMAGE_PREFIX,
@@ -64,7 +64,7 @@ class DescribedEpisode:
     number: int
     rows: Rows
     kept: dict[str, Any]
-    info: EpisodeInfo
+    info: SimulatedInfo
 
 
 def read_rows(folder: Path, names: Sequence[str], *, schema: pa.Schema | None = None) -> list[dict[str, Any]]:
@@ -181,7 +181,7 @@ class Dataset:
         return list(spoken_episodes(self.path)) if set(COLUMNS) <= set(self.info.features) else []
 
     @cached_property
-    def infos(self) -> list[EpisodeInfo]:
+    def infos(self) -> list[SimulatedInfo]:
         """What was known of each simulated episode before its first frame; empty for a dataset of somebody else's."""
         try:
             return [read_episode_info(row["episode_info"]) for row in self.sidecar if row["episode_info"] is not None]
@@ -205,20 +205,20 @@ class Dataset:
             if row["episode_index"] in range(len(self.rows))
         ]
 
-    def action_kind(self, info: EpisodeInfo) -> ActionKind | None:
+    def action_kind(self, info: SimulatedInfo) -> ActionKind | None:
         """What the action column holds, by the names of its components; None when it is none of ours."""
         names = self.info.features[ACTION].names if ACTION in self.info.features else None
         kinds: tuple[ActionKind, ...] = ("joint", "joint_increment", "ee", "ee_delta")
         return next((kind for kind in kinds if action_names(info.robot, kind) == names), None)
 
-    def state_kind(self, info: EpisodeInfo) -> StateKind | None:
+    def state_kind(self, info: SimulatedInfo) -> StateKind | None:
         """What observation.state holds, by the names of its components; None when it is none of ours."""
         names = self.info.features[STATE].names if STATE in self.info.features else None
         return next((kind for kind in STATE_KINDS if state_names(info.robot, kind) == names), None)
 
 
 def compare_beginning(
-    info: EpisodeInfo, state: Array, fps: int, seen: Mapping[str, Cells]
+    info: SimulatedInfo, state: Array, fps: int, seen: Mapping[str, Cells]
 ) -> Mapping[str, PictureComparison] | NotMeasured:
     """Camera -> its pictures until the fingers first close against what states and scene make of them.
 

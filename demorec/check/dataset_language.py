@@ -23,7 +23,7 @@ from demorec.check.base import Found, Measurement, NotMeasured, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode
-from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE, EpisodeInfo
+from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE, SimulatedInfo
 
 Row = dict[str, Any]
 _ABOUT_PICTURES = ("vqa", "trace")
@@ -57,8 +57,8 @@ def _malformed(dataset: Dataset, episode: SpokenEpisode) -> Iterator[str]:
         if row.get("timestamp") not in times:
             yield f"a {row.get('style')} begins at {row.get('timestamp')} s, where no frame is"
     subtasks = sorted(row["timestamp"] for row in episode.persistent if row.get("style") == "subtask")
-    is_collected = any(row["episode_info"] is None for row in dataset.sidecar)
-    if subtasks and subtasks[0] != 0 and not is_collected:  # there, words begin when somebody says some
+    is_external = any(row["episode_info"] is None for row in dataset.sidecar)
+    if subtasks and subtasks[0] != 0 and not is_external:  # there, words begin when somebody says some
         yield "no subtask holds at the first frame"
     if len(set(subtasks)) < len(subtasks):
         yield "two subtasks begin at one frame"
@@ -164,7 +164,7 @@ def _wrong_phases(episode: SpokenEpisode, row: Row, fps: int) -> Iterator[str]:
             yield f"frame {first}: {entry['content'][:60]!r} {'hides' if is_miss else 'invents'} a deliberate miss"
 
 
-def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings) -> Iterator[str]:
+def _wrong_words(episode: SpokenEpisode, row: Row, info: SimulatedInfo, start: Surroundings) -> Iterator[str]:
     """Wordings mean the things of the task; subtasks name things of a goal, by kind and colour."""
     scene = info.scene
     objects = {goal.object for goal in scene.goals}
@@ -186,7 +186,7 @@ def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Sur
 
 
 def _wrong_interjections(
-    episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings, fps: int
+    episode: SpokenEpisode, row: Row, info: SimulatedInfo, start: Surroundings, fps: int
 ) -> Iterator[str]:
     """Interjections come where the expert listens, say what is meant and what was mistaken, and renew the plan."""
     said = {

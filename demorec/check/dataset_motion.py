@@ -14,7 +14,7 @@ from demorec.check.dataset import Dataset, Rows
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.check.run import motion_vector
 from demorec.core.geometry import Array
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import ACTION, EE_POSE, STATE
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
@@ -72,7 +72,7 @@ def dataset_forward_kinematics(dataset: Dataset) -> Found:
     return worst(*found)
 
 
-def _tcp_poses(dataset: Dataset, info: EpisodeInfo, rows: Rows) -> dict[str, Array]:
+def _tcp_poses(dataset: Dataset, info: SimulatedInfo, rows: Rows) -> dict[str, Array]:
     """Feature -> the TCP's poses (T, 7) that it holds, base frame."""
     told = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}
     if dataset.state_kind(info) == "joint_ee":

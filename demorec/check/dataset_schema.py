@@ -14,9 +14,9 @@ from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, in_words
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import check_video, open_table, read_json
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, Feature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import ACTION, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, observation_names
 
 _TYPES = {
@@ -54,7 +54,7 @@ def _columns(dataset: Dataset) -> Iterator[str]:
                 yield f"{name} is {schema.field(name).type} in {path.name}, {features[name].dtype} in info.json"
 
 
-def _fits(found: pa.DataType, feature: Feature) -> bool:
+def _fits(found: pa.DataType, feature: DatasetFeature) -> bool:
     if feature.dtype not in _TYPES:
         return True  # pictures in tables, which other writers have
     size = None
@@ -160,7 +160,7 @@ def dataset_description(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.infos)} episodes")
 
 
-def _described(dataset: Dataset, info: EpisodeInfo, stride: int) -> Iterator[str]:
+def _described(dataset: Dataset, info: SimulatedInfo, stride: int) -> Iterator[str]:
     features = dataset.info.features
     if dataset.info.robot_type != info.robot.name:
         yield f"robot_type is {dataset.info.robot_type}, the robot was {info.robot.name}"

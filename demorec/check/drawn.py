@@ -24,7 +24,7 @@ from demorec.check.cells import CellGrid, Cells, ImageKind, cell_side
 from demorec.check.rows import finest_lag
 from demorec.core.errors import RenderError, SceneError
 from demorec.core.geometry import Array
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
@@ -52,7 +52,7 @@ class DrawnPictures:
 
 def draw(
     world: RecordedWorld,
-    cameras: Iterable[Camera],
+    cameras: Iterable[SceneCamera],
     frames: NDArray[np.int64],
     kinds: Mapping[str, Iterable[ImageKind]],
     counts: Mapping[str, tuple[int, int]],
@@ -176,7 +176,7 @@ def _renderer() -> Renderer:
     return RasterRenderer()
 
 
-def small_camera(camera: Camera, counts: tuple[int, int], most: int) -> Camera:
+def small_camera(camera: SceneCamera, counts: tuple[int, int], most: int) -> SceneCamera:
     """A camera that sees what the grid of the camera's cells covers, and no more, with few pixels."""
     side = cell_side(camera.width, camera.height, counts)
     share = counts[1] * side / camera.height

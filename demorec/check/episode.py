@@ -20,9 +20,9 @@ from demorec.check.episode_drawn import DrawnEpisode, draw_episode
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
-from demorec.episode.episode import EpisodeColumns, EpisodeInfo, Event, Outcome, frame_time_ns
-from demorec.episode.scene import Camera
-from demorec.mcap import Recording, channels
+from demorec.episode.episode import Event, Outcome, SimulatedColumns, SimulatedInfo, frame_time_ns
+from demorec.episode.scene import SceneCamera
+from demorec.mcap import SimulatedRecording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
@@ -80,12 +80,12 @@ class CheckedEpisode(ExitStack):
         return cast(T, self._shared[compute])
 
     @cached_property
-    def recording(self) -> Recording:
+    def recording(self) -> SimulatedRecording:
         """The open recording."""
-        return self.enter_context(Recording(self.path))
+        return self.enter_context(SimulatedRecording(self.path))
 
     @property
-    def info(self) -> EpisodeInfo:
+    def info(self) -> SimulatedInfo:
         """What was known before the first frame."""
         return self.recording.info
 
@@ -95,7 +95,7 @@ class CheckedEpisode(ExitStack):
         return self.recording.outcome
 
     @cached_property
-    def columns(self) -> EpisodeColumns:
+    def columns(self) -> SimulatedColumns:
         """All numbers."""
         return self.recording.columns()
 
@@ -218,7 +218,7 @@ class CheckedEpisode(ExitStack):
     # ------------------------------------------------------------------------------------------- the cameras
 
     @property
-    def cameras(self) -> tuple[Camera, ...]:
+    def cameras(self) -> tuple[SceneCamera, ...]:
         """Of the scene."""
         return self.info.scene.cameras
 
@@ -228,7 +228,7 @@ class CheckedEpisode(ExitStack):
         labels: tuple[ImageKind, ...] = ("labels",) if self.recording.has_segmentation(camera) else ()
         return ("color", *depth, *labels)
 
-    def pictures(self, camera: Camera, kind: ImageKind = "color") -> PictureSummary:
+    def pictures(self, camera: SceneCamera, kind: ImageKind = "color") -> PictureSummary:
         """What the checks need of a camera's decoded pictures; decoded once."""
         if (camera.name, kind) not in self._pictures:
             self._pictures[camera.name, kind] = summarise(self.recording, camera, kind)
@@ -245,7 +245,7 @@ class CheckedEpisode(ExitStack):
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
-    def strays(self, camera: Camera, kind: ImageKind) -> Array | NotMeasured:
+    def strays(self, camera: SceneCamera, kind: ImageKind) -> Array | NotMeasured:
         """(T,) share of the cells of depth or labels that are not what the recorded numbers make of them."""
         if isinstance(self._drawn, NotMeasured):
             return self._drawn
@@ -255,7 +255,7 @@ class CheckedEpisode(ExitStack):
         is_turned = camera.name in self._drawn.shift
         return strays(seen, self._drawn.pictures.cells[camera.name, kind], kind, is_turned=is_turned)
 
-    def compared(self, camera: Camera, kind: ImageKind = "color") -> PictureComparison | NotMeasured:
+    def compared(self, camera: SceneCamera, kind: ImageKind = "color") -> PictureComparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""
         renderer = self.info.config.get("renderer", "raster")
         if kind == "color" and renderer != "raster":
@@ -274,7 +274,7 @@ class CheckedEpisode(ExitStack):
 
 
 def of_each_camera(
-    judge: Callable[[CheckedEpisode, Camera, PictureComparison], Found],
+    judge: Callable[[CheckedEpisode, SceneCamera, PictureComparison], Found],
 ) -> Callable[[CheckedEpisode], Iterator[Found]]:
     """A check of the colour pictures of one camera, against what the recorded numbers make of them, as one of all."""
 
@@ -328,7 +328,7 @@ class PictureSummary:
         return len(self.cells)
 
 
-def summarise(recording: Recording, camera: Camera, kind: ImageKind) -> PictureSummary:
+def summarise(recording: SimulatedRecording, camera: SceneCamera, kind: ImageKind) -> PictureSummary:
     """Decode all pictures of a camera once."""
     read: dict[ImageKind, Callable[[str], Iterator[NDArray[Any]]]] = {
         "color": recording.images,

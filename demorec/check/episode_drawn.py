@@ -17,8 +17,8 @@ from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
 from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
 from demorec.core.geometry import Array, Pose
 from demorec.episode.camera_error import told_error, true_camera
-from demorec.episode.episode import EpisodeColumns, EpisodeInfo
-from demorec.episode.scene import Camera, Scene
+from demorec.episode.episode import SimulatedColumns, SimulatedInfo
+from demorec.episode.scene import Scene, SceneCamera
 from demorec.render.recorded import RecordedWorld
 
 _NUM_FITTED = 9
@@ -43,8 +43,8 @@ class DrawnEpisode:
 
 
 def draw_episode(
-    info: EpisodeInfo,
-    columns: EpisodeColumns,
+    info: SimulatedInfo,
+    columns: SimulatedColumns,
     kinds: Mapping[str, Iterable[ImageKind]],
     colors: Mapping[str, Cells] | None = None,
     *,
@@ -81,7 +81,7 @@ def draw_episode(
     )
 
 
-def drawable_scene(info: EpisodeInfo) -> Scene:
+def drawable_scene(info: SimulatedInfo) -> Scene:
     """The recorded scene, its cameras without their calibration error; in older recordings without its offset.
 
     One shift of all pictures makes up for most of a turn, but not for an offset: what is near moves farther by it than
@@ -90,7 +90,7 @@ def drawable_scene(info: EpisodeInfo) -> Scene:
     return replace(info.scene, cameras=tuple(_moved_back(camera, info.behaviour) for camera in info.scene.cameras))
 
 
-def _moved_back(camera: Camera, behaviour: Mapping[str, float]) -> Camera:
+def _moved_back(camera: SceneCamera, behaviour: Mapping[str, float]) -> SceneCamera:
     error = told_error(camera.name, behaviour)
     if error is not None:
         return true_camera(camera, error)
@@ -101,7 +101,7 @@ def _moved_back(camera: Camera, behaviour: Mapping[str, float]) -> Camera:
     return replace(camera, mount_from_camera=camera.mount_from_camera @ Pose(position=-offset))
 
 
-def _turned_back(camera: Camera, turn: Array | None) -> Camera:
+def _turned_back(camera: SceneCamera, turn: Array | None) -> SceneCamera:
     """The camera before it was turned by a small rotation vector, rad in its own axes."""
     if turn is None:
         return camera
@@ -110,7 +110,7 @@ def _turned_back(camera: Camera, turn: Array | None) -> Camera:
 
 
 def _turns(
-    info: EpisodeInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
+    info: SimulatedInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
 ) -> dict[str, Array]:
     """Camera name -> (3,) rotation vector of its calibration error, rad in its own axes, where pictures show one."""
     told = {
@@ -135,6 +135,6 @@ def _turns(
     return {name: turn for name, turn in turns.items() if np.linalg.norm(turn) <= _TURN_MARGIN * told[name]}
 
 
-def _height(camera: Camera) -> float:
+def _height(camera: SceneCamera) -> float:
     """Of the picture, at a distance of 1."""
     return float(2 * np.tan(camera.fov_y / 2))

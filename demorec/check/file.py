@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
 from demorec.episode.episode import FORMAT_VERSION
-from demorec.mcap import CollectedRecording, channels, messages
+from demorec.mcap import Recording, channels, messages
 from demorec.mcap.streams import frame_streams
 
 
@@ -104,7 +104,7 @@ def readable(episode: CheckedEpisode) -> Measurement:
     fail=1,
     reads=("metadata demorec.recovered",),
 )
-def complete(episode: CheckedEpisode | CollectedRecording) -> Measurement:
+def complete(episode: CheckedEpisode | Recording) -> Measurement:
     """The episode was recorded to its end."""
     cut = episode.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")

@@ -20,7 +20,7 @@ from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX, recognised_robot
 from demorec.episode.features import ACTION, STATE, VELOCITY
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 from demorec.robots.urdf import Urdf
 
 GRIPPER = "gripper.width"
@@ -84,7 +84,7 @@ class Motions:
         subject: It, open.
     """
 
-    def __init__(self, subject: Dataset | CollectedRecording) -> None:
+    def __init__(self, subject: Dataset | Recording) -> None:
         self._subject = subject
 
     @cached_property
@@ -190,7 +190,7 @@ def _motion(
     )
 
 
-def _of_recording(recording: CollectedRecording) -> Iterator[Motion]:
+def _of_recording(recording: Recording) -> Iterator[Motion]:
     info, columns = recording.info, recording.columns()
     described = {feature.name: feature for feature in info.features}
     if STATE not in described or not columns.num_frames:

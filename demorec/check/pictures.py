@@ -22,7 +22,7 @@ from demorec.check.drawn import PictureComparison, judge_unlike
 from demorec.check.episode import CheckedEpisode, of_each_camera
 from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 
 MIN_MOTION = 2.5
 """Root mean square change of the drawn cells from frame to frame, of 255, that a picture must show."""
@@ -94,7 +94,7 @@ def pictures_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
     reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
-def odd_pictures(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
+def odd_pictures(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
     """No single picture is another one, torn, blurred, shifted or off in colour."""
     excess = _excess(compared)
     excess[~_is_exact(episode, camera)[: len(excess)]] *= _PREDICTED_WEIGHT
@@ -106,7 +106,7 @@ def _excess(compared: PictureComparison) -> Array:
     return np.maximum(compared.unlike - np.median(compared.unlike), 0.0)
 
 
-def _is_exact(episode: CheckedEpisode, camera: Camera) -> NDArray[np.bool_]:
+def _is_exact(episode: CheckedEpisode, camera: SceneCamera) -> NDArray[np.bool_]:
     """(T,) pictures whose coder leaves nothing to the next: all but the predicted ones of AV1."""
     if episode.recording.video_settings(camera.name).codec != "av1":
         return np.ones(episode.num_frames, dtype=np.bool_)
@@ -124,7 +124,7 @@ def _stale(compared: PictureComparison) -> NDArray[np.bool_]:
     reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
-def frozen(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
+def frozen(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
     """A camera does not stand still while something moves in its view."""
     return _stale_frames(camera, compared, *longest_run(_stale(compared)))
 
@@ -134,14 +134,14 @@ def frozen(episode: CheckedEpisode, camera: Camera, compared: PictureComparison)
     reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
-def repeated_pictures(episode: CheckedEpisode, camera: Camera, compared: PictureComparison) -> Found:
+def repeated_pictures(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
     """No picture was dropped and the one before shown in its place."""
     stale = _stale(compared)
     stale &= _is_exact(episode, camera)[: len(stale)]
     return _stale_frames(camera, compared, int(stale.sum()), int(np.argmax(stale)))
 
 
-def _stale_frames(camera: Camera, compared: PictureComparison, count: int, first: int) -> Found:
+def _stale_frames(camera: SceneCamera, compared: PictureComparison, count: int, first: int) -> Found:
     """So many pictures of a camera are stale, of those in which something moves."""
     num_moving = int((compared.motion > MIN_MOTION).sum())
     if not num_moving:
@@ -166,7 +166,7 @@ def distinct_cameras(episode: CheckedEpisode) -> Iterator[Found]:
             yield Measurement(value=value, detail=f"cameras {camera.name} and {other.name}")
 
 
-def _same_place(episode: CheckedEpisode, camera: Camera, other: Camera) -> bool:
+def _same_place(episode: CheckedEpisode, camera: SceneCamera, other: SceneCamera) -> bool:
     poses = episode.columns.world_from_camera
     return bool(np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3)
 

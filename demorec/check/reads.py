@@ -18,8 +18,8 @@ from demorec.datasets.lerobot.language import COLUMNS
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.datasets.lerobot.progress import PROGRESS_PATH
 from demorec.episode import features
-from demorec.episode.episode import EpisodeInfo, Outcome
-from demorec.episode.scene import Body, Camera, RobotPlacement, Scene, Shape
+from demorec.episode.episode import Outcome, SimulatedInfo
+from demorec.episode.scene import Body, RobotPlacement, Scene, SceneCamera, Shape
 from demorec.mcap import channels
 from demorec.mcap.external.streams import SUBTASK
 from demorec.mcap.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
@@ -93,7 +93,7 @@ def everything() -> Iterator[tuple[SourceKind, str]]:
         yield "topic", topic
     for record in (EPISODE, OUTCOME, RECOVERED):
         yield "field", f"metadata {record}"
-    for name, kind in (("info", EpisodeInfo), ("cameras", CameraStreams), ("outcome", Outcome), ("run", RunFile)):
+    for name, kind in (("info", SimulatedInfo), ("cameras", CameraStreams), ("outcome", Outcome), ("run", RunFile)):
         for field in _leaves(kind, name):
             yield "field", field
     yield "field", f"metadata {COLLECTED}"
@@ -106,14 +106,14 @@ def everything() -> Iterator[tuple[SourceKind, str]]:
 
 def topics() -> list[str]:
     """Every topic that a recording may have."""
-    camera = Camera(name="{camera}", width=16, height=16, fov_y=1.0, mount="world", mount_from_camera=Pose())
+    camera = SceneCamera(name="{camera}", width=16, height=16, fov_y=1.0, mount="world", mount_from_camera=Pose())
     shape = Shape(kind="box", size=(0.1, 0.1, 0.1))
     body = Body(name="{body}", role="object", shape=shape, world_from_body=Pose(), mass=1.0)
     robot = load_robot("panda")
     placement = RobotPlacement(
         name=robot.name, world_from_base=Pose(), joint_position=robot.home_q, gripper_width=robot.gripper.max_width
     )
-    info = EpisodeInfo(
+    info = SimulatedInfo(
         episode_index=0,
         attempt=0,
         root_seed=0,

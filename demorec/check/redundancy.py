@@ -16,7 +16,7 @@ from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.core.errors import SceneError
 from demorec.episode.episode import Event
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.depth import FORMAT as DEPTH_FORMAT
@@ -183,7 +183,7 @@ def picture_messages(episode: CheckedEpisode) -> Iterator[Found]:
         yield _picture_messages(episode, camera)
 
 
-def _picture_messages(episode: CheckedEpisode, camera: Camera) -> Measurement:
+def _picture_messages(episode: CheckedEpisode, camera: SceneCamera) -> Measurement:
     name, frame_id = camera.name, camera_frame(camera.name)
     codec = episode.recording.video_settings(name).codec
     color = messages.PictureMessages(frame_id, codec)

@@ -17,11 +17,11 @@ from demorec.core.errors import check_option, resource_error
 from demorec.core.processes import SPAWN
 from demorec.core.tables import CHECKS
 from demorec.core.user_modules import is_allowed
-from demorec.episode.episode import EpisodeInfo
-from demorec.mcap import CollectedRecording
-from demorec.mcap.opening import is_collected
+from demorec.episode.episode import SimulatedInfo
+from demorec.mcap import Recording
+from demorec.mcap.opening import is_external
 from demorec.robots.assets import allow_models, modules_of_models
-from demorec.runs.collected import is_collected_run
+from demorec.runs.external import is_external_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
@@ -162,10 +162,10 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
     allow_models(options.allowed)
-    infos: Sequence[EpisodeInfo] = ()
+    infos: Sequence[SimulatedInfo] = ()
     checks = options.checks(subject.kind)
-    if subject.kind == "recording" and is_collected(subject.path):
-        with CollectedRecording(subject.path) as recording:
+    if subject.kind == "recording" and is_external(subject.path):
+        with Recording(subject.path) as recording:
             gates = ("collected_opens", "collected_readable")
             found = _run(options.checks("collected"), recording, gates, recording.columns)
             found += _run(options.checks("motion"), Motions(recording), (), recording.columns)
@@ -175,7 +175,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
             found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
             if any(result.needs_allow for result in found):
                 infos = [episode.info]
-    elif subject.kind == "run" and is_collected_run(subject.path):
+    elif subject.kind == "run" and is_external_run(subject.path):
         found = [check.run(subject.path) for check in options.checks("collected_run")]
         found += [check.skipped(NOT_APPLICABLE) for check in checks]
     elif subject.kind == "run":

@@ -18,8 +18,8 @@ from demorec.core.files import open_regular, read_json_limited
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.episode.episode import EpisodeInfo, Outcome
-from demorec.mcap import Recording
+from demorec.episode.episode import Outcome, SimulatedInfo
+from demorec.mcap import SimulatedRecording
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 
 _MAX_JSON_BYTES = 2 << 30
@@ -38,7 +38,7 @@ class Told:
         motion: `motion_vector` of its joints.
     """
 
-    info: EpisodeInfo
+    info: SimulatedInfo
     outcome: Outcome | None
     digest: str
     num_bytes: int
@@ -90,7 +90,7 @@ class CheckedRun:
         found = {}
         for path in self.recordings:
             try:
-                with Recording(path) as recording:
+                with SimulatedRecording(path) as recording:
                     found[str(path.relative_to(self.path))] = Told(
                         info=recording.info,
                         outcome=recording.outcome,
@@ -103,7 +103,7 @@ class CheckedRun:
         return found
 
     @property
-    def successes(self) -> list[EpisodeInfo]:
+    def successes(self) -> list[SimulatedInfo]:
         """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
         asked = self.run["num_episodes"]
         infos = [told.info for file, told in self.told.items() if file.startswith("episodes/")]

@@ -22,7 +22,7 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR, is_dataset
 from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transcode
 from demorec.datasets.lerobot.reader import PacketReader
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """What the sidecar keeps that is not of the recording."""
@@ -129,7 +129,7 @@ def episode_differences(
         ResourceError: This machine cannot read it.
     """
     try:
-        with Recording(recording_file) as recording:
+        with SimulatedRecording(recording_file) as recording:
             exporting = exported(recording, options)
             prepared = prepare_episode(exporting, options, code_depth=False)
             # Encoded anew, images have the bytes of the version and machine that encoded them.

@@ -18,9 +18,9 @@ from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import Found, expect
 
 if TYPE_CHECKING:
-    from demorec.mcap.external.summary import CollectedCameraSummary, CollectedSummary, FeatureSummary
+    from demorec.mcap.external.summary import ExternalCameraSummary, ExternalSummary, FeatureSummary
     from demorec.mcap.summary import RecordingSummary
-    from demorec.runs.collected import CollectedRun
+    from demorec.runs.external import ExternalRun
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
@@ -69,14 +69,14 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.core.plain import to_plain
-    from demorec.mcap.opening import is_collected
+    from demorec.mcap.opening import is_external
     from demorec.mcap.summary import summarize
 
-    if is_collected(path):
-        from demorec.mcap.external.summary import summarize_collected
+    if is_external(path):
+        from demorec.mcap.external.summary import summarize_external
 
-        collected = summarize_collected(path)
-        return {"kind": "collected recording", **to_plain(collected)}, _collected_lines(collected)
+        collected = summarize_external(path)
+        return {"kind": "collected recording", **to_plain(collected)}, _external_lines(collected)
     summary = summarize(path)
     return {"kind": "recording", **to_plain(summary)}, _recording_lines(summary)
 
@@ -112,14 +112,14 @@ def _recording_lines(summary: RecordingSummary) -> list[str]:
     return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
 
 
-def _collected_lines(summary: CollectedSummary) -> list[str]:
+def _external_lines(summary: ExternalSummary) -> list[str]:
     """About one recording."""
     robot = f"{summary.robot}{' (URDF known)' if summary.has_urdf else ''}"
     facts = [
         ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, collected, format {summary.format_version})"),
         ("instruction", summary.instruction),
         ("episode", str(summary.episode_index)),
-        ("outcome", _collected_outcome(summary)),
+        ("outcome", _external_outcome(summary)),
         (
             "length",
             f"{summary.frames} frames, {summary.seconds:.2f} s, {summary.rate:.2f} Hz (nominal {summary.fps} Hz)",
@@ -136,7 +136,7 @@ def _collected_lines(summary: CollectedSummary) -> list[str]:
     return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
 
 
-def _collected_outcome(summary: CollectedSummary) -> str:
+def _external_outcome(summary: ExternalSummary) -> str:
     if summary.is_recovered:
         return "unknown: recovered after a crash"
     return _SUCCESS_WORDS[summary.success] + (f": {summary.reason}" if summary.reason else "")
@@ -149,7 +149,7 @@ def _feature(feature: FeatureSummary) -> Iterator[str]:
         yield feature.source
 
 
-def _camera(camera: CollectedCameraSummary) -> Iterator[str]:
+def _camera(camera: ExternalCameraSummary) -> Iterator[str]:
     video = camera.video
     yield f"{video.width}x{video.height} {video.codec}{' as it came' if camera.is_kept else ''}"
     yield f"{camera.pictures} pictures"
@@ -171,14 +171,14 @@ def _outcome(summary: RecordingSummary) -> str:
 
 def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.core.plain import to_plain
-    from demorec.runs.collected import is_collected_run, load_collected_run
+    from demorec.runs.external import is_external_run, load_external_run
     from demorec.runs.run_file import load_run_file
 
-    if is_collected_run(path):
-        collected = load_collected_run(path)
+    if is_external_run(path):
+        collected = load_external_run(path)
         left_out = _left_out(path)
         plain = {"kind": "collected run", "path": str(path), "digest": collected.digest, **to_plain(collected)}
-        return plain | {"left_out": left_out}, [*_collected_run_lines(path, collected), *_left_out_lines(left_out)]
+        return plain | {"left_out": left_out}, [*_external_run_lines(path, collected), *_left_out_lines(left_out)]
     run = load_run_file(path)
     plain = {
         "kind": "run",
@@ -224,7 +224,7 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
     return [*aligned(facts), "", *aligned(rows)]
 
 
-def _collected_run_lines(path: Path, run: CollectedRun) -> list[str]:
+def _external_run_lines(path: Path, run: ExternalRun) -> list[str]:
     """About a run."""
     frames = sum(line.num_frames for line in run.episodes)
     counts = {word: sum(line.success is success for line in run.episodes) for success, word in _SUCCESS_WORDS.items()}
@@ -334,7 +334,7 @@ def _names(names: object) -> str:
 
 
 def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
-    from demorec.episode.collected import CollectedInfo
+    from demorec.episode.external import EpisodeInfo
     from demorec.mcap import open_recording
 
     path, recordings = found.path, (*found.recordings, *found.failed)
@@ -343,7 +343,7 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
     for file in recordings:
         with open_recording(file) as recording:
             info, outcome = recording.info, recording.outcome
-            task, seed = ("(collected)", "") if isinstance(info, CollectedInfo) else (info.task, str(info.root_seed))
+            task, seed = ("(collected)", "") if isinstance(info, EpisodeInfo) else (info.task, str(info.root_seed))
             success = None if outcome is None else outcome.success
         items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
         word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from demorec.core.errors import ConfigError, ExportError
 from demorec.core.registry import nearest_match
 from demorec.datasets.options import CommonOptions
-from demorec.episode.episode import EpisodeColumns
+from demorec.episode.episode import SimulatedColumns
 from demorec.episode.features import (
     ENVIRONMENT_STATE,
     IMAGE_PREFIX,
 )
-from demorec.mcap import AnyRecording, Recording
+from demorec.mcap import AnyRecording, SimulatedRecording
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 INTERVENTION = "intervention"
@@ -58,11 +58,11 @@ class Simulated:
         recording: Open.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: SimulatedRecording) -> None:
         self.recording = recording
 
     @cached_property
-    def columns(self) -> EpisodeColumns:
+    def columns(self) -> SimulatedColumns:
         """All numbers, every frame; RecordingError for damage."""
         return self.recording.columns()
 

@@ -22,8 +22,8 @@ from demorec.datasets.episode import (
     frame_stride,
 )
 from demorec.datasets.options import CommonOptions
-from demorec.episode.collected import NO_PICTURE
 from demorec.episode.episode import interventions
+from demorec.episode.external import NO_PICTURE
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -39,7 +39,7 @@ from demorec.episode.features import (
     observation_vectors,
 )
 from demorec.episode.sensed import SENSED, ObservationRows
-from demorec.mcap import AnyRecording, CollectedRecording, Recording, channels
+from demorec.mcap import AnyRecording, Recording, SimulatedRecording, channels
 
 _SECOND_NS = 1_000_000_000
 
@@ -49,7 +49,7 @@ class _Simulated(ExportEpisode):
 
     simulated: Simulated
 
-    def __init__(self, recording: Recording, options: CommonOptions) -> None:
+    def __init__(self, recording: SimulatedRecording, options: CommonOptions) -> None:
         super().__init__(recording, options)
         self.simulated = Simulated(recording)
         info = recording.info
@@ -181,7 +181,7 @@ class _External(ExportEpisode):
 
     simulated = None
 
-    def __init__(self, recording: CollectedRecording, options: CommonOptions) -> None:
+    def __init__(self, recording: Recording, options: CommonOptions) -> None:
         super().__init__(recording, options)
         self._recording = recording
         self._check_options()
@@ -312,6 +312,4 @@ class _External(ExportEpisode):
 
 def exported(recording: AnyRecording, options: CommonOptions) -> ExportEpisode:
     """What a dataset with these options has of a recording; ConfigError for options that it cannot serve."""
-    return (
-        _External(recording, options) if isinstance(recording, CollectedRecording) else _Simulated(recording, options)
-    )
+    return _External(recording, options) if isinstance(recording, Recording) else _Simulated(recording, options)

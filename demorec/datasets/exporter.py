@@ -21,7 +21,7 @@ class Exporter[O: CommonOptions]:
     Attributes:
         summary: What comes out, in one line.
         options: Its flags; a dataclass with a docstring below each field.
-        function: "module:name" of (sources, out, options, progress) -> report. It reads `Recording`s and nothing else,
+        function: "module:name" of (sources, out, options, progress) -> report. It reads recordings and nothing else,
             takes those that `demorec.datasets.sources` finds, and makes `out` whole or not at all. Raises ConfigError,
             ExportError and RecordingError.
     """

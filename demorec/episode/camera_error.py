@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.robots.motion import angle_between
 
 ANGLE_MARGIN = 1e-6
@@ -56,6 +56,6 @@ def told_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
     return Pose(position=position, quat_xyzw=np.array([*turn, math.sqrt(1.0 - size * size)]))
 
 
-def true_camera(recorded: Camera, true_from_recorded: Pose) -> Camera:
+def true_camera(recorded: SceneCamera, true_from_recorded: Pose) -> SceneCamera:
     """The camera where it truly was."""
     return replace(recorded, mount_from_camera=recorded.mount_from_camera @ true_from_recorded.inverse())

@@ -142,7 +142,7 @@ class Frame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeInfo:
+class SimulatedInfo:
     """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
 
     Attributes:
@@ -229,7 +229,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EpisodeColumns:
+class SimulatedColumns:
     """All numbers of an episode, one row a frame (T rows); pictures are read on their own.
 
     Poses are position, then quaternion xyzw. Shapes and units as in Observation and Action.

@@ -217,7 +217,7 @@ class Light:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
+class SceneCamera:
     """A pinhole camera, fixed in the world or carried by a robot link.
 
     Attributes:
@@ -263,7 +263,7 @@ class Scene:
     goals: tuple[Goal, ...] = ()
     physics: Physics = field(default_factory=Physics)
     light: Light = field(default_factory=Light)
-    cameras: tuple[Camera, ...] = ()
+    cameras: tuple[SceneCamera, ...] = ()
     hold: Literal["friction", "constraint"] = "friction"
 
     def body(self, name: str) -> Body:

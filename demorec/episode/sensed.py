@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.episode.episode import EpisodeColumns, Observation
+from demorec.episode.episode import Observation, SimulatedColumns
 from demorec.robots.robot import RobotSpec
 
 
@@ -27,7 +27,7 @@ class ObservationRows:
     wrench: Array | None = None  # (T, 6)
 
     @classmethod
-    def of_columns(cls, columns: EpisodeColumns, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
+    def of_columns(cls, columns: SimulatedColumns, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
         """Those of a recorded episode, or of some of its frames."""
         return cls(
             joint_position=columns.joint_position[rows],

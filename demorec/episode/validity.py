@@ -14,8 +14,8 @@ from collections.abc import Iterable, Iterator
 from demorec.core.config import MAX_PIXELS
 from demorec.core.geometry import Pose
 from demorec.core.plain import from_json
-from demorec.episode.episode import EpisodeInfo
-from demorec.episode.scene import Body, Camera, Scene, Shape
+from demorec.episode.episode import SimulatedInfo
+from demorec.episode.scene import Body, Scene, SceneCamera, Shape
 from demorec.robots.robot import RobotSpec
 
 MAX_DESCRIPTION_BYTES = 1 << 20
@@ -40,20 +40,20 @@ def from_description[T](text: str, cls: type[T]) -> T:
     return from_json(text, cls)
 
 
-def read_episode_info(text: str) -> EpisodeInfo:
+def read_episode_info(text: str) -> SimulatedInfo:
     """The description of an episode from its JSON.
 
     Raises:
         ValueError: One line that says what is wrong with it.
     """
-    info = from_description(text, EpisodeInfo)
+    info = from_description(text, SimulatedInfo)
     wrong = list(_episode(info))
     if wrong:
         raise ValueError("; ".join(wrong[:_MAX_TOLD]))
     return info
 
 
-def _episode(info: EpisodeInfo) -> Iterator[str]:
+def _episode(info: SimulatedInfo) -> Iterator[str]:
     yield from _within("episode_index", info.episode_index, 0, 2**63 - 1)
     yield from _within("attempt", info.attempt, 0, 2**31)
     yield from _within("root_seed", info.root_seed, 0, 2**63 - 1)
@@ -129,7 +129,7 @@ def _shape(what: str, shape: Shape) -> Iterator[str]:
         yield f"the origin of {what} is far away"
 
 
-def _camera(camera: Camera) -> Iterator[str]:
+def _camera(camera: SceneCamera) -> Iterator[str]:
     what = f"the camera {camera.name!r}"
     yield from _pose(what, camera.mount_from_camera)
     for side in (camera.width, camera.height):

@@ -28,7 +28,7 @@ from demorec.generate.folder import AnotherRunError
 from demorec.generate.observer import RunObserver, RunResult
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.runs.find import expect
 from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
 
@@ -159,7 +159,7 @@ def _read_run(source: Path) -> Original:
         if not attempt.file:  # no scene could be laid out, so that nothing was recorded
             continue
         try:
-            with Recording(path) as recording:
+            with SimulatedRecording(path) as recording:
                 info, found = recording.info, recording.digest()
         except RecordingError as error:
             digests[key] = ""

@@ -21,7 +21,7 @@ from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SimulatedWriter
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
 
@@ -64,7 +64,7 @@ def _record(plan: EpisodePlan, path: Path, clock: _Stopwatch) -> None:
     world, renderer = _workshop.equip(episode.info)
     timed: Any = _Timed(renderer, clock, RENDERING) if renderer else None
     session = Session.of_episode(world, episode, timed)
-    with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
+    with SimulatedWriter(path, episode.info, video=plan.config.video) as writer:
         recording = _Timed(writer, clock, RECORDING)
         for frame in session.run(ScriptAgent(episode)):
             recording.write(frame)

@@ -16,8 +16,8 @@ from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.core.user_modules import modules_of
 from demorec.episode.camera_error import error_values
-from demorec.episode.episode import EpisodeInfo
-from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Camera, Scene
+from demorec.episode.episode import SimulatedInfo
+from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.render import Renderer
 from demorec.robots.assets import allow_models, model_name
@@ -47,10 +47,10 @@ class Episode:
     """
 
     plan: EpisodePlan
-    info: EpisodeInfo
+    info: SimulatedInfo
     task: Task
     behaviour: Behaviour
-    cameras: tuple[Camera, ...] = ()
+    cameras: tuple[SceneCamera, ...] = ()
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
     interjection: Interjection | None = None
 
@@ -114,7 +114,7 @@ def prepare(plan: EpisodePlan) -> Episode:
     cameras = vary_cameras(tuple(_cameras(task, robot, config)), ranges, camera_rng)
     errors = calibration_errors(cameras, ranges, camera_rng)
     scene = replace(scene, cameras=tuple(_miscalibrated(camera, errors[camera.name]) for camera in cameras))
-    info = EpisodeInfo(
+    info = SimulatedInfo(
         episode_index=plan.episode_index,
         attempt=plan.attempt,
         root_seed=config.seed,
@@ -140,7 +140,7 @@ def prepare(plan: EpisodePlan) -> Episode:
     )
 
 
-def _cameras(task: Task, robot: RobotSpec, config: GenerateConfig) -> Iterator[Camera]:
+def _cameras(task: Task, robot: RobotSpec, config: GenerateConfig) -> Iterator[SceneCamera]:
     """The cameras that the config names, the task's own before those that everybody has."""
     for name in config.cameras:
         preset = task.camera_presets.get(name) or CAMERAS.load(name, config.modules)
@@ -166,18 +166,18 @@ def _sampler(plan: EpisodePlan, ranges: Ranges) -> Sampler:
     return Sampler(_rng(plan, "scene"), unit_point=point, ranges=ranges, split=config.split, fixed=config.fixed)
 
 
-def _miscalibrated(camera: Camera, true_from_recorded: Pose) -> Camera:
+def _miscalibrated(camera: SceneCamera, true_from_recorded: Pose) -> SceneCamera:
     if true_from_recorded == Pose():
         return camera
     return replace(camera, mount_from_camera=camera.mount_from_camera @ true_from_recorded)
 
 
-def make_world(info: EpisodeInfo) -> World:
+def make_world(info: SimulatedInfo) -> World:
     """An empty world for episodes like this one (same robot, rates and joint sampling)."""
     return World(info.robot, fps=info.fps, sample_joints=info.config.get("joint_rate") == "physics")
 
 
-def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
+def make_renderer(info: SimulatedInfo) -> AbstractContextManager[Renderer | None]:
     """The renderer that an episode's config names, or None without cameras; a context manager either way.
 
     Raises:

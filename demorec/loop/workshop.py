@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.loop.prepare import make_world
 from demorec.render import Renderer
 from demorec.render.warm import WarmRenderer
@@ -22,7 +22,7 @@ class Workshop:
         """Whether an episode was equipped before."""
         return self._world is not None
 
-    def equip(self, info: EpisodeInfo) -> tuple[World, Renderer | None]:
+    def equip(self, info: SimulatedInfo) -> tuple[World, Renderer | None]:
         """A world and a renderer (None without cameras) for episodes like this one; the present ones where they fit.
 
         Raises:

@@ -1,33 +1,28 @@
 """Recordings: one MCAP file an episode, readable by ROS 2, Rerun and Foxglove, and the source of everything after.
 
-with EpisodeWriter(path, info) as writer:
-    for frame in frames:
-        writer.write(frame)
-    writer.finish(outcome)
-
-with Recording(path) as recording:
+with open_recording(path) as recording:
     recording.columns()            # all numbers
-    recording.images("front")      # decoded pictures
+    recording.images("front")      # decoded images
 """
 
-from demorec.mcap.external.reader import CollectedRecording
-from demorec.mcap.external.writer import CollectedWriter
+from demorec.mcap.external.reader import Recording
+from demorec.mcap.external.writer import EpisodeWriter
 from demorec.mcap.file_writer import WriteStats
 from demorec.mcap.opening import AnyRecording, open_recording
 from demorec.mcap.pixels import PixelStatistics
-from demorec.mcap.recording import Recording
+from demorec.mcap.recording import SimulatedRecording
 from demorec.mcap.recover import Recovered, is_whole, recover
 from demorec.mcap.video import VideoPacket, VideoSettings
-from demorec.mcap.writer import EpisodeWriter
+from demorec.mcap.writer import SimulatedWriter
 
 __all__ = [
     "AnyRecording",
-    "CollectedRecording",
-    "CollectedWriter",
     "EpisodeWriter",
     "PixelStatistics",
     "Recording",
     "Recovered",
+    "SimulatedRecording",
+    "SimulatedWriter",
     "VideoPacket",
     "VideoSettings",
     "WriteStats",

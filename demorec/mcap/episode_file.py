@@ -12,8 +12,8 @@ from pathlib import Path
 from demorec.core.closing import Closing
 from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json, to_plain
-from demorec.episode.collected import CollectedInfo, CollectedOutcome
-from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.episode.episode import Outcome, SimulatedInfo
+from demorec.episode.external import EpisodeInfo, ExternalOutcome
 from demorec.mcap import messages, metadata
 from demorec.mcap.channels import camera_topic
 from demorec.mcap.chunks import Block
@@ -22,7 +22,7 @@ from demorec.mcap.pixels import PixelCounter, PixelStatistics
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode
 
 
-class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
+class EpisodeFile[O: (Outcome, ExternalOutcome), C](Closing):
     """Context manager over the file of one episode.
 
     Attributes:
@@ -33,7 +33,7 @@ class EpisodeFile[O: (Outcome, CollectedOutcome), C](Closing):
         is_recovered: Whether a crash cut it off.
     """
 
-    info: EpisodeInfo | CollectedInfo
+    info: SimulatedInfo | EpisodeInfo
     outcome: O | None
     num_frames: int
     is_recovered: bool

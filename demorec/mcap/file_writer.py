@@ -10,8 +10,8 @@ from pathlib import Path
 
 from demorec.core.closing import Closing
 from demorec.core.errors import RecordingError
-from demorec.episode.collected import CollectedOutcome, Origin
 from demorec.episode.episode import Outcome
+from demorec.episode.external import ExternalOutcome, Origin
 from demorec.mcap.metadata import OUTCOME, outcome_metadata
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.pictures import PictureCoder
@@ -35,7 +35,7 @@ class WriteStats:
     video_bytes: Mapping[str, int]
 
 
-class FileWriter[O: (Outcome, CollectedOutcome), C: PictureCoder](Closing):
+class FileWriter[O: (Outcome, ExternalOutcome), C: PictureCoder](Closing):
     """Writes one episode; leaving its block without `finish` leaves NAME.mcap.part for `recover`.
 
     Args:

@@ -12,14 +12,14 @@ import numpy as np
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import EpisodeInfo, Frame
+from demorec.episode.episode import Frame, SimulatedInfo
 from demorec.mcap.channels import WRENCH
 from demorec.mcap.streams import frame_streams
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 
 
-def check_joint_names(info: EpisodeInfo) -> None:
+def check_joint_names(info: SimulatedInfo) -> None:
     """Raise RecordingError unless the robot's joints are different ones that its URDF has."""
     robot = info.robot
     known = {joint.name for joint in Urdf.load(asset_path(robot.urdf)).joints if joint.kind != "fixed"}
@@ -37,7 +37,7 @@ def check_joint_names(info: EpisodeInfo) -> None:
 class FrameCheck:
     """Checks frame after frame of one episode; takes microseconds, since it is part of every recording."""
 
-    def __init__(self, info: EpisodeInfo) -> None:
+    def __init__(self, info: SimulatedInfo) -> None:
         self._joints, self._arm = (len(info.robot.joint_names),), (len(info.robot.arm_joints),)
         self._objects = {body.name for body in info.scene.movable}
         self._cameras = {camera.name for camera in info.scene.cameras}

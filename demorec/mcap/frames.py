@@ -8,12 +8,12 @@ from itertools import islice
 
 import numpy as np
 
-from demorec.episode.episode import CameraImages, EpisodeColumns, Event, Frame, JointSample
+from demorec.episode.episode import CameraImages, Event, Frame, JointSample, SimulatedColumns
 from demorec.mcap.reader import RecordingReader
 from demorec.mcap.streams import action_at, observation_at, pose_of
 
 
-def frames_of(recording: RecordingReader, columns: EpisodeColumns | None = None) -> Iterator[Frame]:
+def frames_of(recording: RecordingReader, columns: SimulatedColumns | None = None) -> Iterator[Frame]:
     """Every frame without its pictures: numbers, phase, events, and the joint samples before it.
 
     Args:
@@ -55,7 +55,7 @@ def _samples_before_frames(recording: RecordingReader, times: list[int]) -> dict
     return result
 
 
-def decoded_images(recording: RecordingReader, columns: EpisodeColumns) -> Iterator[Mapping[str, CameraImages]]:
+def decoded_images(recording: RecordingReader, columns: SimulatedColumns) -> Iterator[Mapping[str, CameraImages]]:
     """The recorded pictures of every frame, decoded (so not those that were coded), with the recorded camera poses."""
     streams = {
         name: (
@@ -84,7 +84,7 @@ def frames_with_images(recording: RecordingReader) -> Iterator[Frame]:
         yield replace(frame, images=images)
 
 
-def images_at(recording: RecordingReader, columns: EpisodeColumns, frame: int) -> Mapping[str, CameraImages]:
+def images_at(recording: RecordingReader, columns: SimulatedColumns, frame: int) -> Mapping[str, CameraImages]:
     """The pictures of one frame; only those from the keyframe before it on are decoded."""
 
     def at[P](pictures: Callable[[str], Iterator[P]], camera: str) -> P:

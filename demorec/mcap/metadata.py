@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from demorec.core.errors import RecordingError, in_words
 from demorec.core.plain import to_json
-from demorec.episode.collected import CollectedOutcome
-from demorec.episode.episode import FORMAT_VERSION, EpisodeInfo, Outcome
+from demorec.episode.episode import FORMAT_VERSION, Outcome, SimulatedInfo
+from demorec.episode.external import ExternalOutcome
 from demorec.episode.validity import from_description, read_episode_info
 from demorec.mcap.video import VideoSettings
 
@@ -41,7 +41,7 @@ class CameraStreams:
     segmentation: bool = False
 
 
-def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
+def episode_metadata(info: SimulatedInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
     """The record that makes an MCAP file a recording; the first few values are for people."""
     return sealed(
         {
@@ -57,13 +57,13 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
     )
 
 
-def outcome_metadata(outcome: Outcome | CollectedOutcome) -> dict[str, str]:
+def outcome_metadata(outcome: Outcome | ExternalOutcome) -> dict[str, str]:
     """The record that ends a complete recording."""
     success = "unknown" if outcome.success is None else str(outcome.success).lower()
     return sealed({"success": success, "outcome": to_json(outcome)})
 
 
-def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams]]:
+def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[SimulatedInfo, dict[str, CameraStreams]]:
     """Inverse of `episode_metadata`; RecordingError on damage or an unknown format version."""
     check_seal(EPISODE, metadata)
     version = metadata.get("format_version", "")
@@ -85,7 +85,7 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
     return info, cameras
 
 
-def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
+def _check_cameras(info: SimulatedInfo, cameras: Mapping[str, CameraStreams]) -> None:
     """ValueError unless all cameras of the scene (none, before the first frame) were recorded as it says."""
     if cameras and cameras.keys() != {camera.name for camera in info.scene.cameras}:
         raise ValueError("the recorded cameras are not those of the scene")
@@ -97,7 +97,7 @@ def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> N
             raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
 
 
-def read_outcome_metadata[O: Outcome | CollectedOutcome](metadata: Mapping[str, str], kind: type[O]) -> O:
+def read_outcome_metadata[O: Outcome | ExternalOutcome](metadata: Mapping[str, str], kind: type[O]) -> O:
     """Inverse of `outcome_metadata`, of such an outcome; RecordingError on damage."""
     check_seal(OUTCOME, metadata)
     try:

@@ -68,7 +68,7 @@ def _picture(pixels: NDArray[np.uint8]) -> str:
 def frame_table(recording: RecordingReader) -> pd.DataFrame:
     """All numbers as a table, one row a frame, float64 to the bit; the index is `frame_index`.
 
-    Columns are named as in `demorec.episode.episode.EpisodeColumns`, vectors with their component:
+    Columns are named as in `demorec.episode.episode.SimulatedColumns`, vectors with their component:
     `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
     `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.red_cube.z` (m, world frame), `phase`.
     `time_ns` is simulated time since the episode's start.

@@ -5,25 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 from demorec.core.errors import RecordingError
-from demorec.mcap.external.reader import CollectedRecording
-from demorec.mcap.reader import CollectedEpisodeError
-from demorec.mcap.recording import Recording
+from demorec.mcap.external.reader import Recording
+from demorec.mcap.reader import NotSimulatedError
+from demorec.mcap.recording import SimulatedRecording
 
-AnyRecording = Recording | CollectedRecording
+AnyRecording = SimulatedRecording | Recording
 
 
 def open_recording(path: str | Path) -> AnyRecording:
-    """Open a recording; RecordingError as `Recording` and `CollectedRecording`."""
+    """Open a recording; RecordingError as `SimulatedRecording` and `Recording`."""
     try:
+        return SimulatedRecording(path)
+    except NotSimulatedError:
         return Recording(path)
-    except CollectedEpisodeError:
-        return CollectedRecording(path)
 
 
-def is_collected(path: Path) -> bool:
+def is_external(path: Path) -> bool:
     """Whether a file is the recording of a collected episode; False for what cannot be read."""
     try:
         with open_recording(path) as recording:
-            return isinstance(recording, CollectedRecording)
+            return isinstance(recording, Recording)
     except RecordingError:
         return False

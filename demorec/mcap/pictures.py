@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.collected import CollectedCamera
 from demorec.episode.episode import CameraImages, Frame
-from demorec.episode.scene import Camera
+from demorec.episode.external import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.mcap import messages
 from demorec.mcap.channels import camera_topic, video_topic
 from demorec.mcap.depth import FORMAT as DEPTH_FORMAT
@@ -42,7 +42,7 @@ class PictureTopics:
         codec: Of the pictures.
     """
 
-    def __init__(self, camera: Camera | CollectedCamera, codec: str) -> None:
+    def __init__(self, camera: SceneCamera | Camera, codec: str) -> None:
         self._codec, self._size = codec, (camera.height, camera.width)
         self._topic, self._again_topic = video_topic(camera.name, codec), camera_topic(camera.name, "video")
         self._frame_id = camera_frame(camera.name)
@@ -81,11 +81,9 @@ class PictureCoder:
         last_ns: Stamp of the last picture.
     """
 
-    def __init__(
-        self, camera: Camera | CollectedCamera, video: VideoConfig, fps: int, *, compiled: bool = False
-    ) -> None:
+    def __init__(self, camera: SceneCamera | Camera, video: VideoConfig, fps: int, *, compiled: bool = False) -> None:
         self._encoder, self._pixels = None, PixelCounter(compiled=compiled)
-        if isinstance(camera, CollectedCamera) and camera.kept:
+        if isinstance(camera, Camera) and camera.kept:
             self.settings = settings_of_coded(camera.kept, camera.width, camera.height, fps)
         else:
             self._encoder = make_encoder(video, camera.width, camera.height, fps)
@@ -125,7 +123,7 @@ class CameraRecorder(PictureCoder):
         streams: What is recorded; depth and segmentation when the first frame has them.
     """
 
-    def __init__(self, camera: Camera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
+    def __init__(self, camera: SceneCamera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
         self._camera = camera
         super().__init__(camera, video, fps, compiled=True)
         self.streams = CameraStreams(

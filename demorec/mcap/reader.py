@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json
-from demorec.episode.episode import EpisodeColumns, EpisodeInfo, Event, JointSample, Outcome, frame_time_ns
+from demorec.episode.episode import Event, JointSample, Outcome, SimulatedColumns, SimulatedInfo, frame_time_ns
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.depth import decode_depth
 from demorec.mcap.episode_file import EpisodeFile
 from demorec.mcap.labels import LabelDecoder, from_labels
-from demorec.mcap.streams import Columns, FrameStream, frame_streams, merged_columns
+from demorec.mcap.streams import ColumnArrays, FrameStream, frame_streams, merged_columns
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 from demorec.robots.urdf import check_primitives
 
 
-class CollectedEpisodeError(RecordingError):
-    """The recording is one of a collected episode, which `CollectedRecording` reads."""
+class NotSimulatedError(RecordingError):
+    """The recording is one of a collected episode, which `Recording` reads."""
 
 
 class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
@@ -41,7 +41,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
     """
 
-    info: EpisodeInfo
+    info: SimulatedInfo
     _said: tuple[tuple[int, bytes], ...] | None = None
     """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
@@ -50,7 +50,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
         if found is None and metadata.COLLECTED in self._container.metadata_names:
-            raise CollectedEpisodeError(
+            raise NotSimulatedError(
                 "This needs an episode that demorec simulated; this one was collected from another robot or program "
                 f"and has no scene: {self.path}"
             )
@@ -95,7 +95,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         fps = self.info.fps
         return (np.arange(self.num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)
 
-    def columns(self) -> EpisodeColumns:
+    def columns(self) -> SimulatedColumns:
         """All numbers, one row a frame, to the bit as they were written."""
         streams = frame_streams(self.info)
         times = self._frame_times()
@@ -111,11 +111,11 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
             misses = _held(blocks[channels.DELIBERATE_MISS], messages.read_boolean, times, False)
         # Before the first frame nobody knows which cameras there are.
         columns["world_from_camera"] = {name: columns["world_from_camera"][name] for name in self.cameras}
-        return EpisodeColumns(
+        return SimulatedColumns(
             time_ns=times, phase=tuple(phases), is_deliberate_miss=np.array(misses, dtype=np.bool_), **columns
         )
 
-    def _columns_of(self, stream: FrameStream, block: Block, times: NDArray[np.int64]) -> Columns:
+    def _columns_of(self, stream: FrameStream, block: Block, times: NDArray[np.int64]) -> ColumnArrays:
         """The columns of a stream, which must have one message at each of `times` (T,)."""
         if not np.array_equal(block.time_ns, times):
             raise RecordingError(
@@ -312,7 +312,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         return result.hexdigest()
 
 
-def _column_bytes(columns: EpisodeColumns) -> Iterator[tuple[str, bytes]]:
+def _column_bytes(columns: SimulatedColumns) -> Iterator[tuple[str, bytes]]:
     """Name and bytes of every column that was recorded."""
     for field in dataclasses.fields(columns):
         value = getattr(columns, field.name)

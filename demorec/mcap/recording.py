@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING, overload
 
-from demorec.episode.episode import EpisodeColumns, Frame
+from demorec.episode.episode import Frame, SimulatedColumns
 from demorec.mcap.frames import frames_of, frames_with_images, images_at
 from demorec.mcap.notebook import described, frame_table, html_page
 from demorec.mcap.reader import RecordingReader
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class Recording(RecordingReader):
+class SimulatedRecording(RecordingReader):
     """Context manager over one recording, and the sequence of its frames.
 
     `for frame in recording` gives numbers and pictures together, `recording[120]`, `recording[-1]` and
@@ -44,7 +44,7 @@ class Recording(RecordingReader):
         return dataclasses.replace(frame, images=images_at(self, columns, frame.frame_index))
 
     @cached_property
-    def _numbers(self) -> tuple[EpisodeColumns, list[Frame]]:
+    def _numbers(self) -> tuple[SimulatedColumns, list[Frame]]:
         """All numbers, kept from the first frame on that is asked for."""
         columns = self.columns()
         return columns, list(frames_of(self, columns))

@@ -16,16 +16,16 @@ from mcap.records import Metadata
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.core.files import make_folder
-from demorec.episode.collected import CollectedOutcome, Origin
 from demorec.episode.episode import Outcome, frame_time_ns
+from demorec.episode.external import ExternalOutcome, Origin
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import SalvagedMessage, salvage
-from demorec.mcap.external.metadata import read_collected_metadata
-from demorec.mcap.external.reader import CollectedRecording
+from demorec.mcap.external.metadata import read_external_metadata
+from demorec.mcap.external.reader import Recording
 from demorec.mcap.external.streams import FRAMES, feature_streams
 from demorec.mcap.opening import open_recording
 from demorec.mcap.part_file import PartFile
-from demorec.mcap.recording import Recording
+from demorec.mcap.recording import SimulatedRecording
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.mcap.streams import frame_streams
 
@@ -124,7 +124,7 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
             info, _ = metadata.read_episode_metadata(item.metadata)
             return bool(origin) and info.origin == origin
         if isinstance(item, Metadata) and item.name == metadata.COLLECTED:
-            collected, _, _ = read_collected_metadata(item.metadata)
+            collected, _, _ = read_external_metadata(item.metadata)
             return collected.origin.kind == "import" and collected.origin == origin
         if isinstance(item, str):
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
@@ -145,8 +145,8 @@ class _Frames(NamedTuple):
 
     num_frames: int
     keeps: Callable[[SalvagedMessage, int], bool]
-    reader: type[Recording] | type[CollectedRecording]
-    outcome: type[Outcome] | type[CollectedOutcome]
+    reader: type[SimulatedRecording] | type[Recording]
+    outcome: type[Outcome] | type[ExternalOutcome]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +187,7 @@ def _survey(source: Path) -> _Survey:
             found[item.name] = item.metadata
         elif item is not None:
             counts[item.topic] += 1
-    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.COLLECTED, _frames_of_collected)):
+    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.COLLECTED, _frames_of_external)):
         if name not in found:
             continue
         frames, outcome, reason = look(found[name], counts), found.get(metadata.OUTCOME), reason or "the end is missing"
@@ -207,16 +207,16 @@ def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
     num_frames = min(counts[topic] for topic in topics)
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, Recording, Outcome)
+    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, SimulatedRecording, Outcome)
 
 
-def _frames_of_collected(episode: dict[str, str], counts: Counter[str]) -> _Frames:
+def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
     """Pictures come before the frames that hold them, so what is there of the frames has its pictures."""
-    info, _, _ = read_collected_metadata(episode)
+    info, _, _ = read_external_metadata(episode)
     topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
     num_frames = min(counts[topic] for topic in topics)
 
     def keeps(message: SalvagedMessage, count: int) -> bool:
         return message.topic not in topics | {channels.TF} or count <= num_frames
 
-    return _Frames(num_frames, keeps, CollectedRecording, CollectedOutcome)
+    return _Frames(num_frames, keeps, Recording, ExternalOutcome)

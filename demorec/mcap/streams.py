@@ -1,7 +1,7 @@
 """The streams with one message a frame, one row each: topic, ROS 2 type, layout, encoding and decoding.
 
 `frame_streams` is the table. A row says which values of a frame its message holds (`parts`) and which columns of
-`EpisodeColumns` they become when a recording is read (`columns`); the writer, the reader, recovery and the checks go
+`SimulatedColumns` they become when a recording is read (`columns`); the writer, the reader, recovery and the checks go
 through the rows and know no topic by name. `since` is the format version that brought a stream: in older recordings it
 is neither expected nor written, and what it would tell is None.
 """
@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Action, EpisodeColumns, EpisodeInfo, Frame, Observation
+from demorec.episode.episode import Action, Frame, Observation, SimulatedColumns, SimulatedInfo
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
 from demorec.mcap.channels import (
@@ -41,8 +41,8 @@ POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
 """Position and quaternion xyzw in a layout."""
 _WRENCH_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
 
-Columns = dict[str, Array | dict[str, Array]]
-"""Field of `EpisodeColumns` -> its rows, or name -> rows where the field is a mapping."""
+ColumnArrays = dict[str, Array | dict[str, Array]]
+"""Field of `SimulatedColumns` -> its rows, or name -> rows where the field is a mapping."""
 
 
 class FrameValues(NamedTuple):
@@ -78,7 +78,7 @@ class FrameStream:
     schema: str
     layout: Layout
     parts: Callable[[FrameValues], Sequence[Array]]
-    columns: Callable[[Array], Columns]
+    columns: Callable[[Array], ColumnArrays]
     arrange: Callable[[Array], Array] | None = None
     since: int = 1
 
@@ -94,7 +94,7 @@ class FrameStream:
         return self.layout.encode(np.array(time_ns, dtype=np.int64), values)
 
 
-def frame_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
+def frame_streams(info: SimulatedInfo) -> tuple[FrameStream, ...]:
     """The streams of a recording of the version that `info` names.
 
     `/joint_states` comes first; it may have more messages between the frames.
@@ -102,7 +102,7 @@ def frame_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
     return tuple(stream for stream in _every_stream(info) if stream.since <= info.format_version)
 
 
-def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
+def _every_stream(info: SimulatedInfo) -> Iterator[FrameStream]:
     """The table of all versions' streams."""
     robot, scene = info.robot, info.scene
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
@@ -148,8 +148,8 @@ def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
     return layout(messages.TRANSFORMS, rows)
 
 
-def merged_columns(found: Iterable[Columns]) -> dict[str, Any]:
-    """The columns of several streams as arguments of `EpisodeColumns`; the mappings are there even when empty."""
+def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
+    """The columns of several streams as arguments of `SimulatedColumns`; the mappings are there even when empty."""
     merged: dict[str, Any] = {"object_poses": {}, "world_from_camera": {}}
     for columns in found:
         for name, rows in columns.items():
@@ -163,7 +163,7 @@ def merged_columns(found: Iterable[Columns]) -> dict[str, Any]:
 # --------------------------------------------------------------------------- columns back into one frame's values
 
 
-def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
+def observation_at(columns: SimulatedColumns, frame: int) -> Observation:
     """The observation of a frame, to the bit."""
     return Observation(
         joint_position=columns.joint_position[frame].copy(),
@@ -177,7 +177,7 @@ def observation_at(columns: EpisodeColumns, frame: int) -> Observation:
     )
 
 
-def action_at(columns: EpisodeColumns, frame: int, kind: Literal["action", "command"]) -> Action:
+def action_at(columns: SimulatedColumns, frame: int, kind: Literal["action", "command"]) -> Action:
     """What the expert wanted at a frame, or the command that was sent to the motors."""
     return Action(
         joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),
@@ -197,7 +197,7 @@ def pose_of(row: Array) -> Pose:
 _JOINT_STATE = ("joint_position", "joint_velocity", "joint_effort")
 
 
-def _joint_state_columns(values: Array) -> Columns:
+def _joint_state_columns(values: Array) -> ColumnArrays:
     return {name: part.copy() for name, part in zip(_JOINT_STATE, np.split(values, 3, axis=1), strict=True)}
 
 
@@ -208,7 +208,7 @@ def _gripper_parts(robot: RobotSpec, values: FrameValues) -> Sequence[Array]:
     return (np.array((observation.gripper_width, velocity, observation.contact_force)),)
 
 
-def _gripper_columns(values: Array) -> Columns:
+def _gripper_columns(values: Array) -> ColumnArrays:
     return {"gripper_width": values[:, 0].copy(), "contact_force": values[:, 2].copy()}
 
 
@@ -222,7 +222,7 @@ def _with_zeros(targets: Array) -> Array:
     return np.concatenate((targets, np.zeros((len(targets), 2 * targets.shape[1]))), axis=1)
 
 
-def _target_columns(kind: str, values: Array) -> Columns:
+def _target_columns(kind: str, values: Array) -> ColumnArrays:
     num_arm = values.shape[1] // 3 - 1
     return {f"{kind}_joint_target": values[:, :num_arm].copy(), f"{kind}_gripper": values[:, num_arm].copy()}
 
@@ -237,7 +237,7 @@ def _joints(
     topic: str,
     names: Sequence[str],
     parts: Callable[[FrameValues], Sequence[Array]],
-    columns: Callable[[Array], Columns],
+    columns: Callable[[Array], ColumnArrays],
     arrange: Callable[[Array], Array] | None = None,
 ) -> FrameStream:
     slots = (Slot.VALUE,) * len(names)  # position, velocity, effort

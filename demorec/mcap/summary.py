@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from demorec.episode.episode import SuccessCheck
-from demorec.mcap.external.reader import CollectedRecording
-from demorec.mcap.recording import Recording
+from demorec.mcap.external.reader import Recording
+from demorec.mcap.recording import SimulatedRecording
 from demorec.mcap.video import VideoSettings
 
 
@@ -70,7 +70,7 @@ class RecordingSummary:
     versions: Mapping[str, str]
 
 
-def common_facts(recording: Recording | CollectedRecording) -> dict[str, Any]:
+def common_facts(recording: SimulatedRecording | Recording) -> dict[str, Any]:
     """What summaries of both kinds of recordings tell, by the names of their attributes."""
     info, outcome = recording.info, recording.outcome
     return {
@@ -97,7 +97,7 @@ def summarize(path: Path) -> RecordingSummary:
     Raises:
         RecordingError: It is none, or damaged.
     """
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         info, outcome = recording.info, recording.outcome
         return RecordingSummary(
             **common_facts(recording),

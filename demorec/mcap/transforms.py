@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, quat_multiply
-from demorec.episode.episode import EpisodeInfo, Observation
+from demorec.episode.episode import Observation, SimulatedInfo
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf, joint_motion
 
@@ -37,7 +37,7 @@ class FrameTree:
         moving: (parent, child) of those that do, in the order of `arrange`.
     """
 
-    def __init__(self, info: EpisodeInfo) -> None:
+    def __init__(self, info: SimulatedInfo) -> None:
         urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
         self._num_joints = len(info.robot.joint_names)
         self._objects = [body.name for body in info.scene.movable]

@@ -15,7 +15,7 @@ import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import EpisodeInfo, Event, Frame, JointSample, Outcome, frame_time_ns
+from demorec.episode.episode import Event, Frame, JointSample, Outcome, SimulatedInfo, frame_time_ns
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.cdr import encode
 from demorec.mcap.file_writer import FileWriter
@@ -41,7 +41,7 @@ class _Pending(NamedTuple):
     changes: list[tuple[str, str, bytes]]
 
 
-class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
+class SimulatedWriter(FileWriter[Outcome, CameraRecorder]):
     """Context manager that writes one episode; leaving it without `finish` leaves NAME.mcap.part for `recover`.
 
     Depth and segmentation are recorded when the first frame has them.
@@ -59,7 +59,7 @@ class EpisodeWriter(FileWriter[Outcome, CameraRecorder]):
     """
 
     def __init__(
-        self, path: Path, info: EpisodeInfo, *, video: VideoConfig | None = None, overwrite: bool = False
+        self, path: Path, info: SimulatedInfo, *, video: VideoConfig | None = None, overwrite: bool = False
     ) -> None:
         check_joint_names(info)
         self._info = info

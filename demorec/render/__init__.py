@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import Camera, Light, Rgba, Texture
+from demorec.episode.scene import Light, Rgba, SceneCamera, Texture
 
 VisualKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
 
@@ -88,7 +88,7 @@ class RenderSetup:
     """
 
     bodies: tuple[VisualBody, ...]
-    cameras: tuple[Camera, ...]
+    cameras: tuple[SceneCamera, ...]
     mounts: Mapping[str, Mount] = field(default_factory=dict)
     light: Light = field(default_factory=Light)
     depth: bool = False

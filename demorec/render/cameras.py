@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from demorec.core.geometry import look_at
-from demorec.episode.scene import Camera, Vector3
+from demorec.episode.scene import SceneCamera, Vector3
 from demorec.robots.robot import RobotSpec
 
 
@@ -33,9 +33,9 @@ class CameraPreset:
     fov_y: float = math.radians(45.0)
     fov_x: float = 0.0
 
-    def camera(self, name: str, robot: RobotSpec, *, width: int, height: int) -> Camera:
+    def camera(self, name: str, robot: RobotSpec, *, width: int, height: int) -> SceneCamera:
         """The camera for a picture size and a robot."""
-        return Camera(
+        return SceneCamera(
             name=name,
             width=width,
             height=height,

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import Camera, Scene
+from demorec.episode.scene import Scene, SceneCamera
 from demorec.render import Mount, Renderer, RenderSetup, VisualBody
 
 
@@ -47,7 +47,7 @@ class Painter:
     def __init__(
         self,
         renderer: Renderer,
-        cameras: tuple[Camera, ...],
+        cameras: tuple[SceneCamera, ...],
         *,
         true_from_recorded: Mapping[str, Pose] | None = None,
         depth: bool = False,

@@ -6,7 +6,7 @@ import math
 
 from demorec.core.errors import RenderError
 from demorec.core.geometry import Array, Pose
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.render import RenderSetup, first_rows
 
 MAX_SAMPLES = 1 << 28
@@ -24,7 +24,7 @@ def check_setup(setup: RenderSetup) -> None:
             )
 
 
-def _check_camera(camera: Camera, *, antialias: bool) -> None:
+def _check_camera(camera: SceneCamera, *, antialias: bool) -> None:
     """Raise RenderError for a camera that cannot draw: no pixels, too many, or clipping distances that cross."""
     if camera.width < 1 or camera.height < 1:
         raise RenderError(f"Camera {camera.name!r} is {camera.width}x{camera.height}: both sizes must be at least 1.")
@@ -42,7 +42,7 @@ def _check_camera(camera: Camera, *, antialias: bool) -> None:
         raise RenderError(f"Camera {camera.name!r} has a field of view of {camera.fov_y} rad: allowed is 0 to pi.")
 
 
-def world_from_camera(setup: RenderSetup, camera: Camera, poses: Array) -> Pose:
+def world_from_camera(setup: RenderSetup, camera: SceneCamera, poses: Array) -> Pose:
     """Pose of a camera, OpenCV axes, with `poses` as `Renderer.render` is given them."""
     if camera.mount == "world":
         return camera.mount_from_camera

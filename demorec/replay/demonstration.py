@@ -13,9 +13,9 @@ import numpy as np
 
 from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option
 from demorec.core.geometry import Array
-from demorec.episode.episode import Action, EpisodeInfo, Frame, SuccessCheck
+from demorec.episode.episode import Action, Frame, SimulatedInfo, SuccessCheck
 from demorec.episode.features import ACTION, STATE, ActionKind
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.mcap.frames import frames_of
 from demorec.mcap.streams import action_at
 
@@ -78,7 +78,7 @@ class Demonstration:
     """
 
     name: str
-    info: EpisodeInfo
+    info: SimulatedInfo
     fps: int
     joint_position: Array
     joint_velocity: Array | None
@@ -101,7 +101,7 @@ class Demonstration:
         return len(self.joint_position)
 
 
-def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstration:
+def open_demonstration(recording: SimulatedRecording, options: ReplayOptions) -> Demonstration:
     """A recording to be replayed.
 
     Raises:
@@ -141,7 +141,7 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
 
 def open_file(path: Path, options: ReplayOptions) -> Demonstration:
     """A recording's file to be replayed; errors as `open_demonstration`."""
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         return replace(open_demonstration(recording, options), source=path)
 
 

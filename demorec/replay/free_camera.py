@@ -13,7 +13,7 @@ from demorec.core.config import read_toml
 from demorec.core.errors import ConfigError, in_words
 from demorec.core.geometry import Pose, look_at
 from demorec.core.plain import from_plain
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class FreeCamera:
     width: int | None = None
     height: int | None = None
 
-    def camera(self, name: str, *, width: int, height: int) -> Camera:
+    def camera(self, name: str, *, width: int, height: int) -> SceneCamera:
         """The camera; ConfigError for an impossible description."""
         if (self.look_at is None) == (self.quat_xyzw is None):
             raise ConfigError(f"The camera {name!r} needs either look_at or quat_xyzw, not both and not neither.")
@@ -56,7 +56,7 @@ class FreeCamera:
                 pose = Pose(position=np.array(self.position), quat_xyzw=np.array(self.quat_xyzw) / length)
         except ValueError as error:
             raise ConfigError(f"The camera {name!r} cannot stand like this ({error}).") from error
-        return Camera(
+        return SceneCamera(
             name=name,
             width=self.width or width,
             height=self.height or height,

@@ -13,7 +13,7 @@ from demorec.core.files import make_folder
 from demorec.core.plain import from_plain
 from demorec.core.tables import TASKS
 from demorec.loop import Workshop
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SimulatedWriter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
 from demorec.replay.rerender import recorded_view, view_behaviour, view_painter
@@ -72,7 +72,7 @@ def record_replay(
     video = from_plain(d.info.config.get("video", {}), VideoConfig)
     world, renderer = workshop.equip(info)
     painter = view_painter(renderer, view, d.info.config) if renderer else None
-    with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:
+    with SimulatedWriter(path, info, video=video, overwrite=overwrite) as writer:
         report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
         writer.finish(outcome)
     return report, None if d.source is None else (d.source, path)

@@ -22,11 +22,11 @@ from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
 from demorec.core.user_modules import split_name
 from demorec.episode.camera_error import told_error, true_camera
-from demorec.episode.episode import EpisodeColumns, EpisodeInfo, Outcome
-from demorec.episode.scene import Camera, Scene
+from demorec.episode.episode import Outcome, SimulatedColumns, SimulatedInfo
+from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.loop import prepare
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.mcap.frames import frames_of
 from demorec.render import Renderer
 from demorec.render.painter import Painter
@@ -99,11 +99,11 @@ class SceneView:
     """
 
     scene: Scene
-    true_cameras: tuple[Camera, ...]
+    true_cameras: tuple[SceneCamera, ...]
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
 
 
-def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
+def recorded_view(info: SimulatedInfo, allowed: Collection[str]) -> SceneView:
     """The view of a recording.
 
     Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
@@ -136,7 +136,7 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
     return SceneView(scene=info.scene, true_cameras=true_cameras, true_from_recorded=errors)
 
 
-def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
+def new_view(info: SimulatedInfo, options: RerenderOptions) -> SceneView:
     """The view that the options ask for.
 
     Raises:
@@ -178,7 +178,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     return SceneView(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
 
 
-def view_behaviour(info: EpisodeInfo, view: SceneView) -> dict[str, float]:
+def view_behaviour(info: SimulatedInfo, view: SceneView) -> dict[str, float]:
     """What was drawn for an episode, without the calibration errors of cameras that have none in the view."""
     off = {f"calibration_{name}" for name in view.true_from_recorded}
     return {
@@ -188,14 +188,14 @@ def view_behaviour(info: EpisodeInfo, view: SceneView) -> dict[str, float]:
     }
 
 
-def _default_size(info: EpisodeInfo, options: RerenderOptions) -> tuple[int, int]:
+def _default_size(info: SimulatedInfo, options: RerenderOptions) -> tuple[int, int]:
     first = info.scene.cameras[0] if info.scene.cameras else None
     width = options.width or (first.width if first else int(info.config.get("width", 224)))
     height = options.height or (first.height if first else int(info.config.get("height", 224)))
     return width, height
 
 
-def _check_size(camera: Camera) -> None:
+def _check_size(camera: SceneCamera) -> None:
     for what, value in (("width", camera.width), ("height", camera.height)):
         if not 16 <= value <= 8192 or value % 2:
             raise ConfigError(f"The {what} of the camera {camera.name!r} is {value}: it must be even, 16 to 8192.")
@@ -219,7 +219,7 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
     )
 
 
-def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
+def drawing_config(info: SimulatedInfo, options: RerenderOptions) -> dict[str, Any]:
     """The recording's config with what the options change about the pictures."""
     config = dict(info.config)
     same_names = ("renderer", "antialias", "depth", "segmentation", "width", "height")
@@ -257,7 +257,7 @@ def rerender(
     if out.resolve() == source.resolve():
         raise ConfigError(f"The new recording would replace its own source, choose another --out: {out}")
     allow_models(options.allowed)
-    with Recording(source) as recording:
+    with SimulatedRecording(source) as recording:
         info, columns = recording.info, recording.columns()
         if columns.num_frames == 0:
             raise RecordingError(f"The recording has no frames: {source}")
@@ -277,7 +277,7 @@ def rerender(
             make_folder(out.parent)
             with (
                 nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
-                EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
+                SimulatedWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
                 painter = view_painter(warm.of(str(config.get("renderer", "raster"))), view, config)
                 _write_drawn(writer, recording, columns, painter, view.scene)
@@ -294,7 +294,7 @@ def rerender(
 
 
 def _write_drawn(
-    writer: EpisodeWriter, recording: Recording, columns: EpisodeColumns, painter: Painter, scene: Scene
+    writer: SimulatedWriter, recording: SimulatedRecording, columns: SimulatedColumns, painter: Painter, scene: Scene
 ) -> None:
     """All frames of a recording with new pictures of the scene, and its outcome."""
     world = RecordedWorld(
@@ -307,20 +307,20 @@ def _write_drawn(
     writer.finish(_outcome(recording))
 
 
-def _is_drawn(out: Path, info: EpisodeInfo, outcome: Outcome) -> bool:
+def _is_drawn(out: Path, info: SimulatedInfo, outcome: Outcome) -> bool:
     """Whether a whole recording is there whose description is the one that would be written now.
 
     The description holds the digest of the source, the cameras, the looks and every option of the drawing.
     """
     try:
-        with Recording(out) as drawn:
+        with SimulatedRecording(out) as drawn:
             is_same = to_json(drawn.info) == to_json(info) and drawn.outcome == outcome
             return is_same and bool(drawn.digest())  # which reads it to its end, against its checksums
     except RecordingError:
         return False
 
 
-def _outcome(recording: Recording) -> Outcome:
+def _outcome(recording: SimulatedRecording) -> Outcome:
     if recording.outcome is not None:
         return recording.outcome
     return Outcome(
@@ -332,7 +332,7 @@ def _outcome(recording: Recording) -> Outcome:
     )
 
 
-def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[str, int | None]:
+def _compare(recording: SimulatedRecording, out: Path, options: RerenderOptions) -> dict[str, int | None]:
     """The packets of the cameras that were to stay as they were: equal pictures give equal packets.
 
     Returns:
@@ -341,7 +341,7 @@ def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[
     found: dict[str, int | None] = {}
     if options.looks is not None:
         return found
-    with Recording(out) as new:
+    with SimulatedRecording(out) as new:
         how, how_now = ((c.get("renderer"), c.get("antialias", True)) for c in (recording.info.config, new.info.config))
         if how != how_now:
             return found

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from numpy.typing import NDArray
 
 from demorec.check.base import Level, Result
-from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.learn.evaluate.statistics import Rate
 from demorec.report.filmstrip import Filmstrip
 from demorec.report.histogram import Histogram
@@ -49,7 +49,7 @@ class ReportedEpisode:
     phases: tuple[tuple[str, int, int], ...] = ()
     flags: tuple[Result, ...] = ()
     filmstrip: Filmstrip | None = None
-    info: EpisodeInfo | None = None
+    info: SimulatedInfo | None = None
 
     @property
     def success(self) -> bool | None:

@@ -12,10 +12,10 @@ from demorec.check.report import CheckOptions, Subject, SubjectReport, check_sub
 from demorec.core.errors import ConfigError, RecordingError, without_path
 from demorec.core.plain import to_plain
 from demorec.core.processes import in_turn
-from demorec.episode.episode import EpisodeInfo, Outcome
+from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.episode.features import ACTION, STATE, action_names, action_vectors, observation_names, observation_vectors
 from demorec.episode.sensed import ObservationRows
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.report.content import (
     CheckSummaries,
     Components,
@@ -134,14 +134,14 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
     path = subject.path
     source = path.name if path == root else path.relative_to(root).as_posix()
     try:
-        with Recording(path) as recording:
+        with SimulatedRecording(path) as recording:
             episode, counts = _read_recording(recording, camera, strip_bytes)
     except RecordingError as error:
         episode, counts = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
     return replace(episode, source=source, flags=tuple(flags)), counts, checked
 
 
-def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
+def _read_recording(recording: SimulatedRecording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
     info, columns = recording.info, recording.columns()
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
@@ -213,5 +213,5 @@ def _facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode
     yield "made with", few(f"demorec {info.versions.get('demorec', 'of an unknown version')}" for info in infos)
 
 
-def _cameras(info: EpisodeInfo) -> str:
+def _cameras(info: SimulatedInfo) -> str:
     return ", ".join(f"{camera.name} {camera.width}x{camera.height}" for camera in info.scene.cameras) or "none"

@@ -25,7 +25,7 @@ from demorec.check.coverage import MIN_VALUES, drawn_columns, randomised, with_u
 from demorec.core.errors import ConfigError
 from demorec.core.replacing import REPORT, REPORT_MARK, written_whole
 from demorec.core.text import printable
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import ACTION, STATE
 from demorec.report import charts
 from demorec.report.charts import Chart, css_color
@@ -171,7 +171,7 @@ def _words(episode: ReportedEpisode) -> str:
 
 def _coverage(episodes: Sequence[ReportedEpisode]) -> Iterator[dict[str, object]]:
     """For each task the variables of its part of the section."""
-    by_task: dict[str, list[tuple[int, ReportedEpisode, EpisodeInfo]]] = {}
+    by_task: dict[str, list[tuple[int, ReportedEpisode, SimulatedInfo]]] = {}
     for number, episode in enumerate(episodes):
         if episode.info is not None:
             by_task.setdefault(episode.info.task, []).append((number, episode, episode.info))

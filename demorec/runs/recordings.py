@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import RecordingError
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.runs.run_file import Attempt, sha256_of
 
 
@@ -33,7 +33,7 @@ def inspect_recording(path: Path) -> Inspected:
     Raises:
         RecordingError: It is no complete recording.
     """
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         info, outcome = recording.info, recording.outcome
         if outcome is None:
             raise RecordingError(f"The recording was cut off by a crash: {path}")

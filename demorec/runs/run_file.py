@@ -24,7 +24,7 @@ RUN_FORMAT = 1
 MAX_EPISODES = 10_000_000
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
 COLLECTED = "collected"
-"""The "kind" that run.json has where the run's episodes were collected; see `demorec.runs.collected`."""
+"""The "kind" that run.json has where the run's episodes were collected; see `demorec.runs.external`."""
 IMPORT_NAME = "import.json"
 """Beside run.json: what `demorec import` read, and what it found in it (`demorec.sources.import_file`)."""
 STARTING = "starting"

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
-from demorec.episode.collected import CollectedInfo
-from demorec.runs.collected import CollectedEpisode, CollectedFolder, differences
+from demorec.episode.external import EpisodeInfo
+from demorec.runs.external import ExternalEpisode, ExternalFolder, differences
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.episode_writer import PlannedEpisode
 from demorec.sources.import_file import ImportFile, SkippedBag, save_import_file
@@ -55,7 +55,7 @@ class Batch:
         self._skipped: dict[Path, str] = {}
         self._num_new = self._num_done = 0
         self._next_index = known.num_episodes
-        self._kind: CollectedInfo | None = None
+        self._kind: EpisodeInfo | None = None
         self._progress(0, len(paths))
 
     def look(self, pool: Executor) -> list[Bag]:
@@ -80,12 +80,12 @@ class Batch:
     def run(
         self,
         bags: Sequence[Bag],
-        folder: CollectedFolder,
+        folder: ExternalFolder,
         pool: Executor,
         *,
         ahead: int,
         read: Callable[[Bag], PlannedBag],
-        write: Callable[[Job], tuple[BagReport, list[CollectedEpisode]]],
+        write: Callable[[Job], tuple[BagReport, list[ExternalEpisode]]],
         tell: Callable[[BagReport], None],
     ) -> None:
         """Take new bags into a run.
@@ -111,7 +111,7 @@ class Batch:
         if self._known.bags:
             save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
 
-    def _accept(self, folder: CollectedFolder, bag: Bag, read: Future[PlannedBag]) -> Job | None:
+    def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> Job | None:
         """What is to be written of a bag, with its episodes' numbers; None for one that is left out or there."""
         try:
             planned = read.result()

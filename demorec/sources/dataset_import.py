@@ -21,20 +21,20 @@ from demorec.datasets.lerobot.data_stats import column_numbers
 from demorec.datasets.lerobot.depth import DepthScale
 from demorec.datasets.lerobot.files import table_batches
 from demorec.datasets.lerobot.language import COLUMNS, PERSISTENT, spoken_episodes
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
-from demorec.episode.collected import (
-    CollectedCamera,
-    CollectedFeature,
-    CollectedInfo,
+from demorec.episode.external import (
+    Camera,
+    EpisodeInfo,
+    Feature,
     Origin,
     SourceFile,
     Vector,
 )
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.mcap.external.frame_check import MAX_SUBTASK
-from demorec.runs.collected import open_collected_run
+from demorec.runs.external import open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
 from demorec.sources.channel import BagError
@@ -71,7 +71,7 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
     expect(root, "dataset")
     dataset = _Dataset(root)
     num_new = num_frames = 0
-    with open_collected_run(out, recovers=False) as folder:
+    with open_external_run(out, recovers=False) as folder:
         for place in dataset.places:
             info, features, success = dataset.episode(place)
             num_frames += place.length
@@ -107,7 +107,7 @@ class _Dataset:
             raise ConfigError(f"The dataset has no episodes: {root}")
         if empty := [place.episode_index for place in self.places if place.length < 1]:
             raise BagError(f"Episode {empty[0]} of the dataset has no frames: {root}")
-        self.features: list[CollectedFeature] = []
+        self.features: list[Feature] = []
         self.cameras: dict[str, DatasetCamera] = {}
         self.left_out: dict[str, str] = {}
         for name, feature in info.features.items():
@@ -134,7 +134,7 @@ class _Dataset:
         self._reader = RowReader(root, replace(info, features={name: info.features[name] for name in columns}))
         self._digest = functools.cache(sha256_of)
 
-    def episode(self, place: EpisodePlace) -> tuple[CollectedInfo, dict[str, Vector], bool | None]:
+    def episode(self, place: EpisodePlace) -> tuple[EpisodeInfo, dict[str, Vector], bool | None]:
         """What is known of an episode of T frames, its numbers (feature -> (T, D)), and how it ended."""
         columns = self._reader.read(place)
         number, fps = place.episode_index, int(self.info.fps)
@@ -147,16 +147,14 @@ class _Dataset:
         tasks = list(dict.fromkeys(columns["task_index"][:, 0].tolist()))
         if any(not 0 <= task < len(self._tasks) for task in tasks):
             raise BagError(f"Episode {number} names a task that is not in the table of tasks: {self.root}")
-        info = CollectedInfo(
+        info = EpisodeInfo(
             episode_index=number,
             instruction="; ".join(" ".join(self._tasks[task].split()) for task in tasks),
             robot=self.info.robot_type or _UNNAMED_ROBOT,
             fps=fps,
             features=tuple(self.features),
             cameras=tuple(
-                CollectedCamera(
-                    name=name, width=camera.width, height=camera.height, kept=camera.kept, source=camera.key
-                )
+                Camera(name=name, width=camera.width, height=camera.height, kept=camera.kept, source=camera.key)
                 for name, camera in self.cameras.items()
             ),
             origin=Origin(kind="import", files=tuple(self._files(place))),
@@ -203,7 +201,7 @@ class _Dataset:
             yield SourceFile(name=name, sha256=self._digest(self.root / name))
 
 
-def _why_left_out(name: str, feature: Feature) -> str:
+def _why_left_out(name: str, feature: DatasetFeature) -> str:
     """Why a feature is in no recording, "" for one that is."""
     if name in AUTOMATIC_FEATURES or name == _SUCCESS:
         return ""
@@ -220,7 +218,7 @@ def _why_left_out(name: str, feature: Feature) -> str:
     return ""
 
 
-def _why_no_distances(feature: Feature) -> str:
+def _why_no_distances(feature: DatasetFeature) -> str:
     """Why the distances of a depth feature cannot be read, "" when they can."""
     if not feature.is_video:
         return "its depth is in images, and depth is read from videos"
@@ -231,12 +229,12 @@ def _why_no_distances(feature: Feature) -> str:
     return ""
 
 
-def _feature(name: str, feature: Feature) -> CollectedFeature:
+def _feature(name: str, feature: DatasetFeature) -> Feature:
     count = int(np.prod(feature.shape))
     names = tuple(name.replace(",", " ") for name in feature.names or ())
     if len(names) != count or len(set(names)) != count or not all(text and text.isprintable() for text in names):
         names = tuple(str(number) for number in range(count))
-    return CollectedFeature(name=name, dtype=_RECORDED[feature.dtype], names=names, source=name)
+    return Feature(name=name, dtype=_RECORDED[feature.dtype], names=names, source=name)
 
 
 def _is_exact(root: Path, name: str) -> bool:

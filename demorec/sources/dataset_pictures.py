@@ -22,7 +22,7 @@ from demorec.datasets.lerobot.files import check_video, table_batches
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.datasets.lerobot.packets import PACKET_CODECS, PacketCodec, access_units, episode_distances
 from demorec.datasets.lerobot.reader import EpisodePlace
-from demorec.episode.collected import Kept
+from demorec.episode.external import Kept
 from demorec.mcap.video import is_keyframe
 from demorec.sources.channel import BagError
 from demorec.sources.frames_writer import Picture

@@ -10,7 +10,7 @@ import numpy as np
 
 from demorec.core.errors import ConfigError
 from demorec.core.files import read_text_limited
-from demorec.episode.collected import CollectedCamera, CollectedFeature
+from demorec.episode.external import Camera, Feature
 from demorec.sources.bag import Bag
 from demorec.sources.channel import BagError
 from demorec.sources.episode_writer import PicturePlan
@@ -40,7 +40,7 @@ def urdf_in_bag(bag: Bag, streams: BagStreams, topic: str) -> str:
     return text
 
 
-def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints: Container[str]) -> CollectedFeature:
+def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints: Container[str]) -> Feature:
     """A feature as recordings know it, given the joints of the robot's model."""
     units = tuple(map(recorded_unit, feature.units))
     sources = lines.mapping.features[name]
@@ -52,7 +52,7 @@ def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints:
         clock = "header" if lines.lines[name, index].is_header else "log"
         told.append(f"{source.topic} {source.field}, {lines.rule((name, index))[0]} by {clock} time")
     moves = [element if element in joints and name == STATE else "" for element in feature.names]
-    return CollectedFeature(
+    return Feature(
         name=name,
         dtype="float32" if feature.values.dtype == np.float32 else "float64",
         names=feature.names,
@@ -62,7 +62,7 @@ def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints:
     )
 
 
-def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> CollectedCamera:
+def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Camera:
     """A camera as recordings know it."""
     clock = "header" if lines.lines[name].is_header else "log"
     info = lines.streams.infos.get(name, {})
@@ -70,7 +70,7 @@ def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Collecte
     size = (plan.head.width, plan.head.height)
     fits = (info.get("width") or size[0], info.get("height") or size[1]) == size
     known = fits and len(matrix) == 9 and matrix[0] > 0 and bool(np.isfinite(matrix).all())
-    return CollectedCamera(
+    return Camera(
         name=name,
         width=plan.head.width,
         height=plan.head.height,

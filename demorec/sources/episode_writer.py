@@ -14,8 +14,8 @@ from typing import Any, Self, cast
 import numpy as np
 
 from demorec.core.config import VideoConfig
-from demorec.episode.collected import DEPTH_UNITS, CollectedFrame, CollectedInfo, CollectedOutcome, Kept, Sample
-from demorec.mcap import CollectedWriter
+from demorec.episode.external import DEPTH_UNITS, EpisodeInfo, ExternalOutcome, Kept, Sample, SampledFrame
+from demorec.mcap import EpisodeWriter
 from demorec.sources.channel import BagError
 from demorec.sources.clock import Int, Timeline
 from demorec.sources.fields import picture_bytes
@@ -107,7 +107,7 @@ class PlannedEpisode:
         subtasks: Row -> what is begun there, in words.
     """
 
-    info: CollectedInfo
+    info: EpisodeInfo
     rows: EpisodeRows
     plans: Mapping[str, PicturePlan]
     subtasks: Mapping[int, str]
@@ -146,7 +146,7 @@ class ImportedEpisodeWriter:
             first = int(plan.numbers.min()) if len(plan.numbers) else 0
             self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.numbers, first))
         self._next_row = 0
-        self._writer = CollectedWriter(path, episode.info, video=video)
+        self._writer = EpisodeWriter(path, episode.info, video=video)
         self._is_finished = False
 
     def __enter__(self) -> Self:
@@ -202,7 +202,7 @@ class ImportedEpisodeWriter:
             }
             pictures = {name: int(waiting.plan.positions[row]) for name, waiting in self._waiting.items()}
             subtask = self._subtasks.get(row, "")
-            self._writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=pictures, subtask=subtask))
+            self._writer.write(SampledFrame(time_ns=time_ns, samples=samples, pictures=pictures, subtask=subtask))
             self._next_row += 1
 
     def finish(self) -> None:
@@ -211,5 +211,5 @@ class ImportedEpisodeWriter:
         if self._next_row < len(self._rows.times_ns):
             missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
             raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
-        self._writer.finish(CollectedOutcome(success=self._rows.window.success, num_frames=self._next_row))
+        self._writer.finish(ExternalOutcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True

@@ -9,13 +9,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.episode.collected import CollectedFrame, CollectedInfo, CollectedOutcome, Sample, Vector
 from demorec.episode.episode import frame_time_ns
-from demorec.mcap import CollectedWriter
-from demorec.runs.collected import CollectedFolder
+from demorec.episode.external import EpisodeInfo, ExternalOutcome, Sample, SampledFrame, Vector
+from demorec.mcap import EpisodeWriter
+from demorec.runs.external import ExternalFolder
 
 Picture = bytes | NDArray[Any]
-"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `CollectedWriter.picture` takes them."""
+"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `EpisodeWriter.picture` takes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +37,8 @@ class FramesImport:
 
 
 def write_frames(
-    folder: CollectedFolder,
-    info: CollectedInfo,
+    folder: ExternalFolder,
+    info: EpisodeInfo,
     frames: Iterable[Mapping[str, Vector]],
     pictures: Mapping[str, Iterator[Picture]],
     *,
@@ -65,7 +65,7 @@ def write_frames(
     """
     folder.check_fits(info)
     path = folder.path_of(info.episode_index)
-    writer = CollectedWriter(path, info, video=video)
+    writer = EpisodeWriter(path, info, video=video)
     leads = leads or {}
     begin = max(leads.values(), default=0)
     try:
@@ -78,9 +78,9 @@ def write_frames(
             shown = {name: writer.picture(name, time_ns, next(images)) for name, images in pictures.items()}
             samples = {name: Sample(stamp_ns=time_ns, vector=vector) for name, vector in vectors.items()}
             subtask = (subtasks or {}).get(count, "")
-            writer.write(CollectedFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
+            writer.write(SampledFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
             count += 1
-        writer.finish(CollectedOutcome(success=success, num_frames=count))
+        writer.finish(ExternalOutcome(success=success, num_frames=count))
     except BaseException:
         writer.discard()
         raise

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
-from demorec.episode.collected import CollectedFeature, Vector
+from demorec.episode.external import Feature, Vector
 from demorec.sources.fields import converted
 from demorec.sources.hdf5_mapping import DatasetPart
 from demorec.sources.mapping_file import MAX_ELEMENTS, STATE, conversion_factor, recorded_unit
@@ -74,7 +74,7 @@ class StoredFeature:
         """float32 where that holds all numbers as they are."""
         return np.float32 if all(column.is_single for column in self.columns) else np.float64
 
-    def described(self, joints: Container[str]) -> CollectedFeature:
+    def described(self, joints: Container[str]) -> Feature:
         """The feature as recordings know it, given the joints of the robot's model."""
         names = tuple(name for column in self.columns for name in column.names)
         units = tuple(
@@ -83,7 +83,7 @@ class StoredFeature:
         called = (name.removesuffix(".pos") for name in names)  # as LeRobot calls the position of a joint
         moves = tuple(name if name in joints and self.name == STATE else "" for name in called)
         source = "; ".join(column.part.dataset for column in self.columns)
-        return CollectedFeature(
+        return Feature(
             name=self.name,
             dtype="float32" if self.dtype is np.float32 else "float64",
             names=names,

@@ -16,10 +16,10 @@ from pathlib import Path
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
-from demorec.episode.collected import CollectedInfo, Origin, SourceFile, Vector
+from demorec.episode.external import EpisodeInfo, Origin, SourceFile, Vector
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.robots.urdf import Urdf
-from demorec.runs.collected import differences, open_collected_run
+from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
 from demorec.sources.description import urdf_text
@@ -141,7 +141,7 @@ def _num_rows(observed: Sequence[StoredArray], others: Sequence[StoredArray]) ->
 
 def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: VideoConfig) -> int:
     """Record what is not there; how many episodes that were."""
-    with open_collected_run(out, recovers=False) as folder:
+    with open_external_run(out, recovers=False) as folder:
         missing = [plan for plan in plans if not folder.has(plan.info)]
         for plan in missing:
             with ForeignFile(plan.path) as file, _named(plan.path):
@@ -168,7 +168,7 @@ class _Plan:
                 joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf or attribute else set()
             except ValueError as error:
                 raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
-            self.info = CollectedInfo(
+            self.info = EpisodeInfo(
                 episode_index=episode_index,
                 instruction=task_of(file, place, mapping),
                 robot=mapping.robot.name,

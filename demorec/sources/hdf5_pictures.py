@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.core.config import MAX_PIXELS
 from demorec.datasets.hdf5.foreign import StoredArray
-from demorec.episode.collected import CollectedCamera, Kept
+from demorec.episode.external import Camera, Kept
 from demorec.sources.fields import FieldError
 from demorec.sources.frames_writer import Picture
 from demorec.sources.hdf5_features import Hdf5FitError
@@ -78,11 +78,9 @@ class StoredCamera:
             self._scale = _float_scale(array)
             self.told = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.told}"
 
-    def described(self) -> CollectedCamera:
+    def described(self) -> Camera:
         """The camera as recordings know it."""
-        return CollectedCamera(
-            name=self.name, width=self.width, height=self.height, kept=self.kept, source=self._camera.dataset
-        )
+        return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=self._camera.dataset)
 
     def pictures(self) -> Iterator[Picture]:
         """One a row.

@@ -17,18 +17,18 @@ import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
-from demorec.episode.collected import CollectedInfo, Origin, SourceFile
+from demorec.episode.external import EpisodeInfo, Origin, SourceFile
 from demorec.mcap.external.frame_check import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.video import size_problem
 from demorec.robots.urdf import Urdf
-from demorec.runs.collected import (
-    CollectedEpisode,
-    collected_line,
+from demorec.runs.external import (
+    ExternalEpisode,
     differences,
     episode_path,
-    open_collected_run,
+    external_line,
+    open_external_run,
 )
 from demorec.sources.bag import Bag, bags_in
 from demorec.sources.batch import Batch, ImportResult, Job, PlannedBag, files_of
@@ -89,7 +89,7 @@ def import_bags(
     with processes(workers) as pool:
         new = batch.look(pool)
         if new or (known.bags and batch.skipped_bags() != known.skipped):
-            with open_collected_run(out, recovers=False) as folder:
+            with open_external_run(out, recovers=False) as folder:
                 ahead = 1 if workers == 1 else 2 * workers
                 read, write = partial(_plan, recipe), partial(_write, recipe)
                 batch.run(new, folder, pool, ahead=ahead, read=read, write=write, tell=tell)
@@ -110,12 +110,12 @@ def _plan(recipe: _Recipe, bag: Bag) -> PlannedBag:
     return _Import(bag, dict(files_of(bag)), recipe.mapping, recipe.urdf, recipe.video).plan()
 
 
-def _write(recipe: _Recipe, job: Job) -> tuple[BagReport, list[CollectedEpisode]]:
+def _write(recipe: _Recipe, job: Job) -> tuple[BagReport, list[ExternalEpisode]]:
     """Write the episodes of a bag; its report, and their lines of run.json."""
     files = dict(job.report.files)
     _Import(job.bag, files, recipe.mapping, recipe.urdf, recipe.video).write(job.episodes, job.folder)
     paths = [episode_path(job.folder, episode.info.episode_index) for episode in job.episodes]
-    return job.report, [collected_line(path) for path in paths]
+    return job.report, [external_line(path) for path in paths]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ class _Import:
         except ValueError as error:
             raise BagError(f"The robot's model cannot be used ({error}): {self.bag.path}") from error
         files = tuple(SourceFile(name=name, sha256=sha256) for name, sha256 in self.files.items())
-        info = CollectedInfo(
+        info = EpisodeInfo(
             episode_index=index,
             instruction=" ".join(task_text(self.bag, lines.streams, rows.window, self.mapping).split()),
             robot=self.mapping.robot.name,

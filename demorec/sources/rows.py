@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.collected import DEPTH_UNITS
+from demorec.episode.external import DEPTH_UNITS
 from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.channel import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.episode.collected import DEPTH_UNITS
+from demorec.episode.external import DEPTH_UNITS
 from demorec.mcap.limits import SpentError
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.candidates import Vector, transforms_of, vectors_of

@@ -9,7 +9,7 @@ from demorec.episode.episode import Action, Event
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """How the expert does it in one episode; recorded as `EpisodeInfo.behaviour`.
+    """How the expert does it in one episode; recorded as `SimulatedInfo.behaviour`.
 
     Attributes:
         speed: Factor on the speeds of all motions; touching down with an object is never faster than at 1.

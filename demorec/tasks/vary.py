@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.scene import Body, Camera, Light, Rgba, Scene, Shape, Texture, Vector3
+from demorec.episode.scene import Body, Light, Rgba, Scene, SceneCamera, Shape, Texture, Vector3
 from demorec.episode.variation import Ranges
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 from demorec.tasks.script import Behaviour
@@ -187,7 +187,7 @@ def _other_light(light: Light, ranges: Ranges, rng: np.random.Generator) -> Ligh
     )
 
 
-def vary_cameras(cameras: tuple[Camera, ...], ranges: Ranges, rng: np.random.Generator) -> tuple[Camera, ...]:
+def vary_cameras(cameras: tuple[SceneCamera, ...], ranges: Ranges, rng: np.random.Generator) -> tuple[SceneCamera, ...]:
     """Cameras nudged from where they should be; this is recorded as their pose."""
     nudged = []
     for camera in cameras:
@@ -198,7 +198,7 @@ def vary_cameras(cameras: tuple[Camera, ...], ranges: Ranges, rng: np.random.Gen
     return tuple(nudged)
 
 
-def calibration_errors(cameras: tuple[Camera, ...], ranges: Ranges, rng: np.random.Generator) -> dict[str, Pose]:
+def calibration_errors(cameras: tuple[SceneCamera, ...], ranges: Ranges, rng: np.random.Generator) -> dict[str, Pose]:
     """Camera name -> true_from_recorded: what the recorded extrinsics are wrong by."""
     position, rotation = ranges.number("calibration_position"), ranges.number("calibration_rotation")
     return {camera.name: small_pose(rng, position=position, rotation=rotation) for camera in cameras}

@@ -15,10 +15,10 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import to_json
 from demorec.core.user_modules import modules_of
-from demorec.episode.episode import EpisodeInfo, Frame, Outcome
+from demorec.episode.episode import Frame, Outcome, SimulatedInfo
 from demorec.episode.validity import read_episode_info
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SimulatedWriter
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.sim.arm import arm_kinematics
 from demorec.tasks.grasping import hand_down, symmetric_yaws
@@ -138,7 +138,7 @@ class TaskContract:
         """`demorec check` finds no fault, and the recorded commands do the task again."""
         frames, outcome = run_expert(self.task, self.robot, self.seed, 0)
         path, allowed = tmp_path / "episode_000000.mcap", modules_of([self.task, self.robot])
-        with EpisodeWriter(path, self._episode(0).info) as writer:
+        with SimulatedWriter(path, self._episode(0).info) as writer:
             for frame in frames:
                 writer.write(frame)
             writer.finish(outcome)
@@ -172,7 +172,7 @@ def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Fram
     return frames, session.outcome
 
 
-def _is_within_reach(info: EpisodeInfo, point: list[float]) -> bool:
+def _is_within_reach(info: SimulatedInfo, point: list[float]) -> bool:
     """Whether the TCP gets to a point of the world (3,), metres, with the hand pointing down."""
     base_from_world = info.scene.robot.world_from_base.inverse()
     arm = arm_kinematics(info.robot, scale=info.scene.robot.scale)

@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from demorec.view.episode import Depth, Distances, PlayedCollected, PlayedEpisode, Video, timed
+from demorec.view.episode import Depth, Distances, PlayedEpisode, PlayedExternal, Video, timed
 from demorec.view.paths import Paths
 from demorec.view.style import FRUSTUM, segment_colors
 from demorec.view.times import indexes, log_pose, send_poses
@@ -22,9 +22,9 @@ _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
 
 
-def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedCollected) -> None:
+def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedExternal) -> None:
     """Every camera with what it saw; the coded pictures are passed on as they are."""
-    if isinstance(episode, PlayedCollected):
+    if isinstance(episode, PlayedExternal):
         names, depth = list({**episode.videos, **episode.depth}), episode.depth
     else:
         names = [camera.name for camera in episode.info.scene.cameras]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.episode.collected import CollectedInfo, CollectedOutcome
-from demorec.episode.episode import EpisodeInfo, Event, Outcome
+from demorec.episode.episode import Event, Outcome, SimulatedInfo
+from demorec.episode.external import EpisodeInfo, ExternalOutcome
 
 Distances = NDArray[np.uint16] | NDArray[np.float32]
 """(H, W) millimetres or metres."""
@@ -82,7 +82,7 @@ class _Shown:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PlayedCollected(_Shown):
+class PlayedExternal(_Shown):
     """What is shown of a collected episode; its curves are the elements of its features.
 
     Attributes:
@@ -91,8 +91,8 @@ class PlayedCollected(_Shown):
         joint_position: Joint of the URDF -> (T,) rad or m.
     """
 
-    info: CollectedInfo
-    outcome: CollectedOutcome | None
+    info: EpisodeInfo
+    outcome: ExternalOutcome | None
     joint_position: Mapping[str, NDArray[np.float64]]
 
     @property
@@ -127,7 +127,7 @@ class PlayedEpisode(_Shown):
         boxes: Camera -> frame -> (name, (x, y, width, height) px) of what it sees.
     """
 
-    info: EpisodeInfo
+    info: SimulatedInfo
     outcome: Outcome | None
     robot_description: str | None
     body_description: Callable[[str], str | None] = lambda _: None

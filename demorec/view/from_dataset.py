@@ -19,8 +19,8 @@ from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot
-from demorec.episode.collected import CollectedCamera, CollectedFeature, CollectedInfo, CollectedOutcome, Origin
-from demorec.episode.episode import EpisodeInfo, Outcome, SuccessCheck
+from demorec.episode.episode import Outcome, SimulatedInfo, SuccessCheck
+from demorec.episode.external import Camera, EpisodeInfo, ExternalOutcome, Feature, Origin
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE_KINDS, state_names
 from demorec.episode.validity import read_episode_info
 from demorec.mcap.external.transforms import JointPositions
@@ -28,7 +28,7 @@ from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.urdf import Urdf, check_primitives
 from demorec.view.dataset_episode import DatasetEpisode, dataset_rows
-from demorec.view.episode import Curves, PlayedCollected, PlayedEpisode
+from demorec.view.episode import Curves, PlayedEpisode, PlayedExternal
 from demorec.view.held_objects import held_object_poses
 
 
@@ -42,7 +42,7 @@ def dataset_episodes(root: Path) -> list[int]:
 
 
 @contextmanager
-def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode | PlayedCollected]:
+def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode | PlayedExternal]:
     """One episode of a dataset.
 
     Raises:
@@ -56,10 +56,10 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
     yield episode
 
 
-def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedCollected:
+def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedExternal:
     found = DatasetEpisode(root, episode_index)
     if found.row.get("episode_info") is None:
-        return _collected(found)
+        return _external(found)
     row, described = found.row, found.described
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
     info = read_episode_info(row["episode_info"])
@@ -103,7 +103,7 @@ def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedColle
     )
 
 
-def _collected(found: DatasetEpisode) -> PlayedCollected:
+def _external(found: DatasetEpisode) -> PlayedExternal:
     """An episode as its dataset knows it, at the dataset's rate."""
     root, row, described, robot = found.root, found.row, found.described, found.robot
     data, time_ns, videos, depth = found.data, found.time_ns, found.videos(), found.depth()
@@ -115,19 +115,17 @@ def _collected(found: DatasetEpisode) -> PlayedCollected:
     tasks = read_tasks(root)
     joints, units = ({}, {}) if robot is None else (robot.record.joints, robot.record.units)
     features = tuple(
-        CollectedFeature(
-            name=name, dtype="float32", names=parts, joints=joints.get(name, ()), units=units.get(name, ())
-        )
+        Feature(name=name, dtype="float32", names=parts, joints=joints.get(name, ()), units=units.get(name, ()))
         for name, parts in names.items()
     )
     positions = JointPositions(features)
     values = positions.of(data).T if positions.joints else ()
-    return PlayedCollected(
+    return PlayedExternal(
         name=f"episode_{found.number:06d}",
         group=root.resolve().name,
         identity=hashlib.sha256(f"{root.resolve()} {found.number}".encode()).hexdigest()[:16],
         source=str(row.get("source", root.resolve().name)),
-        info=CollectedInfo(
+        info=EpisodeInfo(
             episode_index=found.number,
             instruction=tasks[int(data["task_index"][0, 0])] if len(time_ns) else "",
             robot=described.robot_type or "",
@@ -147,21 +145,21 @@ def _collected(found: DatasetEpisode) -> PlayedCollected:
     )
 
 
-def _camera(described: DatasetInfo, name: str) -> CollectedCamera:
+def _camera(described: DatasetInfo, name: str) -> Camera:
     height, width = described.features[IMAGE_PREFIX + name].shape[:2]
-    return CollectedCamera(name=name, width=width, height=height)
+    return Camera(name=name, width=width, height=height)
 
 
-def _external_outcome(row: Mapping[str, Any], data: Mapping[str, Array], num_frames: int) -> CollectedOutcome:
+def _external_outcome(row: Mapping[str, Any], data: Mapping[str, Array], num_frames: int) -> ExternalOutcome:
     """As the sidecar has it, or else as the last row says."""
     if row:
-        return CollectedOutcome(success=row["success"], num_frames=num_frames, reason=row["failure_reason"])
+        return ExternalOutcome(success=row["success"], num_frames=num_frames, reason=row["failure_reason"])
     ends = data.get("next.success")
     success = None if ends is None or not num_frames else bool(ends[-1, 0])
-    return CollectedOutcome(success=success, num_frames=num_frames)
+    return ExternalOutcome(success=success, num_frames=num_frames)
 
 
-def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
+def _tcp_poses(info: SimulatedInfo, state: Array, robot: DatasetRobot | None) -> Array:
     """(T, 7) from the joints, of a dataset that leaves observation.ee_pose out."""
     spec = info.robot
     urdf = Urdf.load(asset_path(spec.urdf), scale=info.scene.robot.scale) if robot is None else robot.model
@@ -176,7 +174,7 @@ def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> A
 
 
 def _object_poses(
-    info: EpisodeInfo, ends: dict[str, Array], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
+    info: SimulatedInfo, ends: dict[str, Array], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
 ) -> dict[str, Array]:
     """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
     if ENVIRONMENT_STATE not in data:
@@ -225,7 +223,7 @@ def _camera_poses(root: Path, episode_index: int) -> dict[str, Array]:
 
 
 def _curves(
-    info: EpisodeInfo,
+    info: SimulatedInfo,
     data: dict[str, Array],
     base_from_tcp: Array,
     time_ns: NDArray[np.int64],

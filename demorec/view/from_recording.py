@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.collected import NO_PICTURE, CollectedColumns
-from demorec.episode.episode import EpisodeColumns
-from demorec.mcap import AnyRecording, CollectedRecording, Recording, open_recording
+from demorec.episode.episode import SimulatedColumns
+from demorec.episode.external import NO_PICTURE, Columns
+from demorec.mcap import AnyRecording, Recording, SimulatedRecording, open_recording
 from demorec.mcap.channels import description_topic
 from demorec.mcap.external.transforms import JointPositions
 from demorec.runs.run_file import EPISODES, FAILED
-from demorec.view.episode import Curves, PlayedCollected, PlayedEpisode, Video, timed
+from demorec.view.episode import Curves, PlayedEpisode, PlayedExternal, Video, timed
 
 
 @contextmanager
-def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedCollected]:
+def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedExternal]:
     """The episode of a recording; its pictures can be read until the context is left.
 
     Raises:
@@ -36,13 +36,13 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedCollected]:
         "source": path.name,
     }
     with open_recording(path) as recording:
-        if isinstance(recording, CollectedRecording):
-            yield _collected(recording, known)
+        if isinstance(recording, Recording):
+            yield _external(recording, known)
         else:
             yield _simulated(recording, known)
 
 
-def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
+def _simulated(recording: SimulatedRecording, known: dict[str, Any]) -> PlayedEpisode:
     info, columns = recording.info, recording.columns()
     return PlayedEpisode(
         **known,
@@ -75,12 +75,12 @@ def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
     )
 
 
-def _collected(recording: CollectedRecording, known: dict[str, Any]) -> PlayedCollected:
+def _external(recording: Recording, known: dict[str, Any]) -> PlayedExternal:
     info, columns = recording.info, recording.columns()
     time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
     positions = JointPositions(info.features)
     values = positions.of(columns.features) if positions.joints else np.zeros((len(time_ns), 0))
-    return PlayedCollected(
+    return PlayedExternal(
         **known,
         info=info,
         outcome=recording.outcome,
@@ -106,7 +106,7 @@ def _collected(recording: CollectedRecording, known: dict[str, Any]) -> PlayedCo
     )
 
 
-def _shown_at(columns: CollectedColumns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _shown_at(columns: Columns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """(P,) when each picture of a camera is shown: with the first frame that holds it, or the next one after it.
 
     Not at its own stamp, which may be of another clock.
@@ -128,7 +128,7 @@ def _video(recording: AnyRecording, camera: str, shown_at: NDArray[np.int64]) ->
     return Video(codec=recording.video_settings(camera).codec, packets=packets)
 
 
-def _curves(recording: Recording, columns: EpisodeColumns) -> dict[str, Curves]:
+def _curves(recording: SimulatedRecording, columns: SimulatedColumns) -> dict[str, Curves]:
     """All plots; joints at the rate at which they were recorded, which may be that of the physics."""
     robot = recording.info.robot
     time_ns = columns.time_ns

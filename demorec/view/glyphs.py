@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.sources import PlaybackSource
 
 DRAWABLE = (
@@ -51,7 +51,7 @@ def drawable_source(source: PlaybackSource, missing: set[str]) -> PlaybackSource
     """The same episode with drawable text; `missing` takes what was replaced."""
 
     @contextmanager
-    def opened() -> Iterator[PlayedEpisode | PlayedCollected]:
+    def opened() -> Iterator[PlayedEpisode | PlayedExternal]:
         with source.open() as episode:
             spelt = drawable(episode, missing)
             if isinstance(episode, PlayedEpisode):  # models are looked for by their own names

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from demorec.core.geometry import Array
 from demorec.view.compare import DIFFERENCES, A, B
-from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.paths import Paths
 from demorec.view.times import FRAMES, SECONDS
 
@@ -18,10 +18,10 @@ _FLOOR = 3.0
 """Bodies wider than this (metres) are the floor, which would only hide the grid."""
 
 
-def episode_layout(episode: PlayedEpisode | PlayedCollected, *, is_alone: bool = False) -> rrb.Blueprint:
+def episode_layout(episode: PlayedEpisode | PlayedExternal, *, is_alone: bool = False) -> rrb.Blueprint:
     """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
-    if isinstance(episode, PlayedCollected):
-        return _panels(_collected_views(episode), episode.info.fps, is_alone=is_alone)
+    if isinstance(episode, PlayedExternal):
+        return _panels(_external_views(episode), episode.info.fps, is_alone=is_alone)
     paths = Paths()
     return _blueprint(
         episode,
@@ -101,13 +101,13 @@ def _panels(views: rrb.Container, fps: int, *, is_alone: bool) -> rrb.Blueprint:
     )
 
 
-def _pages(episode: PlayedEpisode | PlayedCollected) -> list[rrb.View]:
+def _pages(episode: PlayedEpisode | PlayedExternal) -> list[rrb.View]:
     """What is said of the episode, if anything is, and the episode in words."""
     pages = [rrb.TextDocumentView(origin=Paths().words, name="in words")] if episode.statements else []
     return [*pages, rrb.TextDocumentView(origin=Paths().summary, name="episode")]
 
 
-def _collected_views(episode: PlayedCollected) -> rrb.Container:
+def _external_views(episode: PlayedExternal) -> rrb.Container:
     """The robot, if it is known, beside the cameras; the features below."""
     paths = Paths()
     top: list[rrb.View | rrb.Container] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from demorec.view.episode import Curves, PlayedCollected, PlayedEpisode
+from demorec.view.episode import Curves, PlayedEpisode, PlayedExternal
 from demorec.view.paths import Paths
 from demorec.view.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
 from demorec.view.times import indexes
@@ -31,7 +31,7 @@ def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
 def log_curves(
     recording: rr.RecordingStream,
     paths: Paths,
-    episode: PlayedEpisode | PlayedCollected,
+    episode: PlayedEpisode | PlayedExternal,
     label: str = "",
     *,
     is_second: bool = False,
@@ -39,7 +39,7 @@ def log_curves(
     """All plots; `label` goes before the names of the curves, a second episode's have other colours."""
     for name, curves in episode.curves.items():
         entity = paths.curves(name)
-        if isinstance(episode, PlayedCollected):
+        if isinstance(episode, PlayedExternal):
             lines = rr.SeriesLines(names=list(curves.names), colors=series_colors(len(curves.names)))
         else:
             lines = rr.SeriesLines(

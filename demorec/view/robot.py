@@ -14,7 +14,7 @@ from demorec.core.geometry import Array, Pose, quat_multiply
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf, UrdfJoint
-from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.meshes import SurfaceMesh, skeleton_meshes, urdf_meshes
 from demorec.view.paths import Paths
 from demorec.view.times import log_pose, send_poses
@@ -26,7 +26,7 @@ _SAME_PLACE = 1e-3
 
 
 def log_robot(
-    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedCollected, tint: Rgba | None = None
+    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedExternal, tint: Rgba | None = None
 ) -> None:
     """Meshes of all links below `paths.robot`, nested as the links are, and how the joints move them.
 
@@ -36,11 +36,11 @@ def log_robot(
         RecordingError: A mesh of the robot's model cannot be read.
     """
     positions: Mapping[str, Array]
-    if isinstance(episode, PlayedCollected):
+    if isinstance(episode, PlayedExternal):
         if not episode.info.urdf:
             return
         urdf, base, positions = Urdf.parse(episode.info.urdf), Pose(), episode.joint_position
-        meshes = _collected_meshes(episode.info.urdf, urdf)
+        meshes = _external_meshes(episode.info.urdf, urdf)
     else:
         placement = episode.info.scene.robot
         urdf, meshes = robot_model(episode.info.robot.urdf, placement.scale, episode.robot_description)
@@ -64,7 +64,7 @@ def log_robot(
         recording.log(entities[link], as_mesh3d(mesh, tint), static=True)
 
 
-def _collected_meshes(text: str, urdf: Urdf) -> Mapping[str, SurfaceMesh]:
+def _external_meshes(text: str, urdf: Urdf) -> Mapping[str, SurfaceMesh]:
     """Link -> what it looks like; rods between the joints where the URDF names files that are not here."""
     try:
         return urdf_meshes(text, None)

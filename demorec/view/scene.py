@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from demorec.episode.scene import Rgba
 from demorec.view.bodies import log_bodies
 from demorec.view.cameras import log_cameras
-from demorec.view.episode import PlayedCollected, PlayedEpisode, Statements
+from demorec.view.episode import PlayedEpisode, PlayedExternal, Statements
 from demorec.view.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.view.paths import Paths
 from demorec.view.robot import log_robot
@@ -26,7 +26,7 @@ _HEADINGS = {"subtask": "Now", "motion": "Motion", "plan": "Plan", "memory": "So
 
 def log_episode(
     recording: rr.RecordingStream,
-    episode: PlayedEpisode | PlayedCollected,
+    episode: PlayedEpisode | PlayedExternal,
     *,
     root: str = "",
     label: str = "",
@@ -52,7 +52,7 @@ def log_episode(
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 
 
-def new_recording(episode: PlayedEpisode | PlayedCollected) -> rr.RecordingStream:
+def new_recording(episode: PlayedEpisode | PlayedExternal) -> rr.RecordingStream:
     """An empty Rerun recording with the episode's name and properties."""
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(entry(episode))
@@ -60,9 +60,9 @@ def new_recording(episode: PlayedEpisode | PlayedCollected) -> rr.RecordingStrea
     return recording
 
 
-def application_id(episode: PlayedEpisode | PlayedCollected) -> str:
+def application_id(episode: PlayedEpisode | PlayedExternal) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
-    if isinstance(episode, PlayedCollected):
+    if isinstance(episode, PlayedExternal):
         words = [camera.name for camera in episode.info.cameras]
     else:
         words = [episode.info.task, "-".join(camera.name for camera in episode.info.scene.cameras)]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from demorec.core.errors import ConfigError, OptionError
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
-from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.view.from_recording import open_recorded
 
@@ -25,7 +25,7 @@ class PlaybackSource:
     """
 
     name: str
-    open: Callable[[], AbstractContextManager[PlayedEpisode | PlayedCollected]]
+    open: Callable[[], AbstractContextManager[PlayedEpisode | PlayedExternal]]
 
 
 def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[PlaybackSource]:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import re
 
 from demorec.episode.episode import Outcome
-from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.episode import PlayedEpisode, PlayedExternal
 
 _NUMBERED = re.compile(r"^episode_0*(?=\d)")
 _OF_A_RUN = re.compile(r"episode_0*(?P<number>\d+)(?:\.attempt_(?P<attempt>\d+))?")
 
 
-def entry(episode: PlayedEpisode | PlayedCollected) -> str:
+def entry(episode: PlayedEpisode | PlayedExternal) -> str:
     """A few characters for the viewer's narrow list: "3 ok", "0.1 FAIL place" (the attempt after the dot)."""
-    if isinstance(episode, PlayedCollected):
+    if isinstance(episode, PlayedExternal):
         name, phase = _NUMBERED.sub("", episode.name), ""
     else:
         match = _OF_A_RUN.fullmatch(episode.name)
@@ -24,9 +24,9 @@ def entry(episode: PlayedEpisode | PlayedCollected) -> str:
     return f"{name} ok" if episode.outcome.success else f"{name} FAIL {phase}".rstrip()
 
 
-def properties(episode: PlayedEpisode | PlayedCollected) -> dict[str, str | int | float | bool]:
+def properties(episode: PlayedEpisode | PlayedExternal) -> dict[str, str | int | float | bool]:
     """What the viewer lists beside the recording's name."""
-    if isinstance(episode, PlayedCollected):
+    if isinstance(episode, PlayedExternal):
         return {
             "instruction": episode.info.instruction,
             "outcome": episode.verdict,
@@ -58,9 +58,9 @@ def properties(episode: PlayedEpisode | PlayedCollected) -> dict[str, str | int 
     return values
 
 
-def summary(episode: PlayedEpisode | PlayedCollected) -> str:
+def summary(episode: PlayedEpisode | PlayedExternal) -> str:
     """Markdown: task, outcome and its checks, the failed ones first."""
-    if isinstance(episode, PlayedCollected):
+    if isinstance(episode, PlayedExternal):
         seconds = float(episode.time_ns[-1]) / 1e9 if episode.num_frames else 0.0
         about = f"{episode.info.robot} · episode {episode.info.episode_index}"
         length = f"{seconds:.1f} s · {episode.num_frames} frames (nominal {episode.info.fps} Hz)"

@@ -16,7 +16,7 @@ import pybullet_data
 from numpy.typing import NDArray
 
 from demorec import Recorder
-from demorec.episode.collected import CollectedCamera
+from demorec.episode.external import Camera
 
 URDF = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
 FPS, PHYSICS_HZ = 30, 240
@@ -44,7 +44,7 @@ def main(folder: str, num_episodes: int = 2, num_frames: int = 45) -> None:
     try:
         arm = pybullet.loadURDF(str(URDF), useFixedBase=True, physicsClientId=client)
         joints = list(range(pybullet.getNumJoints(arm, physicsClientId=client)))
-        cameras = {name: CollectedCamera(name=name, width=SIDE, height=SIDE, intrinsics=INTRINSICS) for name in EYES}
+        cameras = {name: Camera(name=name, width=SIDE, height=SIDE, intrinsics=INTRINSICS) for name in EYES}
         # A simulator can wait for the coder, which a robot cannot.
         with Recorder(folder, robot=URDF, cameras=cameras, fps=FPS, task="reach out", when_full="wait") as recorder:
             for _ in range(num_episodes):

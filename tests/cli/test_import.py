@@ -16,8 +16,8 @@ from support import bag_mappings, bags
 
 from demorec.cli import main
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.mcap import CollectedRecording
-from demorec.runs.collected import load_collected_run
+from demorec.mcap import Recording
+from demorec.runs.external import load_external_run
 
 
 def _run(*words: str | Path) -> int:
@@ -54,8 +54,8 @@ def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: p
     told = capsys.readouterr()
     assert "Nothing odd was found." in told.out
     assert told.err == ""
-    (episode,) = load_collected_run(tmp_path / "run").episodes
-    with CollectedRecording(tmp_path / "run" / episode.file) as recording:
+    (episode,) = load_external_run(tmp_path / "run").episodes
+    with Recording(tmp_path / "run" / episode.file) as recording:
         sizes = {feature.name: len(feature.names) for feature in recording.info.features}
         assert (sizes["observation.state"], sizes["action"], len(recording.info.cameras)) == FEATURES[name]
         assert recording.num_frames == episode.num_frames >= 30

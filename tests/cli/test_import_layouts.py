@@ -13,7 +13,7 @@ from support.layout_topics import Layout, Part
 from support.layouts import LAYOUTS, UR
 
 from demorec.cli import main
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 
 
 def _run(*words: str | Path) -> int:
@@ -58,7 +58,7 @@ def test_a_suggestion_is_right_unedited_or_refused(
         assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
         return
     assert (code, warned) == (0, ""), capsys.readouterr().err
-    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         columns = recording.columns()
         features = {feature.name: feature.names for feature in recording.info.features}
         assert list(features["observation.state"]) == [label for part in layout.state for label in part.names]

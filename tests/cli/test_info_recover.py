@@ -13,7 +13,7 @@ from support.export import export, files_of
 from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, main, run_command
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.runs.find import find
 
 
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_episode(folder / "a.mcap", num_frames=45, depth=True)
     write_episode(folder / "b.mcap", num_frames=30, success=False, episode_index=7, cameras=())
     info, frames, _ = make_episode(num_frames=70)
-    with EpisodeWriter(folder / "c.mcap", info) as writer:
+    with SimulatedWriter(folder / "c.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)
     part = folder / "c.mcap.part"
@@ -59,7 +59,7 @@ def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -
 def test_info_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", folder / "a.mcap", "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    with Recording(folder / "a.mcap") as recording:
+    with SimulatedRecording(folder / "a.mcap") as recording:
         assert found["digest"] == recording.digest()
     assert (found["kind"], found["frames"], found["success"], found["root_seed"]) == ("recording", 45, True, 0)
     assert found["cameras"][0]["video"]["codec"] == "h264"
@@ -245,7 +245,7 @@ def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     before = part.read_bytes()
     assert run("recover", part) == 0
     assert capsys.readouterr().out == f"Kept 60 frames, then the end is missing: {tmp_path / 'c.mcap'}\n"
-    with Recording(tmp_path / "c.mcap") as recording:
+    with SimulatedRecording(tmp_path / "c.mcap") as recording:
         assert (recording.num_frames, recording.outcome, recording.is_recovered) == (60, None, True)
     assert part.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c.mcap", "c.mcap.part"]
@@ -272,7 +272,7 @@ def test_recovering_a_complete_file_keeps_everything(
     source.write_bytes((folder / "a.mcap").read_bytes())
     assert run("recover", source, "--out", tmp_path / "again.mcap") == 0
     assert "Complete: all 45 frames" in capsys.readouterr().out
-    with Recording(source) as one, Recording(tmp_path / "again.mcap") as other:
+    with SimulatedRecording(source) as one, SimulatedRecording(tmp_path / "again.mcap") as other:
         assert one.digest() == other.digest()
         assert one.pixel_statistics("front").counts.tolist() == other.pixel_statistics("front").counts.tolist()
 
@@ -291,7 +291,7 @@ def test_what_is_recovered_is_no_further_episode_of_its_run(
         monkeypatch.chdir(damaged.parent)
     assert run("recover", damaged.name if is_inside else damaged) == 0
     place = tmp_path / "run" / ("recovered" if mark else "episodes") / "a.recovered.mcap"
-    with Recording(place) as recording:
+    with SimulatedRecording(place) as recording:
         assert recording.num_frames > 0
     if mark:
         assert find(tmp_path / "run").recordings == (damaged,)

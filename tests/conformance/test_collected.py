@@ -13,18 +13,18 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from support.collected import TOP, URDF, make_collected, write_collected
 from support.export import export
+from support.external import TOP, URDF, make_external, write_external
 
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.robots.urdf import Urdf
 
-EPISODE = make_collected()
+EPISODE = make_external()
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_collected(tmp_path_factory.mktemp("collected") / "a.mcap", EPISODE)
+    return write_external(tmp_path_factory.mktemp("collected") / "a.mcap", EPISODE)
 
 
 def test_mcap_decodes_numbers_stamps_and_pictures(path: Path) -> None:
@@ -97,6 +97,6 @@ def test_rerun_shows_joints_videos_and_frames(path: Path, tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_lerobot_reads_the_dataset_as_it_was_recorded(tmp_path: Path) -> None:
     (tmp_path / "run" / "episodes").mkdir(parents=True)
-    write_collected(tmp_path / "run" / "episodes" / "episode_000000.mcap", make_collected(cameras=(TOP,)))
+    write_external(tmp_path / "run" / "episodes" / "episode_000000.mcap", make_external(cameras=(TOP,)))
     report = export(tmp_path / "run", tmp_path / "d", verify=True)
     assert (report.num_frames, report.verified_frames, report.not_verified) == (45, 2, "")

@@ -20,8 +20,8 @@ from demorec.datasets.exported import exported
 from demorec.datasets.lerobot import ExportOptions, dataset_digest
 from demorec.datasets.lerobot.boxes import coco_string
 from demorec.datasets.lerobot.prepare import prepare_episode
-from demorec.episode.scene import Camera, Shape
-from demorec.mcap import Recording
+from demorec.episode.scene import SceneCamera, Shape
+from demorec.mcap import SimulatedRecording
 
 PREFIX = "observation.images."
 Row = dict[str, Any]
@@ -48,7 +48,7 @@ class Truth:
 
     def __init__(self, run: Path) -> None:
         (path,) = (run / "episodes").glob("*.mcap")
-        self.recording = Recording(path)
+        self.recording = SimulatedRecording(path)
         self.columns, self.scene = self.recording.columns(), self.recording.info.scene
         names = self.recording.segment_names()
         self.labels = {camera: list(self.recording.segmentation(camera)) for camera in self.recording.cameras}
@@ -161,7 +161,7 @@ def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
     (frames,) = language_of(dataset)
     (path,) = (run / "episodes").glob("*.mcap")
     step, last = 30, len(frames) - 1
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         options = ExportOptions(language=())
         told = prepare_episode(
             exported(recording, options), options, code_depth=False, about=[2 * step, last]
@@ -266,7 +266,7 @@ def test_outlines_of_what_faces_the_camera(shape: Shape) -> None:
     from demorec.core.geometry import look_at
 
     eye = look_at((0.0, 0.0, 100.15), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-    camera = Camera(name="c", width=100, height=100, fov_y=0.02, mount="world", mount_from_camera=eye, far=200.0)
+    camera = SceneCamera(name="c", width=100, height=100, fov_y=0.02, mount="world", mount_from_camera=eye, far=200.0)
     face = 0.2 * 0.1 if shape.kind == "box" else np.pi * 0.1**2
     scale = camera.intrinsics[0, 0] / 100
     area = outline_area(camera, eye.vector(), shape, np.array([0, 0, 0, 0, 0, 0, 1.0]))

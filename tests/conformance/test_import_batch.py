@@ -23,8 +23,8 @@ from support import bag_mappings, bags
 from demorec.cli import main
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.tables import CHECKS
-from demorec.mcap import CollectedRecording
-from demorec.runs.collected import load_collected_run
+from demorec.mcap import Recording
+from demorec.runs.external import load_external_run
 from demorec.sources import import_run
 from demorec.sources.bag import Bag
 from demorec.sources.channel import BagError
@@ -140,9 +140,9 @@ def test_bad_bags_are_skipped_and_listed(
     for number, (line, (_, reason)) in enumerate(zip(lines[-len(BAD) :], BAD.values(), strict=True)):
         assert line.startswith(f"  {folder / f'run_{2 * number + 1}.mcap'}: ")
         assert reason in line
-    assert len(load_collected_run(run).episodes) == len(BAD)
+    assert len(load_external_run(run).episodes) == len(BAD)
     for number in range(len(BAD)):
-        with CollectedRecording(run / "episodes" / f"episode_{number:06d}.mcap") as recording:
+        with Recording(run / "episodes" / f"episode_{number:06d}.mcap") as recording:
             assert [file.name for file in recording.info.origin.files] == [f"run_{2 * number}.mcap"]
     assert _demorec("info", run) == 0
     shown = capsys.readouterr().out
@@ -177,7 +177,7 @@ def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path],
         progress=lambda *counts: done.append(counts),
     )  # fmt: skip
     assert _content(tmp_path / "run") == _content(alone)
-    assert load_collected_run(tmp_path / "run").digest == load_collected_run(alone).digest
+    assert load_external_run(tmp_path / "run").digest == load_external_run(alone).digest
     assert tuple(told) == result.reports
     assert done == [(count, 2 * len(BAD)) for count in range(2 * len(BAD) + 1)]
 
@@ -196,7 +196,7 @@ def test_an_interrupted_import_goes_on_to_the_same_run(batch: tuple[Path, Path],
         result = import_bags([batch[0]], batch[1], run, skip_bad=True)
         assert result.num_new == len(BAD) - moment - 1
         assert _content(run) == _content(alone)
-        assert load_collected_run(run).digest == load_collected_run(alone).digest
+        assert load_external_run(run).digest == load_external_run(alone).digest
 
 
 def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_again(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
     assert {name: data for name, data in after.items() if name in before and name != "import.json"} == {
         name: data for name, data in before.items() if name != "import.json"
     }
-    with CollectedRecording(run / "episodes" / f"episode_{len(BAD):06d}.mcap") as recording:
+    with Recording(run / "episodes" / f"episode_{len(BAD):06d}.mcap") as recording:
         assert [file.name for file in recording.info.origin.files] == ["run_1.mcap"]
     skipped = json.loads((run / "import.json").read_text())["skipped"]
     assert [bag["name"] for bag in skipped] == [f"run_{2 * number + 1}.mcap" for number in range(1, len(BAD))]
@@ -357,4 +357,4 @@ def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone
     psutil.wait_procs(workers, timeout=30)
     import_bags([batch[0]], batch[1], run, skip_bad=True)
     assert _content(run) == _content(alone)
-    assert load_collected_run(run).digest == load_collected_run(alone).digest
+    assert load_external_run(run).digest == load_external_run(alone).digest

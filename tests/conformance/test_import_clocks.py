@@ -12,7 +12,7 @@ import pytest
 from support import bag_mappings, bags
 
 from demorec.cli import main
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 
 STATE, ACTION, FRONT = "/joint_states", "/joint_command", "/front/rgb"
 GRIPPER = "/gripper/state"
@@ -105,7 +105,7 @@ def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
     assert code == 0
     assert tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]["fps"] == 30
     assert "Nothing odd was found." in told
-    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         assert recording.info.fps == 30
         times = recording.columns().time_ns.tolist()
         assert times == [note.header_ns for note in bags.of_topic(notes, FRONT)]
@@ -130,7 +130,7 @@ def test_only_the_source_without_headers_goes_by_times_of_recording(imports: Imp
     code, told, _ = imports(notes, _with_gripper(stamp="log"))
     assert code == 0
     assert "Nothing odd was found." in told
-    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         columns = recording.columns()
     states, grippers = bags.of_topic(notes, STATE), [note for note in notes if note.topic == GRIPPER]
     for time_ns, values in zip(columns.time_ns.tolist(), columns.features["observation.state"], strict=True):
@@ -142,7 +142,7 @@ def test_only_the_source_without_headers_goes_by_times_of_recording(imports: Imp
 def test_a_camera_by_times_of_recording(imports: Imports, tmp_path: Path) -> None:
     notes = real()
     assert imports(notes, MAPPING + 'stamp = "log"\n')[0] == 0
-    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         times = recording.columns().picture_stamps["front"].tolist()
     assert set(times) <= {note.log_ns for note in notes if note.topic == FRONT}
 
@@ -230,7 +230,7 @@ def test_the_suggested_task_is_that_of_each_bag(
         assert "[task] needs one of text, topic and file_name" in capsys.readouterr().err
         return
     for index, instruction in enumerate((task, "push the block")):
-        with CollectedRecording(tmp_path / f"run/episodes/episode_{index:06d}.mcap") as recording:
+        with Recording(tmp_path / f"run/episodes/episode_{index:06d}.mcap") as recording:
             assert recording.info.instruction == instruction
 
 

@@ -21,9 +21,9 @@ from support.export import export
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.depth import quantised
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 from demorec.mcap.depth import encode_millimetres
-from demorec.view.episode import PlayedCollected
+from demorec.view.episode import PlayedExternal
 from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.sources import find_episodes
 
@@ -119,7 +119,7 @@ def recording_of(run: Path) -> Path:
     return path
 
 
-def held(recording: CollectedRecording, moments: Sequence[int]) -> list[int]:
+def held(recording: Recording, moments: Sequence[int]) -> list[int]:
     """The moments of the pictures that a recording has."""
     stamps: list[int] = recording.columns().picture_stamps["wrist_depth"].tolist()
     assert set(stamps) <= set(moments)
@@ -134,7 +134,7 @@ def held(recording: CollectedRecording, moments: Sequence[int]) -> list[int]:
 )  # fmt: skip
 def test_every_distance_stays(kind: str, is_ros1: bool, tmp_path: Path) -> None:
     run, moments = imported(kind, tmp_path, is_ros1=is_ros1)
-    with CollectedRecording(recording_of(run)) as recording:
+    with Recording(recording_of(run)) as recording:
         assert (recording.cameras, recording.depth_cameras) == (("wrist",), ("wrist_depth",))
         camera = next(camera for camera in recording.info.cameras if camera.is_depth)
         assert camera.kept == ("32FC1" if kind == "32FC1" else "16UC1")
@@ -156,7 +156,7 @@ def test_other_readers_find_it(kind: str, tmp_path: Path) -> None:
             ).iter_decoded_messages()
             if channel.topic == "/camera/wrist_depth/depth"
         ]
-    with CollectedRecording(recording_of(run)) as recording:
+    with Recording(recording_of(run)) as recording:
         stamps = held(recording, moments)
     assert [message.header.stamp.sec * bags.NS + message.header.stamp.nanosec for message in found] == stamps
     for message, stamp in zip(found, stamps, strict=True):
@@ -187,7 +187,7 @@ def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> Non
 
     run, moments = imported(kind, tmp_path)
     export(run, tmp_path / "d.hdf5", "hdf5", depth=True)
-    with CollectedRecording(recording_of(run)) as recording, h5py.File(tmp_path / "d.hdf5") as file:
+    with Recording(recording_of(run)) as recording, h5py.File(tmp_path / "d.hdf5") as file:
         numbers = recording.columns().pictures["wrist_depth"]
         stamps = held(recording, moments)
         stored = file["data/demo_0/obs/wrist_depth"][..., 0]
@@ -197,7 +197,7 @@ def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> Non
     report = export(run, tmp_path / "dataset", depth=True)
     assert report.depth_left_out == ()
     with open_dataset_episode(tmp_path / "dataset", 0) as episode:
-        assert isinstance(episode, PlayedCollected)
+        assert isinstance(episode, PlayedExternal)
         times, shown = zip(*episode.depth["wrist_depth"](), strict=True)
     assert list(times) == episode.time_ns.tolist()
     np.testing.assert_allclose(shown, np.nan_to_num(stored, posinf=0).clip(max=10), atol=2e-3)

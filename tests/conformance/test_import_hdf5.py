@@ -12,10 +12,10 @@ import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.collected import TOP, make_collected
-from support.collected import write_collected as write_collected_recording
 from support.commands import exit_code
 from support.export import data_table, export, make_run
+from support.external import TOP, make_external
+from support.external import write_external as write_external_recording
 from support.hdf5 import (
     ALOHA_CAMERAS,
     HEIGHT,
@@ -29,8 +29,8 @@ from support.hdf5 import (
 
 from demorec.core.errors import ConfigError
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
-from demorec.mcap import CollectedRecording, Recording
-from demorec.runs.collected import load_collected_run
+from demorec.mcap import Recording, SimulatedRecording
+from demorec.runs.external import load_external_run
 from demorec.sources.frames_writer import FramesImport, Picture
 from demorec.sources.hdf5_episodes import episode_places
 from demorec.sources.hdf5_features import Hdf5FitError, StoredFeature
@@ -83,7 +83,7 @@ def test_numbers_of_robomimic_are_those_of_the_file(robomimic: tuple[Path, Path]
                 "observation.environment_state": obs["object"],
                 "action": file[f"data/{demo}/actions"][:],
             }
-            with CollectedRecording(path) as recording:
+            with Recording(path) as recording:
                 columns, info = recording.columns(), recording.info
             assert columns.features.keys() == expected.keys()
             for name, values in expected.items():
@@ -106,7 +106,7 @@ def test_each_row_shows_its_own_picture(robomimic: tuple[Path, Path]) -> None:
     source, run = robomimic
     with h5py.File(source) as file:
         for demo, path in zip(DEMOS, recordings(run), strict=True):
-            with CollectedRecording(path) as recording:
+            with Recording(path) as recording:
                 for camera in ("agentview", "robot0_eye_in_hand"):
                     given = file[f"data/{demo}/obs/{camera}_image"][:]
                     shown = list(recording.images(camera))
@@ -121,7 +121,7 @@ def test_a_mask_chooses_and_a_dataset_tells_the_outcome(tmp_path: Path) -> None:
         opened["data/demo_10/rewards"][-1] = 0
     result, run = imported(file, changes=changes)
     assert (result.num_episodes, result.num_frames) == (2, 13)
-    lines = load_collected_run(run).episodes
+    lines = load_external_run(run).episodes
     assert [(line.num_frames, line.success) for line in lines] == [(7, True), (6, False)]
     assert tuple(result.left_out) == ("dones", "states", "next_obs")
 
@@ -133,7 +133,7 @@ def test_aloha_becomes_a_run(is_compressed: bool, tmp_path: Path) -> None:
     kept = "jpeg kept as it is" if is_compressed else "pixels, coded once"
     assert result.cameras == dict.fromkeys(ALOHA_CAMERAS, f"64x48, {kept}")
     for source, path in zip(files, recordings(run), strict=True):
-        with h5py.File(source) as file, CollectedRecording(path) as recording:
+        with h5py.File(source) as file, Recording(path) as recording:
             actions = [file[name][:] for name in ("action", "base_action") if name in file]
             expected = {
                 "observation.state": file["observations/qpos"][:],
@@ -159,7 +159,7 @@ def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) ->
     dataset = 'dataset = "observations/images/cam_high"'
     result, run = imported(file, changes={dataset: f'{dataset}\ncolors = "bgr"'})
     assert result.cameras["cam_high"].endswith("with red and blue exchanged, coded once")
-    with CollectedRecording(recordings(run)[0]) as recording:
+    with Recording(recordings(run)[0]) as recording:
         shown = recording.picture("cam_high", 0)
     red, blue = shown[: HEIGHT // 2, : WIDTH // 2 - 4, 0].mean(), shown[: HEIGHT // 2, : WIDTH // 2 - 4, 2].mean()
     assert blue - red > 200  # the corner is red in the file
@@ -168,7 +168,7 @@ def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) ->
 def test_the_action_can_be_the_next_state(tmp_path: Path) -> None:
     file = write_aloha(tmp_path / "episode_0.hdf5")
     _, run = imported(file, changes={'dataset = "action"': 'next = "observation.state"'})
-    with h5py.File(file) as opened, CollectedRecording(recordings(run)[0]) as recording:
+    with h5py.File(file) as opened, Recording(recordings(run)[0]) as recording:
         columns = recording.columns()
         np.testing.assert_array_equal(columns.features["action"], opened["observations/qpos"][1:])
         np.testing.assert_array_equal(columns.features["observation.state"], opened["observations/qpos"][:-1])
@@ -182,8 +182,8 @@ def test_our_own_file_comes_back_to_the_bit(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.hdf5") as file:
         for index, path in enumerate(recordings(run)):
             with (
-                CollectedRecording(path) as recording,
-                Recording(tmp_path / f"simulated/episodes/{path.name}") as simulated,
+                Recording(path) as recording,
+                SimulatedRecording(tmp_path / f"simulated/episodes/{path.name}") as simulated,
             ):
                 found, original, info = recording.columns().features, simulated.columns(), recording.info
                 assert (info.instruction, info.fps) == (simulated.info.instruction, simulated.info.fps)
@@ -199,13 +199,13 @@ def test_our_own_file_comes_back_to_the_bit(tmp_path: Path) -> None:
             assert info.features[0].joints[:7] == simulated.info.robot.joint_names[:7]
 
 
-def test_our_own_file_of_collected_episodes_comes_back(tmp_path: Path) -> None:
+def test_our_own_file_of_external_episodes_comes_back(tmp_path: Path) -> None:
     (tmp_path / "given" / "episodes").mkdir(parents=True)
-    given = make_collected(cameras=(TOP,), num_frames=20, success=False)
-    write_collected_recording(tmp_path / "given" / "episodes" / "episode_000000.mcap", given)
+    given = make_external(cameras=(TOP,), num_frames=20, success=False)
+    write_external_recording(tmp_path / "given" / "episodes" / "episode_000000.mcap", given)
     export(tmp_path / "given", tmp_path / "a.hdf5", "hdf5", include_failures=True)
     _, run = imported(tmp_path / "a.hdf5")
-    with CollectedRecording(recordings(run)[0]) as recording:
+    with Recording(recordings(run)[0]) as recording:
         for name in ("observation.state", "observation.force", "action"):
             expected = np.array([frame.samples[name].vector for frame in given.frames])
             assert recording.columns().features[name].dtype == expected.dtype
@@ -224,7 +224,7 @@ def test_distances_stay(kind: str, tmp_path: Path) -> None:
         opened["observations/images/cam_high_depth"] = given
     result, run = imported(file)
     assert result.cameras["cam_high_depth"].endswith("kept as they are")
-    with CollectedRecording(recordings(run)[0]) as recording:
+    with Recording(recordings(run)[0]) as recording:
         assert recording.depth_cameras == ("cam_high_depth",)
         found = np.array(list(recording.distances("cam_high_depth")))
     assert found.dtype == given.dtype.newbyteorder("=")
@@ -234,7 +234,7 @@ def test_distances_stay(kind: str, tmp_path: Path) -> None:
 def test_distances_of_our_own_file_come_back(tmp_path: Path) -> None:
     export(make_run(tmp_path / "simulated", (4,), depth=True), tmp_path / "a.hdf5", "hdf5", depth=True)
     _, run = imported(tmp_path / "a.hdf5")
-    with h5py.File(tmp_path / "a.hdf5") as file, CollectedRecording(recordings(run)[0]) as recording:
+    with h5py.File(tmp_path / "a.hdf5") as file, Recording(recordings(run)[0]) as recording:
         assert recording.depth_cameras
         for camera in recording.depth_cameras:
             expected = file[f"data/demo_0/obs/{camera}"][..., 0]
@@ -319,7 +319,7 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
                 stored[row] = np.frombuffer(data, np.uint8)
     result, run = imported(file)
     assert result.cameras == dict.fromkeys(ALOHA_CAMERAS, "64x48, jpeg kept as it is")
-    with CollectedRecording(recordings(run)[0]) as recording:
+    with Recording(recordings(run)[0]) as recording:
         for camera in ALOHA_CAMERAS:
             assert [packet.data for packet in recording.packets(camera)] == given
     mapping = file.with_suffix(".toml")
@@ -366,7 +366,7 @@ def test_pixels_of_other_forms_are_those_of_the_usual_one(kind: str, has_channel
                 shown = images.transpose(0, 3, 1, 2) if has_channels_first else images
                 opened[f"observations/images/{camera}"] = shown
         result, run = imported(file)
-        with CollectedRecording(recordings(run)[0]) as recording:
+        with Recording(recordings(run)[0]) as recording:
             found.append([[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS])
     assert found[0] == found[1]
     told = {"uint8": "64x48, pixels", "255": "64x48, float32 from 0 to 255"}.get(kind, f"64x48, {kind} from 0 to 1")
@@ -390,7 +390,7 @@ def test_one_observation_more_than_actions_is_left_out(tmp_path: Path, capsys: p
             _one_observation_more(file)
         run = file.with_name("run")
         assert exit_code("import", "hdf5", file, "--mapping", suggested(file), "--out", run) == 0
-        with CollectedRecording(recordings(run)[0]) as recording:
+        with Recording(recordings(run)[0]) as recording:
             columns = recording.columns()
             packets = [[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS]
             found.append((columns.time_ns.tolist(), packets, {n: v.tolist() for n, v in columns.features.items()}))
@@ -404,7 +404,7 @@ def test_with_one_observation_more_the_last_action_is_the_last_state(tmp_path: P
     file = write_aloha(tmp_path / "episode_0.hdf5")
     _one_observation_more(file)
     _, run = imported(file, changes={'dataset = "action"': 'next = "observation.state"'})
-    with h5py.File(file) as opened, CollectedRecording(recordings(run)[0]) as recording:
+    with h5py.File(file) as opened, Recording(recordings(run)[0]) as recording:
         np.testing.assert_array_equal(recording.columns().features["action"], opened["observations/qpos"][1:])
 
 

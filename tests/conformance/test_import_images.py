@@ -17,7 +17,7 @@ from support import bag_mappings, bags
 
 from demorec.cli import main
 from demorec.core.tables import CHECKS
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 
 FRONT, SIDE = "/front/image_raw/compressed", "/side/image_raw/compressed"
 STATE, ACTION = "/follower/joint_states", "/leader/joint_states"
@@ -84,7 +84,7 @@ def imported(
     file = bag_mappings.write_mapping(mapping, tmp_path / "robot.toml")
     assert run("import", path, "--mapping", file, "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
-    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         columns = recording.columns()
         shown = {name: columns.picture_stamps[name][columns.pictures[name]].tolist() for name in columns.pictures}
     return told, shown

@@ -19,7 +19,7 @@ from support.export import export
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot import dataset_digest
-from demorec.mcap import CollectedRecording, CollectedWriter, recover
+from demorec.mcap import EpisodeWriter, Recording, recover
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 ARM = [note for note in bags.so101(3.0) if "joint_states" in note.topic]
@@ -47,7 +47,7 @@ def imported(notes: bags.Notes, mapping: str, folder: Path) -> int:
 
 def row_at(recording: Path, at_s: float) -> int:
     """The first frame that is not before a moment."""
-    with CollectedRecording(recording) as opened:
+    with Recording(recording) as opened:
         times = opened.columns().time_ns
     return next(row for row, time in enumerate(times.tolist()) if time >= bags.EPOCH_NS + round(at_s * bags.NS))
 
@@ -69,7 +69,7 @@ def test_a_dataset_brings_its_subtasks_back(tmp_path: Path, capsys: pytest.Captu
     assert "language_persistent" not in capsys.readouterr().out
     told = []
     for run in ("run", "again"):
-        with CollectedRecording(recordings(tmp_path / run)[0]) as opened:
+        with Recording(recordings(tmp_path / run)[0]) as opened:
             told.append(opened.subtasks)
     assert len(told[0]) == 3
     assert told[0] == told[1]
@@ -98,7 +98,7 @@ def test_what_else_a_dataset_says_is_left_out(
     pq.write_table(table.set_column(place, "language_persistent", pa.array(kept, plain)), file)
     assert exit_code("import", "lerobot", tmp_path / "a", "--out", tmp_path / "again") == 0
     assert f"language_persistent is left out: {expected}" in capsys.readouterr().out
-    with CollectedRecording(recordings(tmp_path / "again")[0]) as opened:
+    with Recording(recordings(tmp_path / "again")[0]) as opened:
         assert len(opened.subtasks) == (2 if "style" in change else 0)
 
 
@@ -107,7 +107,7 @@ def test_a_dataset_has_exactly_what_was_said(tmp_path: Path, capsys: pytest.Capt
     (recording,) = recordings(tmp_path / "run")
     begun = ((0.41, "grasp the cup"), (1.013, "lift the cup"), (2.2, "put it down"))
     expected = [(row_at(recording, at), text) for at, text in begun]
-    with CollectedRecording(recording) as opened:
+    with Recording(recording) as opened:
         assert list(opened.subtasks) == expected
     words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "subtask")
     assert exit_code(*words, "--no-verify") == 0
@@ -131,7 +131,7 @@ def test_what_was_said_is_shown_when_it_was_said(kind: str, tmp_path: Path) -> N
     if kind == "dataset":
         place = tmp_path / "dataset"
         export(tmp_path / "run", place, language=("subtask",))
-    with CollectedRecording(recording) as opened:
+    with Recording(recording) as opened:
         times = opened.columns().time_ns
         expected = [(int(times[frame] - times[0]) / 1e9, text) for frame, text in opened.subtasks]
     assert len(expected) == 3
@@ -161,7 +161,7 @@ def test_a_suggestion_names_the_texts(tmp_path: Path, capsys: pytest.CaptureFixt
     )
     mapping = bag_mappings.write_mapping(chosen, tmp_path / "robot.toml")
     assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
-    with CollectedRecording(recordings(tmp_path / "run")[0]) as opened:
+    with Recording(recordings(tmp_path / "run")[0]) as opened:
         assert [said for _, said in opened.subtasks] == ["grasp the cup", "lift the cup", "put it down"]
 
 
@@ -178,9 +178,9 @@ def test_markers_with_other_texts_are_subtasks(tmp_path: Path, capsys: pytest.Ca
     text = '[episodes]\ncut = "marker"\ntopic = "/marker"\n[subtasks]\ntopic = "/marker"\n'
     assert imported(texts("/marker", said), text, tmp_path) == 0
     first, second = recordings(tmp_path / "run")
-    with CollectedRecording(first) as opened:
+    with Recording(first) as opened:
         assert [said for _, said in opened.subtasks] == ["reach"]
-    with CollectedRecording(second) as opened:
+    with Recording(second) as opened:
         assert opened.subtasks == ()
     capsys.readouterr()
     words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "--no-verify")
@@ -228,13 +228,13 @@ def test_bad_input_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureF
 def test_recovery_keeps_what_was_said(tmp_path: Path) -> None:
     from dataclasses import replace
 
-    from support.collected import make_collected
+    from support.external import make_external
 
-    given = make_collected(cameras=())
-    with CollectedWriter(tmp_path / "a.mcap", given.info) as writer:
+    given = make_external(cameras=())
+    with EpisodeWriter(tmp_path / "a.mcap", given.info) as writer:
         for number, frame in enumerate(given.frames):
             writer.write(replace(frame, subtask={0: "reach", 9: "grasp"}.get(number, "")))
         writer.flush()
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
-    with CollectedRecording(tmp_path / "b.mcap") as recording:
+    with Recording(tmp_path / "b.mcap") as recording:
         assert recording.subtasks == ((0, "reach"), (9, "grasp"))

@@ -21,8 +21,8 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.datasets.lerobot import dataset_digest
-from demorec.mcap import CollectedRecording
-from demorec.runs.collected import load_collected_run
+from demorec.mcap import Recording
+from demorec.runs.external import load_external_run
 from demorec.sources.dataset_import import import_lerobot
 from demorec.view.sources import find_episodes
 
@@ -70,10 +70,10 @@ def shown_by(dataset: Path) -> list[NDArray[np.uint8]]:
 
 def test_numbers_and_tasks_are_those_of_the_dataset(imported: tuple[str, Path, Path]) -> None:
     _, dataset, run = imported
-    assert [line.num_frames for line in load_collected_run(run).episodes] == list(LENGTHS)
+    assert [line.num_frames for line in load_external_run(run).episodes] == list(LENGTHS)
     begin = 0
     for number, file in enumerate(recordings(run)):
-        with CollectedRecording(file) as recording:
+        with Recording(file) as recording:
             columns, end = recording.columns(), begin + LENGTHS[number]
             for name in VECTORS:
                 expected = columns_of(dataset, name)[begin:end].astype(columns.features[name].dtype)
@@ -89,7 +89,7 @@ def test_pictures_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> No
     kind, dataset, run = imported
     found = []
     for file in recordings(run):
-        with CollectedRecording(file) as recording:
+        with Recording(file) as recording:
             assert recording.info.cameras[0].kept == ("av1" if kind == "video" else "")
             found += list(recording.images(NAME))
     if kind == "image":
@@ -126,7 +126,7 @@ def test_the_packets_are_those_of_the_video(imported: tuple[str, Path, Path]) ->
             packets += [bytes(packet) for packet in container.demux(video=0) if packet.size]
     found = []
     for path in recordings(run):
-        with CollectedRecording(path) as recording:
+        with Recording(path) as recording:
             found += [packet.data.removeprefix(b"\x12\x00") for packet in recording.packets(NAME)]
     assert found == packets
 
@@ -162,12 +162,12 @@ def test_the_same_command_again_goes_on(imported: tuple[str, Path, Path], tmp_pa
 
 
 def test_our_own_dataset_comes_back_to_the_bit(tmp_path: Path) -> None:
-    from support.collected import TOP, make_collected, write_collected
+    from support.external import TOP, make_external, write_external
 
     (tmp_path / "run" / "episodes").mkdir(parents=True)
     for index, length in enumerate((20, 33)):
-        given = make_collected(cameras=(TOP,), num_frames=length, episode_index=index, success=None)
-        write_collected(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
+        given = make_external(cameras=(TOP,), num_frames=length, episode_index=index, success=None)
+        write_external(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
     export(tmp_path / "run", tmp_path / "a")
     result = import_lerobot(tmp_path / "a", tmp_path / "again")
     assert (result.num_episodes, result.cameras) == (2, {"top": "h264 kept as it is"})
@@ -196,7 +196,7 @@ def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
     assert name in result.cameras
     found = []
     for file in recordings(tmp_path / "run"):
-        with CollectedRecording(file) as recording:
+        with Recording(file) as recording:
             assert recording.depth_cameras == (name,)
             found += list(recording.distances(name))
     assert len(found) == sum(LENGTHS)
@@ -230,7 +230,7 @@ def test_depth_of_another_scale_is_read_by_it_and_without_one_left_out(tmp_path:
     described["features"][key]["info"] |= {"video.depth_min": 0.0, "video.depth_max": 4.095, "video.use_log": False}
     path.write_text(json.dumps(described))
     import_lerobot(tmp_path / "d", tmp_path / "run")
-    with CollectedRecording(recordings(tmp_path / "run")[0]) as recording:
+    with Recording(recordings(tmp_path / "run")[0]) as recording:
         found = list(recording.distances(key.removeprefix("observation.images.")))
     np.testing.assert_allclose(found, np.array(codes_of(tmp_path / "d", key)) / 1000, atol=1e-6)
     del described["features"][key]["info"]["video.shift"]

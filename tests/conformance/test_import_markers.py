@@ -10,7 +10,7 @@ from support import bag_mappings, bags
 
 from demorec.cli import main
 from demorec.core.tables import CHECKS
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 
 TOPIC = "/episode"
 TAKES = [(0.2, "start"), (0.9, "stop"), (1.1, "start"), (1.8, "stop"), (2.0, "start"), (2.7, "success")]
@@ -36,7 +36,7 @@ def _begins(run: Path) -> list[float]:
     """When each episode begins, seconds, to a twentieth."""
     found = []
     for path in sorted((run / "episodes").glob("*.mcap")):
-        with CollectedRecording(path) as recording:
+        with Recording(path) as recording:
             found.append(round((int(recording.columns().time_ns[0]) - bags.EPOCH_NS) / bags.NS * 20) / 20)
     return found
 
@@ -114,5 +114,5 @@ def test_subtasks_share_the_topic(tmp_path: Path) -> None:
     marks = [*TAKES, (0.3, "reach"), (0.6, "grasp"), (0.7, "beep"), (1.5, "discard")]
     assert _import(tmp_path, marks, keys='ignore = ["beep"]', more=f'[subtasks]\ntopic = "{TOPIC}"\n') == 0
     assert _begins(tmp_path / "run") == [0.2, 2.0]
-    with CollectedRecording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         assert [text for _, text in recording.subtasks] == ["reach", "grasp"]

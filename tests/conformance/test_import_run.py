@@ -18,7 +18,7 @@ from support import bag_mappings, bags
 
 from demorec.cli import main
 from demorec.core.errors import ConfigError
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 from demorec.sources.channel import BagError
 from demorec.sources.import_run import import_bags
 
@@ -81,8 +81,8 @@ def imported(
     return layout, notes, folder / "run"
 
 
-def _open(run: Path, index: int = 0) -> CollectedRecording:
-    return CollectedRecording(run / "episodes" / f"episode_{index:06d}.mcap")
+def _open(run: Path, index: int = 0) -> Recording:
+    return Recording(run / "episodes" / f"episode_{index:06d}.mcap")
 
 
 def test_numbers_and_ages(imported: tuple[Layout, bags.Notes, Path]) -> None:

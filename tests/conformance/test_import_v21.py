@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
 
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 
 CAMERA = "observation.images.top"
 LENGTHS = (6, 5)
@@ -121,7 +121,7 @@ def test_the_command_in_the_refusal_converts_it(tmp_path: Path, capsys: pytest.C
     assert (tmp_path / "my cups_old" / "meta" / "episodes.jsonl").exists()
     assert exit_code("import", "lerobot", root, "--out", tmp_path / "run") == 0
     for episode, path in enumerate(sorted((tmp_path / "run/episodes").glob("*.mcap"))):
-        with CollectedRecording(path) as recording:
+        with Recording(path) as recording:
             np.testing.assert_array_equal(recording.columns().features["observation.state"], state(episode))
             levels = [int(picture.mean().round()) for picture in recording.images("top")]
             np.testing.assert_allclose(levels, 20 * np.arange(LENGTHS[episode]) + 10, atol=2)

@@ -25,7 +25,7 @@ from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.packets import episode_packets
 from demorec.datasets.lerobot.reader import episode_places
 from demorec.datasets.lerobot.stills import pictures_at
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
 from demorec.sources.import_run import import_bags
 from demorec.view.from_dataset import open_dataset_episode
@@ -75,7 +75,7 @@ def expected(notes: bags.Notes, run: Path) -> list[Pictures]:
     by_stamp = {note.header_ns: picture for note, picture in zip(of_topic, shown, strict=True)}
     found = []
     for path in sorted((run / "episodes").glob("*.mcap")):
-        with CollectedRecording(path) as recording:
+        with Recording(path) as recording:
             found.append([by_stamp[time] for time in recording.columns().time_ns.tolist()])
     return found
 
@@ -157,7 +157,7 @@ def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path
     result = import_lerobot(dataset, tmp_path / "run")
     assert result.cameras["high"] == "h264 kept as it is"
     for path in sorted((run / "episodes").glob("*.mcap")):
-        with CollectedRecording(path) as given, CollectedRecording(tmp_path / "run/episodes" / path.name) as found:
+        with Recording(path) as given, Recording(tmp_path / "run/episodes" / path.name) as found:
             ours, theirs = (list(recording.packets("high")) for recording in (found, given))
             length = given.columns().num_frames
             slices = [[packet.data[packet.data.rfind(b"\0\0\1") :] for packet in packets] for packets in (ours, theirs)]

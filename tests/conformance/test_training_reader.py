@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.collected import TOP, make_collected, write_collected
 from support.docs import run_examples
 from support.export import export, make_run
+from support.external import TOP, make_external, write_external
 from support.training import CAMERA, assert_same_item, write_by_lerobot
 
 if TYPE_CHECKING:
@@ -177,11 +177,11 @@ def _plain_state(kind: pa.ListType) -> pa.StructType:
     return pa.struct([calls if field.name == "tool_calls" else field for field in kind.value_type])
 
 
-def test_a_dataset_of_collected_episodes_is_read_equally(tmp_path: Path) -> None:
+def test_a_dataset_of_external_episodes_is_read_equally(tmp_path: Path) -> None:
     (tmp_path / "run" / "episodes").mkdir(parents=True)
     for index, length in enumerate((20, 33)):
-        given = make_collected(cameras=(TOP,), num_frames=length, episode_index=index)
-        write_collected(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
+        given = make_external(cameras=(TOP,), num_frames=length, episode_index=index)
+        write_external(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
     export(tmp_path / "run", tmp_path / "d")
     fast, slow = pair(tmp_path / "d")
     assert_same(fast, slow)

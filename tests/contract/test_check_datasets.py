@@ -13,14 +13,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.check import checked, copy, edit_column, edit_json, level_of, simulate_run
-from support.collected import make_collected, write_collected
+from support.external import make_external, write_external
 
 from demorec.check.coverage import draw_coverage, largest_gap
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.tables import TASKS
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.loop import prepare
 
 
@@ -108,7 +108,7 @@ def test_a_dataset_that_lacks_an_episode(run: Path, tmp_path: Path) -> None:
     assert level_of(spoilt, "run_dataset", "run") == "fail"
 
 
-def _infos(count: int) -> list[EpisodeInfo]:
+def _infos(count: int) -> list[SimulatedInfo]:
     return [prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=i)).info for i in range(count)]
 
 
@@ -278,8 +278,8 @@ def test_statistics_of_numbers_of_rows_are_nobodys_business(dataset: Path, tmp_p
     assert level_of(spoilt, "dataset_statistics", "dataset") == "fail"
 
 
-def test_a_number_of_a_collected_episode_that_was_changed(tmp_path: Path) -> None:
-    path = write_collected(tmp_path / "e.mcap", make_collected(cameras=(), num_frames=12))
+def test_a_number_of_a_external_episode_that_was_changed(tmp_path: Path) -> None:
+    path = write_external(tmp_path / "e.mcap", make_external(cameras=(), num_frames=12))
     export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False))
     assert level_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "pass"
     edit_column(tmp_path / "ds", "action", lambda rows: rows + 1e-3)

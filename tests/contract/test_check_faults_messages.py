@@ -194,10 +194,10 @@ def test_the_good_one_passes(good: Path) -> None:
 @pytest.mark.parametrize(("topic", "slot"), [(channels.GRIPPER, 1), (channels.ACTION, 9), (channels.COMMAND, 23)])
 @pytest.mark.parametrize("at", [None, 2 * SECOND])
 def test_values_that_become_no_column(topic: str, slot: int, at: int | None, good: Path, tmp_path: Path) -> None:
-    from demorec.mcap import Recording
+    from demorec.mcap import SimulatedRecording
     from demorec.mcap.streams import frame_streams
 
-    with Recording(good) as recording:
+    with SimulatedRecording(good) as recording:
         layout = next(stream.layout for stream in frame_streams(recording.info) if stream.topic == topic)
 
     def edit(m: Message) -> list[Message]:

@@ -14,7 +14,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import to_plain
 from demorec.learn.evaluate import rollouts
 from demorec.learn.evaluate.rollouts import Evaluation, Settings, make_rollout
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 
@@ -59,7 +59,7 @@ def test_a_rollout_is_recorded_as_it_was_and_replays_to_the_bit(
     attempt = make_rollout(EpisodePlan(config=settings.config, episode_index=3), tmp_path)
     assert (attempt.success, attempt.phase, attempt.num_frames) == (False, "reach", LENGTH)
     path = tmp_path / attempt.file
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         columns = recording.columns()
         assert columns.num_frames == len(policy.said) == LENGTH
         assert {frame.phase for frame in recording} == {"policy"}

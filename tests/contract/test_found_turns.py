@@ -14,11 +14,11 @@ from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import draw_episode
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_plain
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.loop import prepare
 
 
-def older(info: EpisodeInfo) -> EpisodeInfo:
+def older(info: SimulatedInfo) -> SimulatedInfo:
     """As recordings were before they told about which axis a camera is turned."""
     behaviour = {name: value for name, value in info.behaviour.items() if name[-3:] not in ("_qx", "_qy", "_qz")}
     assert len(behaviour) < len(info.behaviour)

@@ -21,12 +21,12 @@ import demorec.gym_env
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.tables import TASKS
 from demorec.episode import features
-from demorec.episode.episode import EpisodeColumns, EpisodeInfo
+from demorec.episode.episode import SimulatedColumns, SimulatedInfo
 from demorec.episode.sensed import ObservationRows
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 
 FRAMES = 45
 VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes")
@@ -58,7 +58,7 @@ def test_gymnasium_accepts_the_environment(task: str) -> None:
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_path: Path) -> None:
     """The numbers of the exported features of a file on disk, against those that a policy would see."""
-    with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
+    with SimulatedRecording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, columns = recording.info, recording.columns()
     rows = ObservationRows.of_columns(columns)
     expected = features.observation_vectors(rows, info.robot, info.scene, privileged=True)
@@ -79,15 +79,17 @@ def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_p
 
 
 @pytest.fixture(scope="module")
-def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, EpisodeColumns]:
+def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedInfo, SimulatedColumns]:
     """What the expert did in an episode without noise, read from a file."""
     path = simulate(tmp_path_factory.mktemp("expert") / "e.mcap", episode_index=2, variation="none")
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         return recording.info, recording.columns()
 
 
 @pytest.mark.parametrize("kind", ACTION_KINDS)
-def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, EpisodeColumns], kind: features.ActionKind) -> None:
+def test_exported_actions_solve_the_task(
+    expert: tuple[SimulatedInfo, SimulatedColumns], kind: features.ActionKind
+) -> None:
     """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
     info, columns = expert
     actions = features.action_vectors(columns, info.scene, kind)

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from demorec.mcap import CollectedRecording
-from demorec.runs.collected import load_collected_run
+from demorec.mcap import Recording
+from demorec.runs.external import load_external_run
 
 pytestmark = pytest.mark.slow  # loops in real time, and three programs that load PyBullet and gymnasium
 EXAMPLES = Path(__file__).parents[2] / "examples" / "recorder"
@@ -37,12 +37,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def first_of(run: Path) -> CollectedRecording:
-    return CollectedRecording(run / "episodes" / "episode_000000.mcap")
+def first_of(run: Path) -> Recording:
+    return Recording(run / "episodes" / "episode_000000.mcap")
 
 
 def test_a_robots_loop(runs: Path) -> None:
-    assert [line.success for line in load_collected_run(runs / "real_robot").episodes] == [True, True]
+    assert [line.success for line in load_external_run(runs / "real_robot").episodes] == [True, True]
     with first_of(runs / "real_robot") as recording:
         columns = recording.columns()
     targets = np.sin(np.arange(60) / 10)
@@ -73,7 +73,7 @@ def test_a_simulation_of_ones_own(runs: Path) -> None:
 
 
 def test_a_gymnasium_environment(runs: Path) -> None:
-    lines = load_collected_run(runs / "gym_wrapper").episodes
+    lines = load_external_run(runs / "gym_wrapper").episodes
     assert [line.num_frames for line in lines] == [40, 40, 40]
     with first_of(runs / "gym_wrapper") as recording:
         columns = recording.columns()

@@ -15,7 +15,7 @@ from support.commands import exit_code
 
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.render.warm import WarmRenderer
 from demorec.replay.free_camera import read_cameras
 from demorec.replay.rerender import RerenderOptions, SceneView, rerender, view_behaviour
@@ -38,7 +38,7 @@ def test_own_cameras_and_looks_give_the_recorded_pictures_again(filmed: Path, tm
     report = rerender(filmed, tmp_path / "again.mcap", RerenderOptions())
     assert report.compared == ("front", "wrist")
     assert not report.differing
-    with Recording(filmed) as a, Recording(tmp_path / "again.mcap") as b:
+    with SimulatedRecording(filmed) as a, SimulatedRecording(tmp_path / "again.mcap") as b:
         for camera in a.cameras:
             assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
             assert np.array_equal(a.pixel_statistics(camera).counts, b.pixel_statistics(camera).counts)
@@ -66,7 +66,7 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
     rerender(source, tmp_path / "again.mcap", RerenderOptions())
     rerender(tmp_path / "again.mcap", tmp_path / "thrice.mcap", RerenderOptions())
-    with Recording(source) as first, Recording(tmp_path / "thrice.mcap") as last:
+    with SimulatedRecording(source) as first, SimulatedRecording(tmp_path / "thrice.mcap") as last:
         assert first.info.scene.cameras == last.info.scene.cameras
         off = [
             np.abs(a.astype(int) - b.astype(int)).max()
@@ -77,7 +77,7 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
 
 def test_a_new_camera_has_no_calibration_error(filmed: Path) -> None:
     """Though it has the name of one that had."""
-    with Recording(filmed) as recording:
+    with SimulatedRecording(filmed) as recording:
         info = recording.info
     names = ("front", "wrist", "wrist_2")
     values = {f"calibration_{name}_{what}": 0.001 for name in names for what in ("x", "y", "z", "angle")}
@@ -99,7 +99,7 @@ def test_other_cameras_sizes_and_looks_pass_the_checks(filmed: Path, tmp_path: P
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
     passed = {r.check for r in report.results if r.level == "pass"}
     assert {"projection", "depth_matches_scene", "segmentation_matches_scene"} <= passed
-    with Recording(filmed) as a, Recording(out / "filmed.mcap") as b:
+    with SimulatedRecording(filmed) as a, SimulatedRecording(out / "filmed.mcap") as b:
         assert b.cameras == ("side", "front")
         assert next(b.images("side")).shape == (96, 128, 3)
         assert b.info.scene.light != a.info.scene.light
@@ -112,7 +112,7 @@ def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
         for name, seed, renderers in (("a", 1, None), ("b", 2, warm), ("c", 1, warm)):
             options = RerenderOptions(looks=seed, cameras=("front",))
             rerender(filmed, tmp_path / f"{name}.mcap", options, renderers=renderers)
-            with Recording(tmp_path / f"{name}.mcap") as recording:
+            with SimulatedRecording(tmp_path / f"{name}.mcap") as recording:
                 scenes.append((recording.info.scene, recording.digest()))
     assert scenes[0] == scenes[2]
     assert scenes[0][0] != scenes[1][0]
@@ -197,7 +197,7 @@ def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str,
     )
     assert done.returncode == 0, done.stderr
     assert "2 of 2 unchanged cameras give the recorded pictures to the bit" in done.stdout
-    with Recording(source) as a, Recording(tmp_path / "again.mcap") as b:
+    with SimulatedRecording(source) as a, SimulatedRecording(tmp_path / "again.mcap") as b:
         for camera in a.cameras:
             assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
             assert np.array_equal(a.columns().world_from_camera[camera], b.columns().world_from_camera[camera])

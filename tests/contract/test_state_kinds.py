@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.check import checked, edit_column, level_of, simulate_run
-from support.collected import make_collected, write_collected
 from support.commands import exit_code
 from support.export import data_table, info
+from support.external import make_external, write_external
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError
@@ -22,7 +22,7 @@ from demorec.generate.reproduce import read_original
 from demorec.gym_env import DemorecEnv
 from demorec.learn.evaluate.policy import CONFIG_NAME
 from demorec.learn.evaluate.rollouts import settings_for
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.replay.demonstration import ReplayOptions
 from demorec.view.episode import PlayedEpisode
 from demorec.view.from_dataset import open_dataset_episode
@@ -57,7 +57,7 @@ def states(dataset: Path) -> Vectors:
 
 def test_the_state_is_joints_gripper_and_the_recorded_pose(run: Path, dataset: Path) -> None:
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
-    with Recording(first) as recording:
+    with SimulatedRecording(first) as recording:
         columns = recording.columns()
     found = states(dataset)[: columns.num_frames]
     assert found.shape == (columns.num_frames, 15)
@@ -116,7 +116,7 @@ def test_it_replays(dataset: Path) -> None:
 def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path) -> None:
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
     export_lerobot([first], tmp_path / "one", SMALL)
-    with Recording(first) as recording:
+    with SimulatedRecording(first) as recording:
         columns = recording.columns()
     config = GenerateConfig(cameras=(), seed=3, variation="none")
     env = DemorecEnv(config=config, state="joint_ee", privileged=False)
@@ -159,8 +159,8 @@ def test_the_dataset_tells_how_to_make_it_again(dataset: Path) -> None:
     assert "--state joint_ee" in (dataset / "README.md").read_text()
 
 
-def test_the_state_of_a_collected_episode_stays_as_it_came(tmp_path: Path) -> None:
-    write_collected(tmp_path / "e.mcap", make_collected(cameras=()))
+def test_the_state_of_a_external_episode_stays_as_it_came(tmp_path: Path) -> None:
+    write_external(tmp_path / "e.mcap", make_external(cameras=()))
     with pytest.raises(ConfigError, match="as it came"):
         export_lerobot([tmp_path / "e.mcap"], tmp_path / "ds", replace(SMALL, action="joint"))
     assert not (tmp_path / "ds").exists()

@@ -21,17 +21,17 @@ from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import EpisodeInfo, Frame
-from demorec.mcap import EpisodeWriter, Recording, recover
+from demorec.episode.episode import Frame, SimulatedInfo
+from demorec.mcap import SimulatedRecording, SimulatedWriter, recover
 
 FPS = 30
 MOST_FRAMES = 300
 
 
-def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
+def write_until_killed(path: Path, info: SimulatedInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
     """Write frames, each as soon as the one before is written, and note every one in the pipe."""
     os.write(notes, b"r")
-    with EpisodeWriter(path, info, video=video) as writer:
+    with SimulatedWriter(path, info, video=video) as writer:
         for frame in frames:
             writer.write(frame)
             os.write(notes, b"f")
@@ -89,7 +89,7 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
         else:
             kept = recovered.num_frames
             assert not recovered.is_complete
-            with Recording(recovered.path) as recording:
+            with SimulatedRecording(recovered.path) as recording:
                 assert recording.outcome is None
                 assert recording.is_recovered
                 assert recording.columns().num_frames == kept
@@ -112,7 +112,7 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
 
 def test_recover_exits_with_1_when_it_keeps_nothing(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=10)
-    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
+    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)
     part = tmp_path / "a.mcap.part"

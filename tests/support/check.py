@@ -19,9 +19,9 @@ import pytest
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.episode.episode import CameraImages, EpisodeColumns, EpisodeInfo, Frame, Outcome
+from demorec.episode.episode import CameraImages, Frame, Outcome, SimulatedColumns, SimulatedInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.frames import decoded_images, frames_of
@@ -42,7 +42,7 @@ def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
     with (
         make_world(episode.info) as world,
         make_renderer(episode.info) as renderer,
-        EpisodeWriter(path, episode.info, video=plan.config.video) as writer,
+        SimulatedWriter(path, episode.info, video=plan.config.video) as writer,
     ):
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):
@@ -87,9 +87,9 @@ class Spoilt:
     """
 
     def __init__(self, path: Path) -> None:
-        with Recording(path) as recording:
-            self.info: EpisodeInfo = recording.info
-            self.columns: EpisodeColumns = recording.columns()
+        with SimulatedRecording(path) as recording:
+            self.info: SimulatedInfo = recording.info
+            self.columns: SimulatedColumns = recording.columns()
             self.outcome: Outcome | None = recording.outcome
             self.pictures: Pictures = [dict(images) for images in decoded_images(recording, self.columns)]
             self._frames = list(frames_of(recording, self.columns))
@@ -126,12 +126,12 @@ class Spoilt:
 
     def write(self, path: Path) -> Path:
         """Record it."""
-        with Recording(self._source) as recording:
+        with SimulatedRecording(self._source) as recording:
             frames = list(frames_of(recording, self.columns))
         outcome = self.outcome
         assert outcome is not None
         # As a program that checks nothing would write it: our own writer refuses some of the faults.
-        with pytest.MonkeyPatch.context() as patch, EpisodeWriter(path, self.info) as writer:
+        with pytest.MonkeyPatch.context() as patch, SimulatedWriter(path, self.info) as writer:
             patch.setattr(FrameCheck, "__call__", lambda *_: None)
             for number, index in enumerate(self.frames):
                 writer.write(self._frame(frames[index], number, index))

@@ -15,8 +15,8 @@ from demorec.check.cells import CellGrid, ImageKind
 from demorec.check.drawn import PictureComparison
 from demorec.check.episode import CheckedEpisode, PictureSummary
 from demorec.core.tables import CHECKS
-from demorec.episode.episode import EpisodeColumns, EpisodeInfo, Outcome
-from demorec.episode.scene import Camera
+from demorec.episode.episode import Outcome, SimulatedColumns, SimulatedInfo
+from demorec.episode.scene import SceneCamera
 
 Rows = NDArray[Any]
 
@@ -47,7 +47,7 @@ class Good:
         return cls(episode, pictures)
 
     @property
-    def _cameras(self) -> dict[str, Camera]:
+    def _cameras(self) -> dict[str, SceneCamera]:
         return {camera.name: camera for camera in self.episode.cameras}
 
     def with_pictures(self, changed: Mapping[tuple[str, ImageKind], Rows]) -> CheckedEpisode:
@@ -75,8 +75,8 @@ class Good:
 class Changed:
     """What is put in a recording's place; None leaves it."""
 
-    columns: EpisodeColumns
-    info: EpisodeInfo
+    columns: SimulatedColumns
+    info: SimulatedInfo
     outcome: Outcome
 
     def with_columns(self, **arrays: Any) -> Changed:

@@ -19,10 +19,10 @@ from demorec.core.config import GenerateConfig
 from demorec.core.plain import to_plain
 from demorec.core.tables import CHECKS
 from demorec.learn.evaluate.rollouts import Evaluation, Settings
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from support import hdf5
-from support.collected import write_collected
 from support.export import export, make_run
+from support.external import write_external
 from support.foreign_dataset import write_foreign
 from support.fuzz import changed_bytes
 from support.mcap import rewritten
@@ -86,12 +86,12 @@ class FuzzedData:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._good = write_episode(folder / "good.mcap", num_frames=12, cameras=("front",))
-        self._collected = write_collected(folder / "collected.mcap")
+        self._external = write_external(folder / "collected.mcap")
         make_run(folder / "run", (4, 5), failures=(6,), cameras=())
         export(self._good, folder / "own")
         write_foreign(folder / "foreign")
         hdf5.write_robomimic(folder / "robomimic.hdf5")
-        with Recording(self._good) as recording:
+        with SimulatedRecording(self._good) as recording:
             names = ("demorec.episode", "demorec.outcome")
             self._metadata = {name: recording._container.metadata(name) or {} for name in names}
 
@@ -177,7 +177,7 @@ class FuzzedData:
             path.write_bytes(rewritten(self._good, change={name: {key: json.dumps(data)}}))
         else:
             what = "bytes"
-            source = chance.choice((self._good, self._collected))
+            source = chance.choice((self._good, self._external))
             path.write_bytes(changed_bytes(source.read_bytes(), chance))
         commands = (
             ["info", path], ["info", path], ["check", path], ["report", path, "--out", self.folder / "out.html"],

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from demorec.core.config import GenerateConfig
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.runs.recordings import inspect_recording
 from demorec.runs.run_file import RunFile, save_run_file
 from support.export import export
@@ -142,7 +142,7 @@ class Odd:
 
     def _messages(self, rng: random.Random, place: Path) -> list[Any]:
         source = rng.choice((self.plain, self.filmed))
-        with Recording(source) as recording:
+        with SimulatedRecording(source) as recording:
             wanted = rng.choice(sorted(recording.topics))
         share = rng.choice((0.05, 1.0))
         return self._recording(

@@ -18,17 +18,17 @@ from demorec.core.geometry import Pose, look_at
 from demorec.episode.episode import (
     Action,
     CameraImages,
-    EpisodeInfo,
     Event,
     Frame,
     JointSample,
     Observation,
     Outcome,
+    SimulatedInfo,
     SuccessCheck,
     frame_time_ns,
 )
-from demorec.episode.scene import Body, Camera, Goal, RobotPlacement, Scene, Shape
-from demorec.mcap import EpisodeWriter
+from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, SceneCamera, Shape
+from demorec.mcap import SimulatedWriter
 from demorec.robots.robot import ParallelGripper, RobotSpec
 
 Codec = Literal["h264", "av1", "jpeg"]
@@ -73,14 +73,14 @@ def make_episode(
     segmentation: bool = False,
     physics_rate_joints: bool = False,
     seed: int = 0,
-) -> tuple[EpisodeInfo, list[Frame], Outcome]:
+) -> tuple[SimulatedInfo, list[Frame], Outcome]:
     """An episode in memory: what is known before it, its frames, how it ended.
 
     `physics_rate_joints` adds joint samples between the frames. Camera "front" stands in the world, every other one
     sits on the hand.
     """
     specs = tuple(_camera(name, width, height) for name in cameras)
-    info = EpisodeInfo(
+    info = SimulatedInfo(
         episode_index=episode_index,
         attempt=0,
         root_seed=seed,
@@ -132,22 +132,22 @@ def frame_number(picture: NDArray[np.uint8]) -> int:
 def write_episode(path: Path, *, video: VideoConfig | None = None, **arguments: object) -> Path:
     """Record `make_episode(**arguments)` at `path`."""
     info, frames, outcome = make_episode(**arguments)  # type: ignore[arg-type]
-    with EpisodeWriter(path, info, video=video) as writer:
+    with SimulatedWriter(path, info, video=video) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)
     return path
 
 
-def _camera(name: str, width: int, height: int) -> Camera:
+def _camera(name: str, width: int, height: int) -> SceneCamera:
     if name == "front":
         pose = look_at((1.2, 0.0, 0.8), (0.45, 0.0, 0.1))
-        return Camera(name=name, width=width, height=height, fov_y=0.9, mount="world", mount_from_camera=pose)
+        return SceneCamera(name=name, width=width, height=height, fov_y=0.9, mount="world", mount_from_camera=pose)
     pose = Pose(position=np.array([0.06, 0.0, 0.0]))
-    return Camera(name=name, width=width, height=height, fov_y=1.2, mount="panda_hand", mount_from_camera=pose)
+    return SceneCamera(name=name, width=width, height=height, fov_y=1.2, mount="panda_hand", mount_from_camera=pose)
 
 
-def _scene(cameras: tuple[Camera, ...], physics_hz: int) -> Scene:
+def _scene(cameras: tuple[SceneCamera, ...], physics_hz: int) -> Scene:
     from demorec.episode.scene import Physics
 
     return Scene(
@@ -202,7 +202,7 @@ def _frame(
     index: int,
     fps: int,
     num_frames: int,
-    cameras: tuple[Camera, ...],
+    cameras: tuple[SceneCamera, ...],
     episode_index: int,
     depth: bool,
     segmentation: bool,
@@ -256,7 +256,7 @@ def _frame(
 
 
 def _images(
-    camera: Camera, number: int, index: int, base_from_tcp: Pose, depth: bool, segmentation: bool
+    camera: SceneCamera, number: int, index: int, base_from_tcp: Pose, depth: bool, segmentation: bool
 ) -> CameraImages:
     rows, cols = np.mgrid[0 : camera.height, 0 : camera.width]
     color = np.empty((camera.height, camera.width, 3), dtype=np.uint8)

@@ -14,7 +14,7 @@ from pybullet_utils.bullet_client import BulletClient
 
 from demorec.core.geometry import Pose, look_at
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import Camera, RobotPlacement, Scene, Texture
+from demorec.episode.scene import RobotPlacement, Scene, SceneCamera, Texture
 from demorec.render import Mount, Renderer, RenderSetup, VisualBody
 from demorec.sim.renderers.client_renderer import view_matrix
 from demorec.sim.visuals import body_poses, shape_rows, visual_bodies
@@ -29,9 +29,9 @@ def connect() -> Any:
     return client
 
 
-def camera(width: int = 224, height: int = 224, **changes: Any) -> Camera:
+def camera(width: int = 224, height: int = 224, **changes: Any) -> SceneCamera:
     """A camera that looks down at the origin from the front left."""
-    base = Camera(
+    base = SceneCamera(
         name="front",
         width=width,
         height=height,
@@ -42,7 +42,9 @@ def camera(width: int = 224, height: int = 224, **changes: Any) -> Camera:
     return replace(base, **changes)
 
 
-def setup(client: Any, *cameras: Camera, textures: dict[int, Texture] | None = None, **changes: Any) -> RenderSetup:
+def setup(
+    client: Any, *cameras: SceneCamera, textures: dict[int, Texture] | None = None, **changes: Any
+) -> RenderSetup:
     """A setup of a client's bodies, with depth and segmentation."""
     bodies = visual_bodies(client, shape_rows(client), names={}, textures=textures or {})
     fields: dict[str, Any] = {"bodies": bodies, "cameras": cameras, "depth": True, "segmentation": True, **changes}
@@ -88,7 +90,7 @@ def add(client: Any, kind: str, size: tuple[float, ...], pose: Pose | None = Non
     return int(client.createMultiBody(mass, -1, shape, pose.position.tolist(), pose.quat_xyzw.tolist()))
 
 
-def rays(cam: Camera, world_from_body: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rays(cam: SceneCamera, world_from_body: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Origin (3,) and directions (H, W, 3) through the pixels' centres in a body's frame, of depth 1."""
     k = cam.intrinsics
     u, v = np.meshgrid(np.arange(cam.width) + 0.5, np.arange(cam.height) + 0.5)
@@ -141,7 +143,7 @@ def cast_capsule(radius: float, length: float, origin: Any, direction: Any) -> N
     return np.asarray(np.minimum.reduce([cast_tube(radius, length, origin, direction), *ends]))
 
 
-def project(cam: Camera, point: Any) -> NDArray[np.float64]:
+def project(cam: SceneCamera, point: Any) -> NDArray[np.float64]:
     """(2,) place in the picture, pixels, of a point in the world."""
     seen = cam.mount_from_camera.inverse().apply(np.asarray(point, dtype=np.float64))
     image = cam.intrinsics @ seen
@@ -188,9 +190,9 @@ def pose_panda(client: Any, bodies: dict[str, Any], t: float) -> None:
     )
 
 
-def panda_cameras(width: int, height: int) -> tuple[Camera, Camera]:
+def panda_cameras(width: int, height: int) -> tuple[SceneCamera, SceneCamera]:
     """One in the world, one on the hand."""
-    front = Camera(
+    front = SceneCamera(
         name="front",
         width=width,
         height=height,
@@ -198,7 +200,7 @@ def panda_cameras(width: int, height: int) -> tuple[Camera, Camera]:
         mount="world",
         mount_from_camera=look_at((1.3, -0.5, 0.8), (0.4, 0.0, 0.15)),
     )
-    wrist = Camera(
+    wrist = SceneCamera(
         name="wrist",
         width=width,
         height=height,
@@ -216,7 +218,7 @@ def panda_mounts(bodies: dict[str, Any]) -> dict[str, Mount]:
     return {"hand": Mount(body=bodies["panda"], link=8)}
 
 
-def centred_tiny_segmentation(client: Any, cam: Camera, world_from_camera: Pose) -> NDArray[np.int32]:
+def centred_tiny_segmentation(client: Any, cam: SceneCamera, world_from_camera: Pose) -> NDArray[np.int32]:
     """TinyRenderer's segmentation with its half pixel taken out: it samples pixels at their corner."""
     projection = np.array(
         client.computeProjectionMatrixFOV(math.degrees(cam.fov_y), cam.width / cam.height, cam.near, cam.far)

@@ -12,13 +12,13 @@ from support.sim import episode
 
 from demorec.core.geometry import Pose
 from demorec.core.tables import CAMERAS, ROBOTS
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.loop import make_world
 from demorec.sim.world import World
 from demorec.tasks.sampling import WORKSPACE
 
 
-def pixel(camera: Camera, world_from_camera: Pose, point: tuple[float, float, float]) -> tuple[float, float]:
+def pixel(camera: SceneCamera, world_from_camera: Pose, point: tuple[float, float, float]) -> tuple[float, float]:
     """Pinhole projection in OpenCV axes, pixels; fails for a point behind the camera."""
     x, y, z = world_from_camera.inverse().apply(np.array(point))
     assert z > camera.near
@@ -26,7 +26,7 @@ def pixel(camera: Camera, world_from_camera: Pose, point: tuple[float, float, fl
     return float(k[0, 0] * x / z + k[0, 2]), float(k[1, 1] * y / z + k[1, 2])
 
 
-def inside(camera: Camera, place: tuple[float, float], margin: float = 0.0) -> bool:
+def inside(camera: SceneCamera, place: tuple[float, float], margin: float = 0.0) -> bool:
     u, v = place[0] / camera.width, place[1] / camera.height
     return margin <= u <= 1 - margin and margin <= v <= 1 - margin
 
@@ -39,7 +39,7 @@ def world(request: pytest.FixtureRequest) -> Iterator[World]:
         yield made
 
 
-def cameras_of(world: World) -> dict[str, Camera]:
+def cameras_of(world: World) -> dict[str, SceneCamera]:
     return {camera.name: camera for camera in world.scene.cameras}
 
 

@@ -17,8 +17,8 @@ from demorec.check.drawn import compare, frames_to_draw, small_camera
 from demorec.check.episode_drawn import draw_episode
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
-from demorec.episode.scene import Camera
-from demorec.mcap import Recording
+from demorec.episode.scene import SceneCamera
+from demorec.mcap import SimulatedRecording
 
 
 def parts(picture: NDArray[Any], width: int, height: int) -> list[list[NDArray[Any]]]:
@@ -71,7 +71,7 @@ def test_a_picture_of_another_size_is_refused() -> None:
 def test_drawn_pictures_have_the_grid_of_the_recorded_ones(tmp_path: Path) -> None:
     """500x224 is drawn as 93x42: by itself that would have another grid."""
     path = write_episode(tmp_path / "e.mcap", num_frames=2, cameras=("front",), width=500, height=224)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         drawn = draw_episode(recording.info, recording.columns(), {"front": ("color",)}).pictures
     assert drawn.cells["front", "color"].shape == (2, 14, 31, 3)
 
@@ -129,7 +129,7 @@ def test_frames_without_a_readable_neighbour_are_drawn() -> None:
 def test_pictures_that_are_not_drawn_are_means_of_those_around(tmp_path: Path) -> None:
     """Against the same episode drawn in every frame, whose joints move evenly."""
     path = write_episode(tmp_path / "e.mcap", num_frames=5, cameras=("front",), width=64, height=64)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         info, columns = recording.info, recording.columns()
         whole = draw_episode(info, columns, {"front": ("color",)}).pictures.cells["front", "color"]
         still = np.zeros_like(whole)
@@ -177,7 +177,7 @@ def test_cells_are_squares_in_the_middle(width: int, height: int) -> None:
     least = 0.85 if ratio < 2.5 else 0.77 if ratio < 5 else 0.6
     assert columns * rows * side**2 > least * width * height
     # A camera with few pixels sees just that: the same direction at the edges of the grid.
-    camera = Camera(name="front", mount="world", mount_from_camera=Pose(), width=width, height=height, fov_y=1.0)
+    camera = SceneCamera(name="front", mount="world", mount_from_camera=Pose(), width=width, height=height, fov_y=1.0)
     few = small_camera(camera, counts, 3)
     assert few.width == few.height * columns / rows
     for place in (0, 1):

@@ -11,8 +11,8 @@ import pytest
 from demorec.check import reads
 from demorec.cli import main
 from demorec.core.tables import CHECKS
-from demorec.episode.episode import EpisodeInfo
-from demorec.mcap import Recording, channels
+from demorec.episode.episode import SimulatedInfo
+from demorec.mcap import SimulatedRecording, channels
 from demorec.mcap.streams import frame_streams
 
 SAMPLES = Path(__file__).parents[2] / "recordings" / "sample"
@@ -39,7 +39,7 @@ def test_every_check_says_what_it_reads() -> None:
 @pytest.mark.parametrize("sample", sorted(SAMPLES.glob("*.mcap")), ids=lambda path: path.stem)
 def test_the_topics_are_those_of_recordings(sample: Path) -> None:
     known = reads.topics()
-    with Recording(sample) as recording:
+    with SimulatedRecording(sample) as recording:
         bodies = [body.name for body in recording.info.scene.bodies]
         for topic in recording.topics:
             general = topic
@@ -52,15 +52,15 @@ def test_the_topics_are_those_of_recordings(sample: Path) -> None:
 
 def test_a_new_stream_or_field_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     @dataclass(frozen=True, kw_only=True, eq=False)
-    class Longer(EpisodeInfo):
+    class Longer(SimulatedInfo):
         mood: str = ""
 
-    def one_more(info: EpisodeInfo) -> tuple[object, ...]:
+    def one_more(info: SimulatedInfo) -> tuple[object, ...]:
         found = frame_streams(info)
         return (*found, replace(found[0], topic="/temperature"))
 
     monkeypatch.setattr(reads, "frame_streams", one_more)
-    monkeypatch.setattr(reads, "EpisodeInfo", Longer)
+    monkeypatch.setattr(reads, "SimulatedInfo", Longer)
     monkeypatch.setattr(channels, "PICTURE_STREAMS", (*channels.PICTURE_STREAMS, "thermal"))
     unread = [row.name for row in reads.coverage() if not row.checks and not row.why_not]
     assert unread == ["/camera/{camera}/thermal", "/temperature", "info.mood"]

@@ -10,25 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.collected import FORCE, TOP, Episode, make_collected, write_collected
+from support.external import FORCE, TOP, Episode, make_external, write_external
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
-from demorec.episode.collected import CollectedFrame, Sample
+from demorec.episode.external import Sample, SampledFrame
 from demorec.mcap import recover
-from demorec.runs.collected import open_collected_run
+from demorec.runs.external import open_external_run
 
 CAMERAS = (TOP, replace(TOP, name="side"))
 
 
 def steady(**changes: Any) -> Episode:
     """An episode at its nominal rate, in which nothing is late or missing."""
-    episode = make_collected(cameras=CAMERAS, **changes)
+    episode = make_external(cameras=CAMERAS, **changes)
     frames, top, side = [], [], []
     for index, frame in enumerate(episode.frames):
         time_ns = 10**18 + index * 33_333_333
         samples = {name: Sample(stamp_ns=time_ns, vector=one.vector) for name, one in frame.samples.items()}
-        frames.append(CollectedFrame(time_ns=time_ns, samples=samples, pictures={"top": index, "side": index}))
+        frames.append(SampledFrame(time_ns=time_ns, samples=samples, pictures={"top": index, "side": index}))
         pixels = episode.pictures["top"][index][1]
         top.append((time_ns, pixels))
         side.append((time_ns, pixels[::-1].copy()))
@@ -37,7 +37,7 @@ def steady(**changes: Any) -> Episode:
     )
 
 
-def shifted(frame: CollectedFrame, *, by: int) -> CollectedFrame:
+def shifted(frame: SampledFrame, *, by: int) -> SampledFrame:
     samples = {name: replace(sample, stamp_ns=sample.stamp_ns + by) for name, sample in frame.samples.items()}
     return replace(frame, time_ns=frame.time_ns + by, samples=samples)
 
@@ -56,12 +56,12 @@ def moved(offset: Callable[[int], int]) -> Callable[[Episode], Episode]:
     return change
 
 
-def each(change: Callable[[int, CollectedFrame], CollectedFrame]) -> Callable[[Episode], Episode]:
+def each(change: Callable[[int, SampledFrame], SampledFrame]) -> Callable[[Episode], Episode]:
     return lambda episode: replace(episode, frames=[change(index, frame) for index, frame in enumerate(episode.frames)])
 
 
 def state(value: Callable[[int, Any], Any]) -> Callable[[Episode], Episode]:
-    def change(index: int, frame: CollectedFrame) -> CollectedFrame:
+    def change(index: int, frame: SampledFrame) -> SampledFrame:
         one = frame.samples["observation.state"]
         vector = np.asarray(value(index, one.vector.copy()), dtype=np.float32)
         return replace(frame, samples={**frame.samples, "observation.state": replace(one, vector=vector)})
@@ -69,13 +69,13 @@ def state(value: Callable[[int, Any], Any]) -> Callable[[Episode], Episode]:
     return each(change)
 
 
-def held(frame: CollectedFrame, name: str) -> Sample:
+def held(frame: SampledFrame, name: str) -> Sample:
     """The sample at one value."""
     return replace(frame.samples[name], vector=np.ones_like(frame.samples[name].vector))
 
 
 def older(name: str, by: int) -> Callable[[Episode], Episode]:
-    def change(index: int, frame: CollectedFrame) -> CollectedFrame:
+    def change(index: int, frame: SampledFrame) -> SampledFrame:
         one = frame.samples[name]
         return replace(frame, samples={**frame.samples, name: replace(one, stamp_ns=one.stamp_ns - by)})
 
@@ -130,7 +130,7 @@ def levels(path: Path) -> dict[str, str]:
 
 
 def test_a_good_episode_passes(tmp_path: Path) -> None:
-    found = levels(write_collected(tmp_path / "a.mcap", steady()))
+    found = levels(write_external(tmp_path / "a.mcap", steady()))
     assert {level for check, level in found.items() if check.startswith("collected_")} == {"pass"}
     assert (found["joint_limits"], found["joint_speed"]) == ("pass", "pass")
     assert "fail" not in found.values()
@@ -141,7 +141,7 @@ def test_a_good_episode_passes(tmp_path: Path) -> None:
 def test_cameras_that_are_the_same_are_named_together(tmp_path: Path) -> None:
     episode = steady()
     twice = replace(episode, pictures={**episode.pictures, "side": episode.pictures["top"]})
-    report = check_subject(Subject(path=write_collected(tmp_path / "a.mcap", twice), kind="recording"), CheckOptions())
+    report = check_subject(Subject(path=write_external(tmp_path / "a.mcap", twice), kind="recording"), CheckOptions())
     (found,) = [result for result in report.results if result.check == "collected_distinct_cameras"]
     assert (found.value, found.detail) == (1, "top and side")
 
@@ -157,18 +157,18 @@ def test_a_label_that_never_changes_is_no_stuck_sensor(tmp_path: Path) -> None:
         samples["intervention"] = replace(force, vector=np.zeros(3))
         frames.append(replace(frame, samples=samples))
     episode = replace(episode, info=replace(episode.info, features=features), frames=frames)
-    assert levels(write_collected(tmp_path / "a.mcap", episode))["collected_stuck"] == "pass"
+    assert levels(write_external(tmp_path / "a.mcap", episode))["collected_stuck"] == "pass"
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_by_its_check_alone(tmp_path: Path, fault: str) -> None:
     change, check, level = FAULTS[fault]
-    found = levels(write_collected(tmp_path / "a.mcap", change(steady())))
+    found = levels(write_external(tmp_path / "a.mcap", change(steady())))
     assert {name: found for name, found in found.items() if found not in ("pass", "skip")} == {check: level}
 
 
 def test_a_damaged_file_is_a_failure(tmp_path: Path) -> None:
-    path = write_collected(tmp_path / "a.mcap", steady())
+    path = write_external(tmp_path / "a.mcap", steady())
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
@@ -176,7 +176,7 @@ def test_a_damaged_file_is_a_failure(tmp_path: Path) -> None:
 
 
 def test_a_recovered_file_is_a_warning(tmp_path: Path) -> None:
-    data = write_collected(tmp_path / "a.mcap", steady(num_frames=100)).read_bytes()
+    data = write_external(tmp_path / "a.mcap", steady(num_frames=100)).read_bytes()
     (tmp_path / "b.mcap").write_bytes(data[: len(data) * 3 // 4])
     recover(tmp_path / "b.mcap", tmp_path / "c.mcap")
     found = levels(tmp_path / "c.mcap")
@@ -195,9 +195,9 @@ def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, st
 @pytest.fixture(scope="module")
 def collected_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    with open_collected_run(folder) as opened:
+    with open_external_run(folder) as opened:
         for index in range(2):
-            opened.add(write_collected(opened.path_of(index), steady(num_frames=20, episode_index=index)))
+            opened.add(write_external(opened.path_of(index), steady(num_frames=20, episode_index=index)))
     return folder
 
 
@@ -216,7 +216,7 @@ def test_a_run_is_told_and_checked(collected_run: Path, capsys: pytest.CaptureFi
 def test_a_run_of_other_files_is_a_failure(collected_run: Path, tmp_path: Path) -> None:
     (tmp_path / "episodes").mkdir()
     (tmp_path / "run.json").write_bytes((collected_run / "run.json").read_bytes())
-    write_collected(tmp_path / "episodes" / "episode_000001.mcap", steady(num_frames=9, episode_index=1))
+    write_external(tmp_path / "episodes" / "episode_000001.mcap", steady(num_frames=9, episode_index=1))
     report = check_subject(Subject(path=tmp_path, kind="run"), CheckOptions())
     told = next(result for result in report.results if result.check == "collected_run_files")
     assert (told.level, told.value) == ("fail", 2)

@@ -13,24 +13,24 @@ import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from support.collected import TOP, Episode, make_collected, write_collected
 from support.export import data_table, export
+from support.external import TOP, Episode, make_external, write_external
 from support.recording import write_episode
 
 from demorec.core.errors import ConfigError, ExportError
-from demorec.mcap import CollectedRecording
+from demorec.mcap import Recording
 
 
 def run_of(folder: Path, *episodes: Episode) -> Path:
     (folder / "episodes").mkdir(parents=True)
     for number, episode in enumerate(episodes):
-        write_collected(folder / "episodes" / f"episode_{number:06d}.mcap", episode)
+        write_external(folder / "episodes" / f"episode_{number:06d}.mcap", episode)
     return folder
 
 
 def complete(**arguments: Any) -> Episode:
     """An episode in which every frame has its picture."""
-    return make_collected(cameras=(TOP,), **arguments)
+    return make_external(cameras=(TOP,), **arguments)
 
 
 def test_numbers_are_those_of_the_recordings(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_numbers_that_float32_does_not_hold_are_refused_where_it_is_written(tmp_
 def test_packets_go_into_the_dataset_as_they_are(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", complete())
     export(run, tmp_path / "d")
-    with CollectedRecording(run / "episodes" / "episode_000000.mcap") as recording:
+    with Recording(run / "episodes" / "episode_000000.mcap") as recording:
         recorded = list(recording.images("top"))
     with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
         shown = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
@@ -114,7 +114,7 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
     failed: dict[str, Any] = {"episode_index": 1, "num_frames": 5, "success": False}
     without = complete(**failed)
     without = replace(without, frames=[replace(frame, pictures={}) for frame in without.frames], pictures={"top": []})
-    blind = make_collected(cameras=(), **failed | {"episode_index": 2})
+    blind = make_external(cameras=(), **failed | {"episode_index": 2})
     slow = complete(**failed | {"episode_index": 3})
     slow = replace(slow, info=replace(slow.info, fps=20))
     run = run_of(tmp_path / "run", complete(num_frames=5), without, blind, slow)
@@ -123,7 +123,7 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
     for options, error in (({}, "no image of the camera top"), ({"episodes": "0,2"}, "cameras is none")):
         with pytest.raises((ExportError, ConfigError), match=error):
             export(run, tmp_path / "e", exporter, include_failures=True, **options)
-    other = run_of(tmp_path / "other", make_collected(cameras=(), num_frames=5))
+    other = run_of(tmp_path / "other", make_external(cameras=(), num_frames=5))
     with pytest.raises(ConfigError, match="cameras is none instead of top") as refused:
         export([run, other], tmp_path / "e", exporter)
     assert "fps is 20" not in str(refused.value)
@@ -139,7 +139,7 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
         ({"features": ("observation.forse",)}, "Unknown feature 'observation.forse'.*observation.force"),
     ],
 )
-def test_options_that_a_collected_episode_cannot_serve(tmp_path: Path, options: dict[str, Any], words: str) -> None:
+def test_options_that_a_external_episode_cannot_serve(tmp_path: Path, options: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         export(run_of(tmp_path / "run", complete(num_frames=5)), tmp_path / "d", **options)
 
@@ -160,12 +160,12 @@ def test_a_dataset_can_be_appended_to(tmp_path: Path) -> None:
 def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     from typing import cast
 
-    from demorec.mcap import CollectedWriter
+    from demorec.mcap import EpisodeWriter
 
     context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
     context.width, context.height, context.pix_fmt, context.time_base = 64, 48, "yuv420p", Fraction(1, 30)
     context.options = {"tune": "zerolatency", "x265-params": "log-level=none:bframes=0:keyint=5"}
-    episode = make_collected(num_frames=12, cameras=(replace(TOP, kept="h265"),))
+    episode = make_external(num_frames=12, cameras=(replace(TOP, kept="h265"),))
     packets = []
     for index in range(12):
         frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 9 * index, dtype=np.uint8), format="rgb24")
@@ -173,7 +173,7 @@ def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
         packets += [bytes(packet) for packet in context.encode(frame)]
     packets += [bytes(packet) for packet in context.encode(None)]
     (tmp_path / "run" / "episodes").mkdir(parents=True)
-    with CollectedWriter(tmp_path / "run" / "episodes" / "episode_000000.mcap", episode.info) as writer:
+    with EpisodeWriter(tmp_path / "run" / "episodes" / "episode_000000.mcap", episode.info) as writer:
         for frame_, packet in zip(episode.frames, packets, strict=True):
             writer.picture("top", frame_.time_ns, packet)
             writer.write(frame_)

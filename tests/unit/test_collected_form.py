@@ -11,30 +11,30 @@ from typing import Any, Literal, cast
 import av
 import numpy as np
 import pytest
-from support.collected import (
+from support.external import (
     ACTION,
     FORCE,
     STATE,
     TOP,
     WRIST,
-    make_collected,
-    write_collected,
+    make_external,
+    write_external,
     write_pictures_and_frames,
 )
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
-from demorec.episode.collected import (
+from demorec.episode.external import (
     NO_PICTURE,
-    CollectedCamera,
-    CollectedFrame,
-    CollectedInfo,
-    CollectedOutcome,
+    Camera,
+    EpisodeInfo,
+    ExternalOutcome,
     Origin,
     Sample,
+    SampledFrame,
     SourceFile,
 )
-from demorec.mcap import CollectedRecording, CollectedWriter, Recording, recover
+from demorec.mcap import EpisodeWriter, Recording, SimulatedRecording, recover
 from demorec.mcap.external.transforms import JointPositions
 from demorec.mcap.external.validity import what_is_wrong
 
@@ -42,11 +42,11 @@ from demorec.mcap.external.validity import what_is_wrong
 @pytest.mark.parametrize("num_frames", [0, 1, 45, 100])
 @pytest.mark.parametrize("cameras", [(), (TOP, WRIST)])
 def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
-    tmp_path: Path, num_frames: int, cameras: tuple[CollectedCamera, ...]
+    tmp_path: Path, num_frames: int, cameras: tuple[Camera, ...]
 ) -> None:
-    episode = make_collected(num_frames=num_frames, cameras=cameras)
-    path = write_collected(tmp_path / "a.mcap", episode)
-    with CollectedRecording(path) as recording:
+    episode = make_external(num_frames=num_frames, cameras=cameras)
+    path = write_external(tmp_path / "a.mcap", episode)
+    with Recording(path) as recording:
         assert recording.info == episode.info
         assert recording.outcome == episode.outcome
         assert recording.num_frames == num_frames
@@ -70,9 +70,9 @@ def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
 def test_pixels_are_coded_once_and_found_by_their_frame(tmp_path: Path, codec: Literal["h264", "av1", "jpeg"]) -> None:
-    episode = make_collected()
-    path = write_collected(tmp_path / "a.mcap", episode, video=VideoConfig(codec=codec))
-    with CollectedRecording(path) as recording:
+    episode = make_external()
+    path = write_external(tmp_path / "a.mcap", episode, video=VideoConfig(codec=codec))
+    with Recording(path) as recording:
         images = list(recording.images("top"))
         assert len(images) == 45
         for picture, (_, pixels) in zip(images, episode.pictures["top"], strict=True):
@@ -105,13 +105,13 @@ def test_packets_that_came_coded_stay_byte_for_byte(tmp_path: Path, codec: Liter
     packets = _packets(codec, 25)
     assert len(packets) == 25
     camera = replace(TOP, kept=codec)
-    episode = make_collected(num_frames=25, cameras=(camera,))
-    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+    episode = make_external(num_frames=25, cameras=(camera,))
+    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         for frame, packet in zip(episode.frames, packets, strict=True):
             writer.picture("top", frame.time_ns, packet)
             writer.write(frame)
         writer.finish(episode.outcome)
-    with CollectedRecording(tmp_path / "a.mcap") as recording:
+    with Recording(tmp_path / "a.mcap") as recording:
         assert [packet.data for packet in recording.packets("top")] == packets
         assert bytes(recording.coded_pictures(["top"])["top"].joined()) == b"".join(packets)
         assert [packet.frame_index for packet in recording.packets("top") if packet.is_keyframe] == [0, 10, 20]
@@ -123,14 +123,14 @@ def test_packets_that_came_coded_stay_byte_for_byte(tmp_path: Path, codec: Liter
 
 def test_pictures_need_not_be_held(tmp_path: Path) -> None:
     """A camera may be quicker than the frames."""
-    episode = make_collected(num_frames=2, cameras=(WRIST,))
-    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+    episode = make_external(num_frames=2, cameras=(WRIST,))
+    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         for index in range(9):
             writer.picture("wrist", index, episode.pictures["wrist"][0][1])
         for number, frame in zip((3, 8), episode.frames, strict=True):
             writer.write(replace(frame, pictures={"wrist": number}))
         writer.finish(episode.outcome)
-    with CollectedRecording(tmp_path / "a.mcap") as recording:
+    with Recording(tmp_path / "a.mcap") as recording:
         columns = recording.columns()
         assert columns.pictures["wrist"].tolist() == [3, 8]
         assert columns.picture_stamps["wrist"].tolist() == list(range(9))
@@ -138,7 +138,7 @@ def test_pictures_need_not_be_held(tmp_path: Path) -> None:
 
 def test_a_digest_is_of_the_content(tmp_path: Path) -> None:
     def digest(name: str, **changes: Any) -> str:
-        with CollectedRecording(write_collected(tmp_path / name, make_collected(num_frames=5, **changes))) as recording:
+        with Recording(write_external(tmp_path / name, make_external(num_frames=5, **changes))) as recording:
             return recording.digest()
 
     assert digest("a.mcap") == digest("b.mcap")
@@ -147,33 +147,33 @@ def test_a_digest_is_of_the_content(tmp_path: Path) -> None:
 
 def test_the_description_says_where_it_came_from(tmp_path: Path) -> None:
     origin = Origin(kind="import", files=(SourceFile(name="a.mcap", sha256="00"),), mapping_digest="11")
-    episode = make_collected(num_frames=3)
-    path = write_collected(tmp_path / "a.mcap", replace(episode, info=replace(episode.info, origin=origin)))
-    with CollectedRecording(path) as recording:
+    episode = make_external(num_frames=3)
+    path = write_external(tmp_path / "a.mcap", replace(episode, info=replace(episode.info, origin=origin)))
+    with Recording(path) as recording:
         assert recording.info.origin == origin
 
 
 def test_what_needs_a_scene_says_why_it_cannot_be(tmp_path: Path) -> None:
-    path = write_collected(tmp_path / "a.mcap")
+    path = write_external(tmp_path / "a.mcap")
     with pytest.raises(RecordingError, match="collected from another robot or program and has no scene"):
-        Recording(path)
+        SimulatedRecording(path)
 
 
-def _frame(**changes: Any) -> Callable[[CollectedWriter, CollectedFrame], object]:
+def _frame(**changes: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
     return lambda writer, frame: writer.write(replace(frame, **changes))
 
 
-def _sample(feature: str, vector: object, stamp_ns: object = 5) -> Callable[[CollectedWriter, CollectedFrame], object]:
+def _sample(feature: str, vector: object, stamp_ns: object = 5) -> Callable[[EpisodeWriter, SampledFrame], object]:
     sample = Sample(stamp_ns=cast(int, stamp_ns), vector=cast(Any, vector))
     return lambda writer, frame: writer.write(replace(frame, samples={**frame.samples, feature: sample}))
 
 
-def _picture(*arguments: Any) -> Callable[[CollectedWriter, CollectedFrame], object]:
+def _picture(*arguments: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
     return lambda writer, frame: writer.picture(*arguments)
 
 
 PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
-BAD: dict[str, tuple[Callable[[CollectedWriter, CollectedFrame], object], str]] = {
+BAD: dict[str, tuple[Callable[[EpisodeWriter, SampledFrame], object], str]] = {
     "length": (
         _sample("action", np.zeros(2)),
         r"'action' of frame 1 is float64 of shape \(2,\), it must be float64 of",
@@ -201,8 +201,8 @@ BAD: dict[str, tuple[Callable[[CollectedWriter, CollectedFrame], object], str]] 
 @pytest.mark.parametrize("what", BAD)
 def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what: str) -> None:
     act, words = BAD[what]
-    episode = make_collected(num_frames=2, cameras=(TOP,))
-    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+    episode = make_external(num_frames=2, cameras=(TOP,))
+    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         writer.picture("top", *episode.pictures["top"][0])
         writer.write(episode.frames[0])
         with pytest.raises(RecordingError, match=words) as error:
@@ -230,28 +230,28 @@ def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what
     ],
 )
 def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
-    info: CollectedInfo = replace(make_collected(num_frames=1).info, **changes)
+    info: EpisodeInfo = replace(make_external(num_frames=1).info, **changes)
     with pytest.raises(ConfigError, match=words):
-        CollectedWriter(tmp_path / "a.mcap", info)
+        EpisodeWriter(tmp_path / "a.mcap", info)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_good_description_has_nothing_wrong() -> None:
-    assert what_is_wrong(make_collected().info) == []
+    assert what_is_wrong(make_external().info) == []
 
 
 def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) -> None:
-    episode = make_collected(num_frames=100)
-    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+    episode = make_external(num_frames=100)
+    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         write_pictures_and_frames(writer, episode)
         data = (tmp_path / "a.mcap.part").read_bytes()
     (tmp_path / "b.mcap.part").write_bytes(data)
     with pytest.raises(DemorecError, match="cut off"):
-        CollectedRecording(tmp_path / "b.mcap.part")
+        Recording(tmp_path / "b.mcap.part")
     result = recover(tmp_path / "b.mcap.part", tmp_path / "b.mcap")
     assert not result.is_complete
     assert 100 - 31 <= result.num_frames < 100
-    with CollectedRecording(tmp_path / "b.mcap") as recording:
+    with Recording(tmp_path / "b.mcap") as recording:
         assert recording.is_recovered
         assert recording.outcome is None
         columns = recording.columns()
@@ -262,11 +262,11 @@ def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) ->
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.999])
 def test_a_file_that_was_cut_anywhere_gives_whole_frames(tmp_path: Path, share: float) -> None:
-    episode = make_collected(num_frames=100)
-    data = write_collected(tmp_path / "a.mcap", episode).read_bytes()
+    episode = make_external(num_frames=100)
+    data = write_external(tmp_path / "a.mcap", episode).read_bytes()
     (tmp_path / "b.mcap").write_bytes(data[: int(share * len(data))])
     result = recover(tmp_path / "b.mcap", tmp_path / "c.mcap")
-    with CollectedRecording(tmp_path / "c.mcap") as recording:
+    with Recording(tmp_path / "c.mcap") as recording:
         columns = recording.columns()
     assert 0 < columns.num_frames == result.num_frames <= 100
     for index in range(result.num_frames):
@@ -275,16 +275,16 @@ def test_a_file_that_was_cut_anywhere_gives_whole_frames(tmp_path: Path, share: 
 
 def test_what_a_killed_import_left_is_made_again(tmp_path: Path) -> None:
     origin = Origin(kind="import", files=(SourceFile(name="a.mcap", sha256="00"),))
-    episode = make_collected(num_frames=3)
+    episode = make_external(num_frames=3)
     imported = replace(episode, info=replace(episode.info, origin=origin))
-    with CollectedWriter(tmp_path / "a.mcap", imported.info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", imported.info) as writer:
         write_pictures_and_frames(writer, imported)
-    write_collected(tmp_path / "a.mcap", imported)
+    write_external(tmp_path / "a.mcap", imported)
     (tmp_path / "a.mcap").unlink()
-    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         write_pictures_and_frames(writer, episode)
     with pytest.raises(ConfigError, match="unfinished recording"):  # of the Recorder: nobody can make it again
-        write_collected(tmp_path / "a.mcap", episode)
+        write_external(tmp_path / "a.mcap", episode)
 
 
 def test_joints_are_told_in_radians() -> None:
@@ -296,8 +296,8 @@ def test_joints_are_told_in_radians() -> None:
 
 
 def test_an_outcome_of_another_length_is_refused(tmp_path: Path) -> None:
-    episode = make_collected(num_frames=3)
-    with CollectedWriter(tmp_path / "a.mcap", episode.info) as writer:
+    episode = make_external(num_frames=3)
+    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         write_pictures_and_frames(writer, episode)
         with pytest.raises(RecordingError, match="The outcome has 4 frames, the recording 3"):
-            writer.finish(CollectedOutcome(num_frames=4))
+            writer.finish(ExternalOutcome(num_frames=4))

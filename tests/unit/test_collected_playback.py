@@ -7,25 +7,25 @@ from pathlib import Path
 
 import pytest
 from rerun.chunk import RrdReader
-from support.collected import TOP, WRIST, make_collected, write_collected
+from support.external import TOP, WRIST, make_external, write_external
 
 from demorec.core.errors import ConfigError
-from demorec.view.episode import PlayedCollected
+from demorec.view.episode import PlayedExternal
 from demorec.view.save import save, save_comparison
 from demorec.view.sources import find_episodes
 
 
-def opened(path: Path) -> PlayedCollected:
+def opened(path: Path) -> PlayedExternal:
     with find_episodes([path])[0].open() as episode:
-        assert isinstance(episode, PlayedCollected)
+        assert isinstance(episode, PlayedExternal)
         return episode
 
 
 def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
-    given = make_collected()
-    path = write_collected(tmp_path / "a.mcap", given)
+    given = make_external()
+    path = write_external(tmp_path / "a.mcap", given)
     with find_episodes([path])[0].open() as episode:
-        assert isinstance(episode, PlayedCollected)
+        assert isinstance(episode, PlayedExternal)
         times = [frame.time_ns - given.frames[0].time_ns for frame in given.frames]
         assert episode.time_ns.tolist() == times
         assert set(episode.curves) == {"observation.state", "action", "observation.force"}
@@ -39,20 +39,20 @@ def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize("cameras", [(), (TOP, WRIST)])
 @pytest.mark.parametrize("urdf", [True, False])
 def test_it_can_be_saved_with_whatever_is_known(tmp_path: Path, cameras: tuple[object, ...], urdf: bool) -> None:
-    given = make_collected(num_frames=5)
+    given = make_external(num_frames=5)
     if not cameras:
-        given = make_collected(num_frames=5, cameras=())
+        given = make_external(num_frames=5, cameras=())
     if not urdf:
         given = replace(given, info=replace(given.info, urdf=""))
-    path = write_collected(tmp_path / "a.mcap", given)
+    path = write_external(tmp_path / "a.mcap", given)
     save(find_episodes([path])[0], tmp_path / "a.rrd")
     assert (tmp_path / "a.rrd").read_bytes().startswith(b"RR")
 
 
 def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    given = make_collected(num_frames=5)
+    given = make_external(num_frames=5)
     mesh = given.info.urdf.replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="package://arm/base.stl"/>')
-    path = write_collected(tmp_path / "a.mcap", replace(given, info=replace(given.info, urdf=mesh)))
+    path = write_external(tmp_path / "a.mcap", replace(given, info=replace(given.info, urdf=mesh)))
     save(find_episodes([path])[0], tmp_path / "a.rrd")
     assert "The robot is drawn as rods between its joints" in caplog.text
     drawn = {
@@ -64,7 +64,7 @@ def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog:
 
 
 def test_two_of_them_are_not_laid_over_each_other(tmp_path: Path) -> None:
-    path = write_collected(tmp_path / "a.mcap", make_collected(num_frames=5))
+    path = write_external(tmp_path / "a.mcap", make_external(num_frames=5))
     (source,) = find_episodes([path])
     with pytest.raises(ConfigError, match="without --compare"):
         save_comparison(source, source, tmp_path / "a.rrd")

@@ -16,15 +16,15 @@ import pybullet
 import pytest
 from rerun.chunk import RrdReader
 from support.check import level_of
-from support.collected import TOP, URDF, Episode, make_collected, write_collected
 from support.export import data_table, export
+from support.external import TOP, URDF, Episode, make_external, write_external
 
 from demorec.core.errors import ExportError, MissingDependencyError
 from demorec.core.plain import digest, from_json, to_json
 from demorec.datasets.lerobot.robots import RobotRecord, portable_urdf, read_robot
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.view import robot as played_robot
-from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.save import save
 from demorec.view.sources import find_episodes
@@ -52,7 +52,7 @@ def files_of(root: Path) -> tuple[Path, Path]:
 
 
 def collected(**arguments: Any) -> Episode:
-    return make_collected(cameras=(TOP,), **arguments)
+    return make_external(cameras=(TOP,), **arguments)
 
 
 def test_another_program_places_the_arm_as_it_was_recorded(exported: Path, tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_another_program_places_the_arm_as_it_was_recorded(exported: Path, tmp_p
     record = json.loads(record_file.read_text())
     alone = Path(shutil.copy(urdf_file, tmp_path))
     rows = data_table(exported).to_pylist()
-    with Recording(SAMPLE) as recording:
+    with SimulatedRecording(SAMPLE) as recording:
         recorded = recording.columns().base_from_tcp
     client = pybullet.connect(pybullet.DIRECT)
     try:
@@ -229,14 +229,14 @@ def meshes_in(path: Path) -> set[str]:
     }
 
 
-def test_a_collected_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
+def test_a_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     given = collected(num_frames=12)
     degrees = [replace(feature, units=("deg", "rad", "")) for feature in given.info.features[:1]]
     given = replace(given, info=replace(given.info, features=(*degrees, *given.info.features[1:])))
-    export(write_collected(tmp_path / "a.mcap", given), tmp_path / "d")
+    export(write_external(tmp_path / "a.mcap", given), tmp_path / "d")
     assert level_of(tmp_path / "d", "dataset_robots", "dataset") == "pass"
     with open_dataset_episode(tmp_path / "d", 0) as episode:
-        assert isinstance(episode, PlayedCollected)
+        assert isinstance(episode, PlayedExternal)
         state = np.array([frame.samples["observation.state"].vector for frame in given.frames])
         np.testing.assert_allclose(episode.joint_position["shoulder"], np.deg2rad(state[:, 0]), atol=1e-7)
         np.testing.assert_array_equal(episode.joint_position["elbow"], state[:, 1])
@@ -252,7 +252,7 @@ def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(e
         assert isinstance(known, PlayedEpisode)
     shutil.rmtree(strange / "demorec")
     with open_dataset_episode(strange, 0) as episode:
-        assert isinstance(episode, PlayedCollected)
+        assert isinstance(episode, PlayedExternal)
         for index, name in enumerate(known.info.robot.arm_joints):
             np.testing.assert_array_equal(episode.joint_position[name], known.joint_position[:, index])
         assert (episode.info.instruction, episode.verdict) == (known.info.instruction, known.verdict)
@@ -271,7 +271,7 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
             info = episode.info
             plain = tuple(replace(feature, joints=()) for feature in info.features)
             episode = replace(episode, info=replace(info, features=plain))
-        export(write_collected(tmp_path / f"{number}.mcap", episode), tmp_path / "d", append=True)
+        export(write_external(tmp_path / f"{number}.mcap", episode), tmp_path / "d", append=True)
     tables = sorted((tmp_path / "d" / "demorec" / "episodes").rglob("*.parquet"))
     names = [name for table in tables for name in pq.read_table(table).column("robot_digest").to_pylist()]
     assert names[0] == names[2] != names[1]

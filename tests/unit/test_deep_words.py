@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support.collected import write_collected
+from support.external import write_external
 
 from demorec.cli import main
 from demorec.cli.check import deep_summary
@@ -31,8 +31,8 @@ def test_other_versions_are_counted_as_they_are_told() -> None:
     assert deep_summary([report(), other], []) == " 2 made again (1 with a warning), 0 not as recorded."
 
 
-def test_a_collected_episode_cannot_be_made_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_collected(tmp_path / "a.mcap")
+def test_a_external_episode_cannot_be_made_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_external(tmp_path / "a.mcap")
     with pytest.raises(SystemExit) as ended:
         main(["check", str(path), "--deep", "--only", "opens"])
     assert ended.value.code == 1

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from demorec.datasets.lerobot.data_stats import data_statistics
-from demorec.datasets.lerobot.layout import Feature, data_schema
+from demorec.datasets.lerobot.layout import DatasetFeature, data_schema
 from demorec.datasets.lerobot.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
 from demorec.datasets.lerobot.writer import merge_statistics
 
@@ -42,13 +42,13 @@ def columns(rng: np.random.Generator, count: int) -> dict[str, NDArray[np.generi
     }
 
 
-def write(path: Path, data: dict[str, NDArray[np.generic]], *, row_group: int) -> dict[str, Feature]:
+def write(path: Path, data: dict[str, NDArray[np.generic]], *, row_group: int) -> dict[str, DatasetFeature]:
     features = {
-        "state": Feature(dtype="float32", shape=(6,)),
-        "camera": Feature(dtype="video", shape=(4, 4, 3)),
-        "reward": Feature(dtype="float32", shape=(1,)),
-        "done": Feature(dtype="bool", shape=(1,)),
-        "index": Feature(dtype="int64", shape=(1,)),
+        "state": DatasetFeature(dtype="float32", shape=(6,)),
+        "camera": DatasetFeature(dtype="video", shape=(4, 4, 3)),
+        "reward": DatasetFeature(dtype="float32", shape=(1,)),
+        "done": DatasetFeature(dtype="bool", shape=(1,)),
+        "index": DatasetFeature(dtype="int64", shape=(1,)),
     }
     schema = data_schema(features)
     state = pa.FixedSizeListArray.from_arrays(pa.array(data["state"].reshape(-1)), type=schema.field("state").type)

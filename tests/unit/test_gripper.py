@@ -20,7 +20,7 @@ from demorec.check.physics import gripper_width
 from demorec.core.geometry import Array
 from demorec.core.plain import from_json, from_plain, to_json, to_plain
 from demorec.core.tables import ROBOTS
-from demorec.episode.episode import Action, EpisodeInfo
+from demorec.episode.episode import Action, SimulatedInfo
 from demorec.episode.features import VELOCITY, observation_vectors
 from demorec.episode.sensed import ObservationRows
 from demorec.mcap.streams import FrameValues, frame_streams
@@ -77,7 +77,7 @@ def test_files_of_every_version_hold_the_gripper_among_the_robots_keys(version: 
         text = next(m.metadata["info"] for m in make_reader(file).iter_metadata() if m.name == "demorec.episode")
     recorded = json.loads(text)["robot"]
     assert recorded["gripper_joints"] == ["panda_finger_joint1", "panda_finger_joint2"]
-    info = from_json(text, EpisodeInfo)
+    info = from_json(text, SimulatedInfo)
     assert info.robot.gripper.max_width == recorded["gripper_max_width"] == 0.08
     assert info.robot.gripper.palm_clearance == recorded["palm_clearance"]
     assert json.loads(to_json(info.robot)) == recorded

@@ -17,7 +17,7 @@ from support.sim import episode, run
 import demorec.loop
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_json, to_json
-from demorec.episode.episode import EpisodeInfo, Frame, Outcome
+from demorec.episode.episode import Frame, Outcome, SimulatedInfo
 from demorec.episode.features import NOISE_DECAY
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 
@@ -67,7 +67,7 @@ def test_observation_comes_before_the_action(ran: tuple[Episode, list[Frame], Ou
 
 def test_replaying_the_commands_gives_the_same_bits(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     prepared, frames, outcome = ran
-    info = from_json(to_json(prepared.info), EpisodeInfo)  # as a recording would hold it
+    info = from_json(to_json(prepared.info), SimulatedInfo)  # as a recording would hold it
     with make_world(info) as world:
         world.reset(info.scene)
         for frame in frames:
@@ -210,7 +210,7 @@ def test_other_frame_rates_work_too(fps: int) -> None:
 def test_info_is_plain_and_complete(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     prepared, _, _ = ran
     info = prepared.info
-    assert from_json(to_json(info), EpisodeInfo) == info
+    assert from_json(to_json(info), SimulatedInfo) == info
     assert info.config["seed"] == 0
     assert info.behaviour["action_noise"] == 0.02
     assert {"demorec", "pybullet", "numpy"} <= set(info.versions)

@@ -10,7 +10,7 @@ import pytest
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import Camera, Light, RobotPlacement, Scene
+from demorec.episode.scene import Light, RobotPlacement, Scene, SceneCamera
 from demorec.render import Mount, RenderSetup, Visual, VisualBody, first_rows
 from demorec.render.painter import Painter
 from demorec.render.setup_checks import world_from_camera
@@ -23,9 +23,9 @@ def ball(color: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0), *, num
     return VisualBody(name="ball", num_links=num_links, is_fixed=False, visuals=(visual,))
 
 
-def camera(mount: str = "world") -> Camera:
+def camera(mount: str = "world") -> SceneCamera:
     pose = Pose(position=np.array([0.1, 0.0, 0.0]))
-    return Camera(name="eye", width=4, height=2, fov_y=1.0, mount=mount, mount_from_camera=pose)
+    return SceneCamera(name="eye", width=4, height=2, fov_y=1.0, mount=mount, mount_from_camera=pose)
 
 
 class Noted:
@@ -76,7 +76,7 @@ class Balls:
         return np.array(rows)
 
 
-def painted(world: Any, *cameras: Camera, **options: Any) -> tuple[Noted, Painter]:
+def painted(world: Any, *cameras: SceneCamera, **options: Any) -> tuple[Noted, Painter]:
     renderer = Noted()
     painter = Painter(renderer, cameras, **options)
     painter.setup(world)

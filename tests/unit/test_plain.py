@@ -15,10 +15,10 @@ from demorec.episode.scene import (
     CONTACT_BREAKING_THRESHOLD,
     FINGER_STIFFNESS,
     Body,
-    Camera,
     Physics,
     RobotPlacement,
     Scene,
+    SceneCamera,
     Shape,
     Texture,
 )
@@ -43,7 +43,7 @@ def _scene() -> Scene:
             ),
         ),
         cameras=(
-            Camera(
+            SceneCamera(
                 name="front",
                 width=64,
                 height=48,

@@ -17,7 +17,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
@@ -66,7 +66,7 @@ def _column(chunks: list[Any], component: str) -> list[Any]:
 
 
 def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], recording: Path) -> None:
-    with Recording(recording) as source:
+    with SimulatedRecording(recording) as source:
         samples = list(source.joint_samples())
         num_frames, joints = source.num_frames, len(source.info.robot.arm_joints)
     assert len(samples) > 7 * (num_frames - 1)  # the physics' rate
@@ -77,7 +77,7 @@ def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], 
 
 @pytest.mark.parametrize(("plot", "part"), [("hand_force", slice(0, 3)), ("hand_torque", slice(3, 6))])
 def test_the_wrench_is_plotted(saved: dict[str, list[Any]], recording: Path, plot: str, part: slice) -> None:
-    with Recording(recording) as source:
+    with SimulatedRecording(recording) as source:
         wrench = source.columns().wrench
     assert wrench is not None
     rows = _column(saved[f"/plots/{plot}"], "Scalars:scalars")
@@ -92,14 +92,14 @@ def test_frames_are_on_both_time_lines(saved: dict[str, list[Any]]) -> None:
 
 @pytest.mark.parametrize("camera", ["front", "wrist"])
 def test_coded_pictures_are_passed_on_unchanged(saved: dict[str, list[Any]], recording: Path, camera: str) -> None:
-    with Recording(recording) as source:
+    with SimulatedRecording(recording) as source:
         packets = list(source.packets(camera))
     rows = _column(saved[f"/world/cameras/{camera}"], "VideoStream:sample")
     assert [(time, bytes(value[0])) for time, value in rows] == [(packet.time_ns, packet.data) for packet in packets]
 
 
 def test_depth_and_segments_are_there(saved: dict[str, list[Any]], recording: Path) -> None:
-    with Recording(recording) as source:
+    with SimulatedRecording(recording) as source:
         metres = next(iter(source.depth("front")))
     _, value = _column(saved["/world/cameras/front/depth"], "DepthImage:buffer")[0]
     millimetres = np.frombuffer(bytes(value[0]), dtype=np.uint16).reshape(metres.shape)
@@ -175,7 +175,7 @@ def test_meshes_are_small_and_have_their_size() -> None:
 
 
 def test_the_recorded_description_stands_in_for_a_model_that_is_not_installed(recording: Path) -> None:
-    with Recording(recording) as source:
+    with SimulatedRecording(recording) as source:
         description = source.description()
     urdf, meshes = robot_model("nowhere/robot.urdf", 1.0, description)
     assert "panda_hand" in {joint.child for joint in urdf.joints}
@@ -208,7 +208,7 @@ def with_models(tmp_path: Path) -> Path:
     """A recording with a mesh and a URDF beside the table and the cube."""
     info, frames, outcome = make_episode(num_frames=3, cameras=())
     info = replace(info, scene=replace(info.scene, bodies=(*info.scene.bodies, DUCK, BRICK)))
-    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
+    with SimulatedWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

@@ -16,7 +16,7 @@ from support.recording import write_episode
 
 from demorec.core.errors import ExportError, RecordingError
 from demorec.core.geometry import Array
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.view.episode import PlayedEpisode
 from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.held_objects import held
@@ -29,7 +29,7 @@ SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
 
 @pytest.fixture(scope="module")
 def recorded() -> Array:
-    with Recording(SAMPLE) as recording:
+    with SimulatedRecording(SAMPLE) as recording:
         return recording.columns().object_poses["red_cube"]
 
 
@@ -95,7 +95,7 @@ def test_depth_is_shown_in_metres_as_the_recordings_have_it(tmp_path: Path) -> N
         shown = np.array(pictures)
         assert list(times) == episode.time_ns.tolist()
         packets = list(episode.videos["front"].packets())
-    with Recording(run / "episodes" / "episode_000001.mcap") as recording:
+    with SimulatedRecording(run / "episodes" / "episode_000001.mcap") as recording:
         measured = np.array(list(recording.depth("front")))
     assert shown.shape == measured.shape
     assert len(packets) == 4
@@ -122,7 +122,7 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
     with open_dataset_episode(tmp_path / "d", 0) as episode:
         assert isinstance(episode, PlayedEpisode)
         _, shown = list(episode.depth["front"]())[2]
-    with Recording(tmp_path / "e.mcap") as recording:
+    with SimulatedRecording(tmp_path / "e.mcap") as recording:
         measured = list(recording.depth("front"))[2]
     low, high = np.log(3.51), np.log(13.5)
     codes = np.rint((np.log(measured + 3.5) - low) / (high - low) * 4095).clip(0)  # as docs/dataset-format.md has them

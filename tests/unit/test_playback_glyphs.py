@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
-from support.collected import make_collected, write_collected
+from support.external import make_external, write_external
 from support.recording import make_episode
 from support.viewer import need_vulkan
 
 from demorec.cli import run_command
 from demorec.cli.view import View
 from demorec.core.errors import DemorecError, RecordingError
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SimulatedWriter
 from demorec.robots.urdf import Urdf
-from demorec.view.episode import PlayedCollected, PlayedEpisode
+from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.glyphs import DRAWABLE, drawable, drawable_source
 from demorec.view.layout import episode_layout
 from demorec.view.scene import log_episode, new_recording
@@ -39,7 +39,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cameras=(replace(camera, name="前"),),
     )
     path = tmp_path_factory.mktemp("运行") / "episode_000000.mcap"
-    with EpisodeWriter(path, replace(info, instruction=INSTRUCTION, scene=scene)) as writer:
+    with SimulatedWriter(path, replace(info, instruction=INSTRUCTION, scene=scene)) as writer:
         for frame in frames:
             seen = frame.observation
             poses = {("方块" if name == cube else name): pose for name, pose in seen.object_poses.items()}
@@ -84,17 +84,17 @@ def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
 
 def test_joints_of_a_robot_without_a_scene_still_belong_together(tmp_path: Path) -> None:
     path = tmp_path / "episode_000000.mcap"
-    given = make_collected()
+    given = make_external()
     joint = next(iter(Urdf.parse(given.info.urdf).joints)).name
     features = tuple(
         replace(f, joints=tuple("关节" if j == joint else j for j in f.joints)) for f in given.info.features
     )
     info = replace(given.info, urdf=given.info.urdf.replace(f'"{joint}"', '"关节"'), features=features, robot="机器人")
-    write_collected(path, replace(given, info=info))
+    write_external(path, replace(given, info=info))
     (source,) = find_episodes([path])
     missing: set[str] = set()
     with drawable_source(source, missing).open() as episode:
-        assert isinstance(episode, PlayedCollected)
+        assert isinstance(episode, PlayedExternal)
         assert missing == set("关节机器人")
         assert "U+5173U+8282" in episode.joint_position
         assert "U+5173U+8282" in {found.name for found in Urdf.parse(episode.info.urdf).joints}

@@ -16,18 +16,18 @@ from typing import Any
 import foxglove
 import numpy as np
 import pytest
-from support.collected import URDF
 from support.export import export
+from support.external import URDF
 
 from demorec import Recorder
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
-from demorec.episode.collected import NO_PICTURE, CollectedCamera, CollectedFeature
-from demorec.mcap import CollectedRecording
-from demorec.mcap.external.writer import CollectedWriter
+from demorec.episode.external import NO_PICTURE, Camera, Feature
+from demorec.mcap import Recording
+from demorec.mcap.external.writer import EpisodeWriter
 from demorec.mcap.recorder.coder import Coder
 from demorec.robots.panda import PANDA
-from demorec.runs.collected import load_collected_run
+from demorec.runs.external import load_external_run
 
 TOP = {"top": (48, 64)}
 PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
@@ -39,8 +39,8 @@ def recorder(folder: Path, **changes: Any) -> Recorder:
     return Recorder(folder, **{**given, "when_full": "wait", **changes})
 
 
-def recording_of(folder: Path, index: int = 0) -> CollectedRecording:
-    return CollectedRecording(folder / "episodes" / f"episode_{index:06d}.mcap")
+def recording_of(folder: Path, index: int = 0) -> Recording:
+    return Recording(folder / "episodes" / f"episode_{index:06d}.mcap")
 
 
 def test_what_was_given_is_recorded_to_the_bit(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_stamps_of_the_caller_and_missing_or_repeated_pictures(tmp_path: Path) -
         assert found.outcome.success is None
 
 
-def feature_of(folder: Path, name: str) -> CollectedFeature:
+def feature_of(folder: Path, name: str) -> Feature:
     with recording_of(folder) as found:
         return next(feature for feature in found.info.features if feature.name == name)
 
@@ -115,7 +115,7 @@ def test_elements_are_named_by_what_is_known(
 
 
 def test_features_may_be_described(tmp_path: Path) -> None:
-    described = CollectedFeature(name="observation.state", names=("a", "b"), units=("deg", "m"))
+    described = Feature(name="observation.state", names=("a", "b"), units=("deg", "m"))
     with recorder(tmp_path / "run", features=[described]) as run, run.episode() as episode:
         episode.write({"b": 2.0, "a": 1.0})  # in whatever order
         episode.write(np.array([3, 4], dtype=np.float32))  # a wider type loses nothing
@@ -135,7 +135,7 @@ def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
             with run.episode() as episode:
                 episode.write([0.0])
                 episode.discard()
-    found = load_collected_run(tmp_path / "run")
+    found = load_external_run(tmp_path / "run")
     assert [line.episode_index for line in found.episodes] == [0, 1, 2, 3]
     assert [line.instruction for line in found.episodes] == ["stack", "another"] * 2
     assert len(found.sessions) == 2
@@ -147,14 +147,14 @@ def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
 def test_a_lost_run_json_is_made_again(tmp_path: Path) -> None:
     with recorder(tmp_path / "run") as run, run.episode() as episode:
         episode.write([0.0])
-    before = load_collected_run(tmp_path / "run")
+    before = load_external_run(tmp_path / "run")
     for damage in (None, "{"):
         (tmp_path / "run" / "run.json").unlink()
         if damage is not None:
             (tmp_path / "run" / "run.json").write_text(damage)
         with recorder(tmp_path / "run"):
             pass
-        assert load_collected_run(tmp_path / "run").episodes == before.episodes
+        assert load_external_run(tmp_path / "run").episodes == before.episodes
     assert (tmp_path / "run" / "run.json.damaged").read_text() == "{"
 
 
@@ -168,7 +168,7 @@ def test_what_ends_an_episode_is_told(tmp_path: Path) -> None:
             episode.write([0.0])
             episode.success = True
             raise KeyboardInterrupt
-    failed, interrupted = load_collected_run(tmp_path / "run").episodes
+    failed, interrupted = load_external_run(tmp_path / "run").episodes
     assert failed.success is False
     assert interrupted.success is True
     assert interrupted.reason == "interrupted"
@@ -229,7 +229,7 @@ def test_bad_input_is_told_in_one_sentence_and_costs_one_frame(tmp_path: Path, w
         ({"robot": "nothing.urdf"}, "No such file"),
         ({"cameras": {"top": 480}}, "must be \\(height, width\\)"),
         ({"cameras": {"to/p": (48, 64)}}, "called 'to/p'"),
-        ({"cameras": {"top": CollectedCamera(name="tip", width=1, height=1)}}, "described as 'tip'"),
+        ({"cameras": {"top": Camera(name="tip", width=1, height=1)}}, "described as 'tip'"),
         ({"cameras": {"top": (47, 64)}}, "64x47 pixels cannot be h264 video, which needs even sizes.* the codec jpeg"),
         ({"cameras": {"top": (48, 65)}, "video": VideoConfig(codec="av1")}, "65x48 pixels cannot be av1 video"),
         ({"when_full": "panic"}, "allowed are error, drop, wait"),
@@ -256,9 +256,9 @@ def test_odd_sizes_are_recorded_by_the_codec_that_is_advised(tmp_path: Path) -> 
     assert export(tmp_path / "run", tmp_path / "d.hdf5", "hdf5").num_frames == 1
 
 
-@pytest.mark.parametrize("features", [(), (CollectedFeature(name="observation.state", names=("a",)),)])
+@pytest.mark.parametrize("features", [(), (Feature(name="observation.state", names=("a",)),)])
 def test_file_and_encoders_are_open_before_the_first_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: tuple[CollectedFeature, ...]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: tuple[Feature, ...]
 ) -> None:
     with recorder(tmp_path / "run", cameras=TOP, features=features) as run, run.episode() as episode:
         assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap.part"]
@@ -335,7 +335,7 @@ def test_frames_that_the_coder_cannot_take_are_an_error(tmp_path: Path, monkeypa
             for _ in range(40):
                 episode.write([0.0])
         go_on.set()
-    assert 15 <= load_collected_run(tmp_path / "run").episodes[0].num_frames <= 16
+    assert 15 <= load_external_run(tmp_path / "run").episodes[0].num_frames <= 16
 
 
 def test_frames_that_the_coder_cannot_take_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,7 +343,7 @@ def test_frames_that_the_coder_cannot_take_are_counted(tmp_path: Path, monkeypat
     with recorder(tmp_path / "run", when_full="drop") as run, run.episode() as episode:
         taken = [episode.write([float(index)]) for index in range(50)]
         go_on.set()
-    line = load_collected_run(tmp_path / "run").episodes[0]
+    line = load_external_run(tmp_path / "run").episodes[0]
     assert line.num_frames == sum(taken)
     assert line.drops == {"frames": 50 - sum(taken)}
     with recording_of(tmp_path / "run") as found:
@@ -352,13 +352,13 @@ def test_frames_that_the_coder_cannot_take_are_counted(tmp_path: Path, monkeypat
 
 
 def test_an_error_of_the_coder_reaches_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: CollectedWriter) -> None:
+    def fail(self: EpisodeWriter) -> None:
         raise RecordingError("The recording cannot be written (No space left on device)")
 
     with recorder(tmp_path / "run") as run:
         episode = run.episode()
         episode.write([0.0])
-        monkeypatch.setattr(CollectedWriter, "flush", fail)
+        monkeypatch.setattr(EpisodeWriter, "flush", fail)
         with pytest.raises(RecordingError, match="No space left"):  # noqa: PT012
             for _ in range(2000):
                 episode.write([0.0])
@@ -398,7 +398,7 @@ def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: si
         assert len(run.recovered) == (1 if number == signal.SIGKILL else 0)
         with run.episode() as episode:
             episode.write([0.0], [0.0])
-    first, second = load_collected_run(tmp_path / "run").episodes
+    first, second = load_external_run(tmp_path / "run").episodes
     assert (first.success, second.episode_index) == (None, 1)
     assert last - 50 <= first.num_frames - 1 <= last
     if number == signal.SIGINT:

@@ -14,7 +14,7 @@ from mcap.stream_reader import StreamReader
 from support.recording import write_episode
 
 from demorec.core.config import VideoConfig
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.mcap.chunks import ChunkPlace, blocks_of
 from demorec.mcap.container import Container
 from demorec.mcap.limits import Limits
@@ -92,7 +92,7 @@ def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> Non
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
 def test_coded_pictures_are_the_packets(tmp_path: Path, codec: str) -> None:
     path = write_episode(tmp_path / "e.mcap", num_frames=9, video=VideoConfig(codec=codec))  # type: ignore[arg-type]
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         for camera, block in recording.coded_pictures(recording.cameras).items():
             packets = list(recording.packets(camera))
             assert list(block.messages()) == [packet.data for packet in packets]

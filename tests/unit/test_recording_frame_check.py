@@ -14,8 +14,8 @@ from support.recording import make_episode
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
-from demorec.episode.episode import EpisodeInfo, Frame
-from demorec.mcap import EpisodeWriter
+from demorec.episode.episode import Frame, SimulatedInfo
+from demorec.mcap import SimulatedWriter
 
 NAN = float("nan")
 
@@ -113,14 +113,14 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
 def test_a_frame_that_does_not_fit_is_refused_at_once(fault: str, tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=4, cameras=("front",), physics_rate_joints=True)
     spoil, words = FAULTS[fault]
-    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
+    with SimulatedWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames[:2]:
             writer.write(frame)
         with pytest.raises(RecordingError, match=f"^Frame 2 has .*{words}"):
             writer.write(spoil(frames[2]))
 
 
-def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
+def renamed(info: SimulatedInfo, *names: str) -> SimulatedInfo:
     return replace(info, robot=replace(info.robot, arm_joints=(*names, *info.robot.arm_joints[len(names) :])))
 
 
@@ -131,5 +131,5 @@ def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
 def test_joints_that_the_robot_does_not_have_are_refused(names: tuple[str, ...], words: str, tmp_path: Path) -> None:
     info, _, _ = make_episode(num_frames=1, cameras=())
     with pytest.raises(RecordingError, match=words):
-        EpisodeWriter(tmp_path / "e.mcap", renamed(info, *names))
+        SimulatedWriter(tmp_path / "e.mcap", renamed(info, *names))
     assert not list(tmp_path.iterdir())  # refused before anything is written

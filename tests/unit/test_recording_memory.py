@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.collected import TOP, make_collected
+from support.external import TOP, make_external
 from support.recording import make_episode
 
 from demorec.episode.episode import frame_time_ns
-from demorec.mcap import CollectedRecording, CollectedWriter, EpisodeWriter, Recording
+from demorec.mcap import EpisodeWriter, Recording, SimulatedRecording, SimulatedWriter
 
-READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
+READERS: dict[str, Callable[[SimulatedRecording], Iterable[object]]] = {
     "packets": lambda recording: recording.packets("front"),
     "images": lambda recording: recording.images("front"),
     "depth": lambda recording: recording.depth("front"),
@@ -32,13 +32,13 @@ def write_long(path: Path, num_frames: int) -> None:
     info, frames, outcome = make_episode(
         num_frames=60, width=64, height=64, cameras=("front",), depth=True, segmentation=True
     )
-    with EpisodeWriter(path, info) as writer:
+    with SimulatedWriter(path, info) as writer:
         for index in range(num_frames):
             writer.write(replace(frames[index % 60], frame_index=index, time_ns=frame_time_ns(index, info.fps)))
         writer.finish(replace(outcome, num_frames=num_frames))
 
 
-def read_through(read: Callable[[Recording], Iterable[object]], recording: Recording) -> None:
+def read_through(read: Callable[[SimulatedRecording], Iterable[object]], recording: SimulatedRecording) -> None:
     deque(read(recording), maxlen=1)
 
 
@@ -61,7 +61,7 @@ def test_memory_does_not_grow_with_length(
     for count in (10, *num_frames):  # the first loads and compiles what is loaded and compiled once
         path = tmp_path / f"{count}.mcap"
         peaks["writing"].append(peak_bytes(partial(write_long, path, count)))
-        with Recording(path) as recording:
+        with SimulatedRecording(path) as recording:
             assert recording.num_frames == count
             for name, read in READERS.items():
                 peaks[name].append(peak_bytes(partial(read_through, read, recording)))
@@ -72,11 +72,11 @@ def test_memory_does_not_grow_with_length(
         assert long < 1.3 * short + 200_000, name
 
 
-def test_numbers_of_a_long_collected_episode_take_little_more_memory_than_they_are(tmp_path: Path) -> None:
-    short = make_collected(cameras=(), num_frames=60)
+def test_numbers_of_a_long_external_episode_take_little_more_memory_than_they_are(tmp_path: Path) -> None:
+    short = make_external(cameras=(), num_frames=60)
     peaks, num_bytes = [], []
     for count in (60, 1500, 6000):  # the first loads what is loaded once
-        with CollectedWriter(tmp_path / f"{count}.mcap", short.info) as writer:
+        with EpisodeWriter(tmp_path / f"{count}.mcap", short.info) as writer:
             for index in range(count):
                 frame = short.frames[index % 60]
                 later = (index // 60) * 10_000_000_000
@@ -85,7 +85,7 @@ def test_numbers_of_a_long_collected_episode_take_little_more_memory_than_they_a
                 }
                 writer.write(replace(frame, time_ns=frame.time_ns + later, samples=samples))
             writer.finish(replace(short.outcome, num_frames=count))
-        with CollectedRecording(tmp_path / f"{count}.mcap") as recording:
+        with Recording(tmp_path / f"{count}.mcap") as recording:
             peaks.append(peak_bytes(recording.columns))
             columns = recording.columns()
             arrays = [columns.time_ns, *columns.features.values(), *columns.stamps.values()]
@@ -93,17 +93,17 @@ def test_numbers_of_a_long_collected_episode_take_little_more_memory_than_they_a
     assert peaks[2] - peaks[1] < 4 * (num_bytes[2] - num_bytes[1])
 
 
-def test_numbers_of_a_collected_episode_are_read_without_its_pictures(tmp_path: Path) -> None:
-    given = make_collected(cameras=(replace(TOP, kept="jpeg"),), num_frames=120)
+def test_numbers_of_a_external_episode_are_read_without_its_pictures(tmp_path: Path) -> None:
+    given = make_external(cameras=(replace(TOP, kept="jpeg"),), num_frames=120)
     noise = np.random.default_rng(0)
     num_bytes = 0
-    with CollectedWriter(tmp_path / "a.mcap", given.info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", given.info) as writer:
         for number, frame in enumerate(given.frames):
             num_bytes += 200_000
             assert writer.picture("top", frame.time_ns, noise.bytes(200_000)) == number
             writer.write(frame)
         writer.finish(given.outcome)
-    with CollectedRecording(tmp_path / "a.mcap") as recording:
+    with Recording(tmp_path / "a.mcap") as recording:
         # A chunk has the pictures of a second, and is there compressed and unpacked.
         assert peak_bytes(recording.columns) < num_bytes * 0.7
         stamps = recording.columns().picture_stamps["top"].tolist()

@@ -20,7 +20,7 @@ from support.recording import Codec, frame_number, make_episode, write_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import MissingDependencyError, RecordingError
 from demorec.episode.episode import Frame
-from demorec.mcap import Recording, episode_file, video
+from demorec.mcap import SimulatedRecording, episode_file, video
 from demorec.mcap.video import VideoPacket, VideoSettings
 
 NUM_FRAMES = 47
@@ -55,7 +55,7 @@ def same_frame(found: Frame, true: Frame) -> None:
 
 
 def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -> None:
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         assert len(recording) == NUM_FRAMES
         count = 0
         for found, true in zip(recording, truth, strict=True):
@@ -66,12 +66,12 @@ def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -
 
 @pytest.mark.parametrize("index", [0, 1, 9, 10, 33, NUM_FRAMES - 1, -1, -NUM_FRAMES])
 def test_any_frame_can_be_picked(path: Path, truth: list[Frame], index: int) -> None:
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         same_frame(recording[index], truth[index])
 
 
 def test_slices_are_those_of_a_list(path: Path, truth: list[Frame]) -> None:
-    with Recording(str(path)) as recording:
+    with SimulatedRecording(str(path)) as recording:
         for part in (slice(3, 9, 2), slice(None, None, -20), slice(-2, None), slice(40, 400), slice(9, 3)):
             found = recording[part]
             assert [frame.frame_index for frame in found] == [frame.frame_index for frame in truth[part]]
@@ -80,7 +80,7 @@ def test_slices_are_those_of_a_list(path: Path, truth: list[Frame]) -> None:
 
 @pytest.mark.parametrize("index", [NUM_FRAMES, -NUM_FRAMES - 1])
 def test_there_are_no_frames_beyond_the_ends(path: Path, index: int) -> None:
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         with pytest.raises(IndexError):
             recording[index]
         with pytest.raises(IndexError):
@@ -90,7 +90,7 @@ def test_there_are_no_frames_beyond_the_ends(path: Path, index: int) -> None:
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
 def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path: Path, codec: Codec) -> None:
     file = write_episode(tmp_path / "a.mcap", num_frames=12, video=VideoConfig(codec=codec, gop=5))
-    with Recording(file) as recording:
+    with SimulatedRecording(file) as recording:
         whole = list(recording.images("wrist"))
         for index in (11, 0, 4, 5, -3):
             assert np.array_equal(recording.image("wrist", index), whole[index])
@@ -105,20 +105,20 @@ def test_only_pictures_from_the_keyframe_on_are_decoded(path: Path, monkeypatch:
 
     real = video.decode
     monkeypatch.setattr(episode_file, "decode", decode)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         recording.image("front", 33)
     assert [packet.frame_index for packet in given] == [30, 31, 32, 33]  # a keyframe every ten
 
 
 def test_a_closed_recording_says_so(path: Path) -> None:
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         pass
     with pytest.raises(RecordingError, match="closed before it was read"):
         recording[3]
 
 
 def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         table = recording.to_pandas()
     assert table.index.name == "frame_index"
     assert list(table.index) == list(range(NUM_FRAMES))
@@ -142,7 +142,7 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
 
 def test_without_pandas_a_sentence_says_how_to_get_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with Recording(path) as recording, pytest.raises(MissingDependencyError, match="pip install pandas"):
+    with SimulatedRecording(path) as recording, pytest.raises(MissingDependencyError, match="pip install pandas"):
         recording.to_pandas()
 
 
@@ -166,7 +166,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_of_a_notebook(path: Path) -> None:
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         page = Page(recording._repr_html_())
         line = repr(recording)
     text = " ".join(page.texts)
@@ -181,13 +181,13 @@ def test_the_page_of_a_notebook(path: Path) -> None:
 def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Path) -> None:
     evil = tmp_path / "<script>alert(1)<\\script>\x1b[2J.mcap"
     evil.write_bytes(path.read_bytes())
-    with Recording(evil) as recording:
+    with SimulatedRecording(evil) as recording:
         assert Page(recording._repr_html_()).tags <= {"table", "tr", "th", "td", "img"}
         assert "\x1b" not in repr(recording) + recording._repr_html_()
 
 
 def test_recordings_without_pictures_or_frames_have_a_page_too(tmp_path: Path) -> None:
-    with Recording(write_episode(tmp_path / "a.mcap", num_frames=3, cameras=())) as recording:
+    with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=3, cameras=())) as recording:
         assert "cameras" in recording._repr_html_()
         assert recording[2].images == {}
         assert [dict(frame.images) for frame in recording] == [{}, {}, {}]
@@ -198,5 +198,5 @@ def test_the_examples_of_the_documents_run(capsys: pytest.CaptureFixture[str], d
     """On a recording of the demo's task, since the examples name what lies on its table."""
     sample = Path(__file__).parents[2] / "recordings/sample/format_2.mcap"
     recording = {"recordings/demo/episodes/episode_000000.mcap": sample}
-    assert run_examples(document, "from demorec.mcap import Recording", recording) == number
+    assert run_examples(document, "from demorec.mcap import open_recording", recording) == number
     assert capsys.readouterr().out

@@ -14,17 +14,17 @@ from support.recording import frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import FORMAT_VERSION, EpisodeInfo, Event, Frame, Outcome
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.episode.episode import FORMAT_VERSION, Event, Frame, Outcome, SimulatedInfo
+from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.mcap.container import Container
 
 CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), VideoConfig(gop=30, crf=30)]
 
 
 def record(
-    path: Path, frames: list[Frame], info: EpisodeInfo, outcome: Outcome, video: VideoConfig | None = None
+    path: Path, frames: list[Frame], info: SimulatedInfo, outcome: Outcome, video: VideoConfig | None = None
 ) -> Path:
-    with EpisodeWriter(path, info, video=video) as writer:
+    with SimulatedWriter(path, info, video=video) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)
@@ -36,7 +36,7 @@ def record(
 def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, cameras: tuple[str, ...]) -> None:
     info, frames, outcome = make_episode(num_frames=num_frames, cameras=cameras)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         assert recording.info == info
         assert recording.outcome == outcome
         assert recording.num_frames == num_frames
@@ -72,7 +72,7 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
 
 
 def test_actions_and_commands_are_kept_apart(tmp_path: Path) -> None:
-    with Recording(write_episode(tmp_path / "a.mcap", num_frames=5, cameras=())) as recording:
+    with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=5, cameras=())) as recording:
         columns = recording.columns()
     assert not np.array_equal(columns.action_joint_target, columns.command_joint_target)
 
@@ -81,7 +81,7 @@ def test_actions_and_commands_are_kept_apart(tmp_path: Path) -> None:
 def test_pictures(tmp_path: Path, video: VideoConfig) -> None:
     info, frames, outcome = make_episode(num_frames=64)
     path = record(tmp_path / "a.mcap", frames, info, outcome, video)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         for camera in recording.cameras:
             packets = list(recording.packets(camera))
             assert [packet.frame_index for packet in packets] == list(range(64))
@@ -108,7 +108,7 @@ def test_what_the_settings_say_is_what_was_encoded(tmp_path: Path) -> None:
     for crf in (18, 40):
         video = VideoConfig(gop=5, crf=crf, preset="medium")
         path = write_episode(tmp_path / f"{crf}.mcap", video=video, num_frames=20)
-        with Recording(path) as recording:
+        with SimulatedRecording(path) as recording:
             settings = recording.video_settings("front")
             assert (settings.gop, settings.crf, settings.preset) == (5, crf, "medium")
             packets = list(recording.packets("front"))
@@ -124,7 +124,7 @@ def test_what_the_settings_say_is_what_was_encoded(tmp_path: Path) -> None:
 def test_depth_and_segmentation(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=33, depth=True, segmentation=True)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         assert recording.has_depth("front")
         assert recording.has_segmentation("wrist")
         for camera in recording.cameras:
@@ -146,7 +146,7 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
 def test_segmentation_of_several_cameras_in_one_pass(tmp_path: Path) -> None:
     path = write_episode(tmp_path / "a.mcap", num_frames=70, cameras=("front", "wrist"), segmentation=True)
     chosen = {0, 31, 32, 69}
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         assert len(list(recording._container.blocks_by_chunk(["/camera/front/segmentation"]))) > 1
         found = list(recording.segmentation_at(["wrist", "front"], chosen))
         for camera in ("front", "wrist"):
@@ -165,7 +165,7 @@ def test_labels_that_were_read_with_the_coded_pictures_are_not_unpacked_again(
 ) -> None:
     path = write_episode(tmp_path / "a.mcap", num_frames=70, cameras=cameras, segmentation=True)
     chosen = {0, 31, 69}
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         expected = list(recording.segmentation_at(cameras, chosen))
         recording.coded_pictures(cameras)
         monkeypatch.setattr("demorec.mcap.container.chunk_content", lambda *_: pytest.fail("a chunk was unpacked"))
@@ -177,7 +177,7 @@ def test_labels_that_were_read_with_the_coded_pictures_are_not_unpacked_again(
 
 
 def test_without_depth_it_says_so(tmp_path: Path) -> None:
-    with Recording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
+    with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
         assert not recording.has_depth("front")
         with pytest.raises(RecordingError, match="no depth pictures"):
             next(recording.depth("front"))
@@ -191,7 +191,7 @@ def test_without_depth_it_says_so(tmp_path: Path) -> None:
 def test_joint_samples_between_the_frames(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=40, cameras=(), physics_rate_joints=True)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         samples = list(recording.joint_samples())
         columns = recording.columns()
     assert len(samples) == 39 * 8 + 1
@@ -213,7 +213,7 @@ def test_events(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", frames, info, outcome)
     expected = [(frame.time_ns, event) for frame in frames for event in frame.events]
     assert {event.level for _, event in expected} == {"info", "warning"}
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         assert list(recording.events()) == expected
         recording.columns()  # comes by them
         assert list(recording.events()) == expected
@@ -224,7 +224,7 @@ def test_statistics_are_of_every_other_picture(tmp_path: Path, width: int, heigh
     """Every fourth row of it, each quarter in turn; large pictures thinned as LeRobot thins them."""
     info, frames, outcome = make_episode(num_frames=7, width=width, height=height)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         found = recording.pixel_statistics("wrist")
     thinned = [frame.images["wrist"].color[::step, ::step] for frame in frames[::2]]
     chosen = np.concatenate([picture[number % 4 :: 4].reshape(-1, 3) for number, picture in enumerate(thinned)])
@@ -235,7 +235,7 @@ def test_statistics_are_of_every_other_picture(tmp_path: Path, width: int, heigh
 def test_statistics_are_near_those_of_all_pixels(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=60)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         counts = recording.pixel_statistics("front").counts
     everything = np.stack([frame.images["front"].color for frame in frames]).reshape(-1, 3).astype(float)
     mean = (counts * np.arange(256)).sum(axis=1) / counts.sum(axis=1)
@@ -252,7 +252,7 @@ def test_the_digest_is_of_the_content(tmp_path: Path) -> None:
 
     def digest(name: str, **changes: Any) -> str:
         path = record(tmp_path / name, changes.get("frames", frames), changes.get("info", info), outcome)
-        with Recording(path) as recording:
+        with SimulatedRecording(path) as recording:
             return recording.digest()
 
     original = digest("a.mcap")
@@ -274,7 +274,7 @@ def test_the_digest_is_of_the_content(tmp_path: Path) -> None:
 def test_no_frames_at_all(tmp_path: Path) -> None:
     info, _, outcome = make_episode(num_frames=1)
     path = record(tmp_path / "a.mcap", [], info, replace(outcome, num_frames=0, success=False))
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         assert recording.num_frames == 0
         assert recording.columns().joint_position.shape == (0, 9)
         assert recording.cameras == ()
@@ -291,7 +291,7 @@ def test_numbers_are_read_without_touching_the_pictures(tmp_path: Path, monkeypa
         return original(container, at, size)
 
     monkeypatch.setattr(Container, "_read_at", remember)
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         opened = sum(read)
         recording.columns()
         numbers = sum(read) - opened

@@ -14,8 +14,8 @@ from support.present import present
 from support.recording import make_episode, write_episode
 
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import FORMAT_VERSION, EpisodeColumns, EpisodeInfo, Frame, Outcome
-from demorec.mcap import EpisodeWriter, Recording, recover
+from demorec.episode.episode import FORMAT_VERSION, Frame, Outcome, SimulatedColumns, SimulatedInfo
+from demorec.mcap import SimulatedRecording, SimulatedWriter, recover
 from demorec.mcap.frames import frames_of
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.mcap.streams import FrameValues, frame_streams, merged_columns
@@ -25,8 +25,8 @@ LATER = {stream.topic for stream in frame_streams(make_episode(num_frames=1)[0])
 NEWEST = [stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since == FORMAT_VERSION]
 
 
-def record(path: Path, info: EpisodeInfo, frames: list[Frame], outcome: Outcome) -> Path:
-    with EpisodeWriter(path, info) as writer:
+def record(path: Path, info: SimulatedInfo, frames: list[Frame], outcome: Outcome) -> Path:
+    with SimulatedWriter(path, info) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)
@@ -52,12 +52,12 @@ def test_every_column_comes_from_one_stream() -> None:
     )
     assert set(told.values()) == {1}
     others = {"time_ns", "phase", "is_deliberate_miss"}
-    assert merged_columns(found).keys() == {field.name for field in fields(EpisodeColumns)} - others
+    assert merged_columns(found).keys() == {field.name for field in fields(SimulatedColumns)} - others
 
 
 def test_frames_are_rebuilt_to_the_bit(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=35, cameras=())
-    with Recording(record(tmp_path / "a.mcap", info, frames, outcome)) as recording:
+    with SimulatedRecording(record(tmp_path / "a.mcap", info, frames, outcome)) as recording:
         rebuilt = list(frames_of(recording))
     for found, true in zip(rebuilt, frames, strict=True):
         for part in ("observation", "action", "command"):
@@ -71,7 +71,10 @@ def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=5, cameras=())
     old = replace(info, format_version=1)
     path = record(tmp_path / "old.mcap", old, without_wrench(frames), outcome)
-    with Recording(path) as recording, Recording(write_episode(tmp_path / "new.mcap", num_frames=5, cameras=())) as new:
+    with (
+        SimulatedRecording(path) as recording,
+        SimulatedRecording(write_episode(tmp_path / "new.mcap", num_frames=5, cameras=())) as new,
+    ):
         assert set(new.topics) - set(recording.topics) == LATER
         assert recording.columns().wrench is None
         assert recording[2].observation.wrench is None
@@ -84,7 +87,7 @@ def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
     assert level_of(path, "topics") == "pass"
     # A crash loses nothing either.
     rescued = recover(path, tmp_path / "rescued.mcap").path
-    with Recording(rescued) as recording:
+    with SimulatedRecording(rescued) as recording:
         assert recording.digest() == digest
 
 
@@ -92,7 +95,10 @@ def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
 def test_a_stream_that_the_version_must_have_is_missed(topic: str, tmp_path: Path) -> None:
     whole = write_episode(tmp_path / "a.mcap", num_frames=5, cameras=())
     path = rewrite_messages(whole, tmp_path / "b.mcap", lambda m: [] if m[0] == topic else [m])
-    with Recording(path) as recording, pytest.raises(RecordingError, match=f"has 0 messages on {topic} at other times"):
+    with (
+        SimulatedRecording(path) as recording,
+        pytest.raises(RecordingError, match=f"has 0 messages on {topic} at other times"),
+    ):
         recording.columns()
     assert level_of(path, "topics") == "fail"
     with pytest.raises(RecordingError, match="no whole frame"):
@@ -105,8 +111,8 @@ def test_one_bit_of_the_wrench_is_another_digest(tmp_path: Path) -> None:
     wrench[4] = np.nextafter(wrench[4], 99.0)
     changed = replace(frames[3], observation=replace(frames[3].observation, wrench=wrench))
     with (
-        Recording(record(tmp_path / "a.mcap", info, frames, outcome)) as one,
-        Recording(record(tmp_path / "b.mcap", info, [*frames[:3], changed, frames[4]], outcome)) as other,
+        SimulatedRecording(record(tmp_path / "a.mcap", info, frames, outcome)) as one,
+        SimulatedRecording(record(tmp_path / "b.mcap", info, [*frames[:3], changed, frames[4]], outcome)) as other,
     ):
         assert one.digest() != other.digest()
 
@@ -140,4 +146,4 @@ def test_a_description_of_another_version_than_its_record_is_refused(tmp_path: P
     with pytest.raises(
         RecordingError, match=r"not that of format version 1 \(its description is of format version 2\)"
     ):
-        Recording(path)
+        SimulatedRecording(path)

@@ -15,7 +15,7 @@ from support.recording import make_episode
 from demorec.core.errors import ConfigError
 from demorec.datasets import episode
 from demorec.learn.training.stretches import INTERVENTION, Stretches
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SimulatedWriter
 
 
 def stretches() -> Stretches:
@@ -41,7 +41,7 @@ def test_the_column_has_the_name_that_the_export_gives_it() -> None:
 
 def write(path: Path, episode_index: int, phases: Sequence[str]) -> None:
     info, frames, outcome = make_episode(num_frames=len(phases), cameras=(), episode_index=episode_index)
-    with EpisodeWriter(path, info) as writer:
+    with SimulatedWriter(path, info) as writer:
         for frame, phase in zip(frames, phases, strict=True):
             writer.write(replace(frame, phase=phase))
         writer.finish(outcome)

@@ -25,7 +25,7 @@ from demorec.datasets.hdf5.file import (
     NewFile,
 )
 from demorec.datasets.hdf5.options import Hdf5Options
-from demorec.episode.episode import EpisodeColumns, EpisodeInfo
+from demorec.episode.episode import SimulatedColumns, SimulatedInfo
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 
 _GYM = 2
@@ -177,7 +177,7 @@ def _environment(simulated: Simulated, episode: ExportEpisode, arguments: dict[s
 
 
 def _states(
-    columns: EpisodeColumns, rows: NDArray[np.intp], info: EpisodeInfo
+    columns: SimulatedColumns, rows: NDArray[np.intp], info: SimulatedInfo
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """(T, D) float64 state of the simulated world as recorded, and the names of its components.
 

@@ -23,7 +23,7 @@ from demorec.datasets.lerobot.attempts import ATTEMPT_SCHEMA
 from demorec.datasets.lerobot.commands import making_commands
 from demorec.datasets.lerobot.files import read_table
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo, Feature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
@@ -195,7 +195,7 @@ def _robot_section(root: Path) -> Iterable[str]:
         )
 
 
-def _meaning(key: str, item: Feature, about: CardFacts) -> str:
+def _meaning(key: str, item: DatasetFeature, about: CardFacts) -> str:
     if (
         not about.is_simulated
         and not key.startswith(IMAGE_PREFIX)

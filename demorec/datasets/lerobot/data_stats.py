@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import table_batches
-from demorec.datasets.lerobot.layout import Feature
+from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.stats import QUANTILES, Statistics, quantile_ranks
 
 _BATCH_ROWS = 2048
 
 
-def data_statistics(files: Iterable[Path], features: Mapping[str, Feature]) -> dict[str, Statistics]:
+def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature]) -> dict[str, Statistics]:
     """Feature -> statistics over all rows.
 
     Args:

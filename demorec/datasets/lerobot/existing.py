@@ -19,8 +19,8 @@ from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     STATS_PATH,
     TASKS_PATH,
+    DatasetFeature,
     DatasetInfo,
-    Feature,
     FilePosition,
 )
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
@@ -132,7 +132,9 @@ def _after(folder: Path, suffix: str, chunks_size: int) -> FilePosition:
     return FilePosition() if last is None else last.next(chunks_size)
 
 
-def features_to_append(existing: Existing, offered: dict[str, Feature], *, fps: int, robot: str) -> tuple[str, ...]:
+def features_to_append(
+    existing: Existing, offered: dict[str, DatasetFeature], *, fps: int, robot: str
+) -> tuple[str, ...]:
     """Check that the recordings can give every feature of the dataset; return those that it does not have.
 
     Raises:
@@ -159,7 +161,7 @@ def features_to_append(existing: Existing, offered: dict[str, Feature], *, fps: 
     return tuple(name for name in offered if name not in info.features)
 
 
-def _feature_differences(there: Feature, ours: Feature) -> Iterable[str]:
+def _feature_differences(there: DatasetFeature, ours: DatasetFeature) -> Iterable[str]:
     for what in ("dtype", "shape"):
         if getattr(there, what) != getattr(ours, what):
             yield f"{what} is {getattr(there, what)}, not {getattr(ours, what)}"

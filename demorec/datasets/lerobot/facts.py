@@ -15,8 +15,8 @@ import pyarrow as pa
 
 from demorec.datasets.lerobot.files import open_table
 from demorec.datasets.lerobot.progress import STAGE_COLUMNS
-from demorec.episode.episode import EpisodeColumns, SuccessCheck
-from demorec.mcap import Recording
+from demorec.episode.episode import SimulatedColumns, SuccessCheck
+from demorec.mcap import SimulatedRecording
 
 _TYPES: dict[str, pa.DataType] = {
     "success": pa.bool_(),
@@ -57,7 +57,7 @@ def facts_of(root: Path) -> tuple[str, ...]:
     return tuple(item.name for item in schema if (kind := fact_type(item.name)) is not None and kind == item.type)
 
 
-def episode_facts(recording: Recording, columns: EpisodeColumns) -> dict[str, Any]:
+def episode_facts(recording: SimulatedRecording, columns: SimulatedColumns) -> dict[str, Any]:
     """Name -> value; positions in the world frame at the start, metres."""
     info, outcome = recording.info, recording.outcome
     checks = () if outcome is None else outcome.checks
@@ -81,7 +81,7 @@ def episode_facts(recording: Recording, columns: EpisodeColumns) -> dict[str, An
     return facts | {CHECKED + name: value for name, value in _nearest_to_limit(checks).items()}
 
 
-def _first_goal(recording: Recording) -> dict[str, Any]:
+def _first_goal(recording: SimulatedRecording) -> dict[str, Any]:
     scene = recording.info.scene
     if not scene.goals:
         return {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
@@ -96,7 +96,7 @@ def _first_goal(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _drawn(recording: Recording) -> Mapping[str, float]:
+def _drawn(recording: SimulatedRecording) -> Mapping[str, float]:
     """What was drawn for the episode: behaviour, the first object's size, mass and friction, gravity, light."""
     info, scene = recording.info, recording.info.scene
     drawn = dict(info.behaviour)

@@ -44,7 +44,7 @@ _ARROW_TYPES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Feature:
+class DatasetFeature:
     """One entry of `features` in info.json.
 
     Attributes:
@@ -86,7 +86,7 @@ class Feature:
         return entry
 
     @classmethod
-    def from_json(cls, entry: dict[str, Any]) -> Feature:
+    def from_json(cls, entry: dict[str, Any]) -> DatasetFeature:
         """Inverse of `to_json`, for datasets written by anyone."""
         names = entry.get("names")
         if isinstance(names, dict):  # older recordings of real robots: {"motors": [...]}
@@ -108,15 +108,15 @@ class Feature:
         )
 
 
-AUTOMATIC_FEATURES: dict[str, Feature] = {
-    "timestamp": Feature(dtype="float32", shape=(1,)),
-    "frame_index": Feature(dtype="int64", shape=(1,)),
-    "episode_index": Feature(dtype="int64", shape=(1,)),
-    "index": Feature(dtype="int64", shape=(1,)),
-    "task_index": Feature(dtype="int64", shape=(1,)),
+AUTOMATIC_FEATURES: dict[str, DatasetFeature] = {
+    "timestamp": DatasetFeature(dtype="float32", shape=(1,)),
+    "frame_index": DatasetFeature(dtype="int64", shape=(1,)),
+    "episode_index": DatasetFeature(dtype="int64", shape=(1,)),
+    "index": DatasetFeature(dtype="int64", shape=(1,)),
+    "task_index": DatasetFeature(dtype="int64", shape=(1,)),
 }
 """Come last in every dataset, filled in by the writer."""
-LANGUAGE_FEATURE = Feature(dtype="language", shape=(1,))
+LANGUAGE_FEATURE = DatasetFeature(dtype="language", shape=(1,))
 """Of each of LeRobot's language columns."""
 
 
@@ -143,7 +143,7 @@ class DatasetInfo:
     """What meta/info.json says."""
 
     fps: int
-    features: dict[str, Feature]
+    features: dict[str, DatasetFeature]
     robot_type: str | None = None
     total_episodes: int = 0
     total_frames: int = 0
@@ -194,7 +194,7 @@ class DatasetInfo:
             if version != CODEBASE_VERSION:
                 raise ExportError(_other_version(version, root))
             data.pop("splits", None)
-            features = {name: Feature.from_json(entry) for name, entry in data.pop("features").items()}
+            features = {name: DatasetFeature.from_json(entry) for name, entry in data.pop("features").items()}
             known = {name: data.pop(name) for name in list(data) if name in _INFO_FIELDS}
             info = cls(features=features, other=data, **known)
             info._check()
@@ -285,7 +285,7 @@ def merged_video_info(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def data_schema(features: dict[str, Feature]) -> pa.Schema:
+def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
     """Schema of the data files, with the metadata from which HF datasets takes its types."""
     fields, described = [], {}
     for name, feature in features.items():

@@ -16,7 +16,7 @@ from demorec.datasets.lerobot.boxes import EpisodeBoxes
 from demorec.datasets.lerobot.depth import depth_info, depth_video
 from demorec.datasets.lerobot.facts import episode_facts
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, Feature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, DatasetFeature
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.progress import EpisodeProgress
 from demorec.datasets.lerobot.sidecar import EpisodeRecord
@@ -41,21 +41,21 @@ class PreparedEpisode:
     boxes: Mapping[str, EpisodeBoxes] = field(default_factory=dict)
 
 
-def dataset_features(episode: ExportEpisode, options: ExportOptions) -> dict[str, Feature]:
+def dataset_features(episode: ExportEpisode, options: ExportOptions) -> dict[str, DatasetFeature]:
     """The features that episodes like this one give with these options, in the order of the dataset."""
     vectors = {
-        name: Feature(dtype="float32", shape=(len(names),), names=names)
+        name: DatasetFeature(dtype="float32", shape=(len(names),), names=names)
         for name, names in episode.names.items()
         if options.takes(name)
     }
     images = {camera.feature: _camera_feature(episode, camera, options) for camera in episode.cameras}
     action = {ACTION: vectors.pop(ACTION)} if ACTION in vectors else {}
-    scalars = {name: Feature(dtype=SCALARS[name], shape=(1,)) for name in episode.scalars if options.takes(name)}
+    scalars = {name: DatasetFeature(dtype=SCALARS[name], shape=(1,)) for name in episode.scalars if options.takes(name)}
     told = {} if options.language is None else dict.fromkeys(COLUMNS, LANGUAGE_FEATURE)
     return {**vectors, **images, **action, **scalars, **AUTOMATIC_FEATURES, **told}
 
 
-def _camera_feature(episode: ExportEpisode, camera: ExportCamera, options: ExportOptions) -> Feature:
+def _camera_feature(episode: ExportEpisode, camera: ExportCamera, options: ExportOptions) -> DatasetFeature:
     settings = episode.recording.video_settings(camera.name)
     size = {"height": settings.height, "width": settings.width}
     if camera.is_depth:
@@ -64,7 +64,7 @@ def _camera_feature(episode: ExportEpisode, camera: ExportCamera, options: Expor
         reason = reason_to_transcode(episode, camera)
         info = video_info(dataset_settings(episode, camera, options.transcode, reason))
     shape = (*size.values(), 1 if camera.is_depth else 3)
-    return Feature(dtype="video", shape=shape, names=("height", "width", "channels"), info=info)
+    return DatasetFeature(dtype="video", shape=shape, names=("height", "width", "channels"), info=info)
 
 
 def reasons_to_transcode(episode: ExportEpisode) -> dict[ExportCamera, str]:

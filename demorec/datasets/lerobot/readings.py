@@ -10,13 +10,13 @@ from pathlib import Path
 from demorec.core.processes import available_cores, in_turn
 from demorec.datasets.exported import exported
 from demorec.datasets.lerobot.attempts import AttemptRecord
-from demorec.datasets.lerobot.layout import Feature
+from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode, reasons_to_transcode
 from demorec.datasets.options import ProgressCallback
 from demorec.datasets.sources import ExportSource, Profile, goes_in, is_wanted
-from demorec.episode.collected import CollectedOutcome
 from demorec.episode.episode import Outcome
+from demorec.episode.external import ExternalOutcome
 from demorec.mcap import open_recording
 
 _BYTES_THAT_PAY = 1 << 30
@@ -43,10 +43,10 @@ class Reading:
 
     path: Path
     attempt: AttemptRecord
-    outcome: Outcome | CollectedOutcome | None
+    outcome: Outcome | ExternalOutcome | None
     prepared: PreparedEpisode | None = None
     profile: Profile = field(default_factory=Profile)
-    features: dict[str, Feature] = field(default_factory=dict)
+    features: dict[str, DatasetFeature] = field(default_factory=dict)
     fps: int = 0
     robot: str = ""
     transcoded: tuple[str, ...] = ()

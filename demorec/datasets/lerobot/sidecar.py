@@ -37,7 +37,7 @@ from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
 from demorec.datasets.lerobot.writer import WrittenEpisode, write_text
-from demorec.episode.episode import EpisodeColumns
+from demorec.episode.episode import SimulatedColumns
 from demorec.episode.scene import Scene
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
@@ -169,7 +169,7 @@ def _simulated_row(simulated: Simulated, rows: NDArray[np.intp]) -> dict[str, An
     }
 
 
-def _phases(columns: EpisodeColumns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
+def _phases(columns: SimulatedColumns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
     """Name, first frame and frame after the last, of each phase."""
     phases = []
     for name, group in groupby(range(len(rows)), key=lambda index: columns.phase[rows[index]]):
@@ -178,7 +178,7 @@ def _phases(columns: EpisodeColumns, rows: NDArray[np.intp]) -> list[dict[str, A
     return phases
 
 
-def _things(scene: Scene, columns: EpisodeColumns) -> dict[str, list[dict[str, Any]]]:
+def _things(scene: Scene, columns: SimulatedColumns) -> dict[str, list[dict[str, Any]]]:
     """Where the objects and goals are, at the start and at the end."""
     return {
         "objects": [

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from demorec.episode.episode import POLICY_PHASE, interventions
 from demorec.loop import Episode
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.sim.world import World
 from demorec.tasks.script import Behaviour
 from demorec.tasks.skills import Expert
@@ -54,7 +54,7 @@ def read_takeover(path: Path) -> TakenOver | None:
     Raises:
         RecordingError: It cannot be read.
     """
-    with Recording(path) as recording:
+    with SimulatedRecording(path) as recording:
         messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
         if not messages:
             return None

@@ -47,7 +47,7 @@ from demorec.learn.evaluate.progress import EvaluationObserver, factors_of
 from demorec.learn.evaluate.statistics import Rate
 from demorec.learn.evaluate.turns import Turns
 from demorec.loop import make_world, prepare
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SimulatedWriter
 from demorec.robots.robot import RobotSpec
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
@@ -242,7 +242,7 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     progress = EvaluationObserver(info.scene)
     name = f"episode_{plan.episode_index:06d}.mcap"
     path = folder / name
-    with EpisodeWriter(path, info, video=plan.config.video, overwrite=True) as recording:
+    with SimulatedWriter(path, info, video=plan.config.video, overwrite=True) as recording:
         for frame in turns.frames():
             recording.write(frame)
             progress.watch(env.world)

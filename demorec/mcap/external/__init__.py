@@ -1,4 +1,4 @@
-"""Recordings of collected episodes (`demorec.episode.collected`): the same MCAP files, of episodes without our scenes.
+"""Recordings of collected episodes (`demorec.episode.external`): the same MCAP files, of episodes without our scenes.
 
 with CollectedWriter(path, info) as writer:
     number = writer.picture("top", stamp_ns, pixels)     # or bytes that are coded already

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.registry import nearest_match
-from demorec.episode.collected import CollectedCamera, CollectedFrame, CollectedInfo
+from demorec.episode.external import Camera, EpisodeInfo, SampledFrame
 from demorec.mcap.depth import DEPTH_TYPES
 
 MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1
@@ -20,10 +20,10 @@ MAX_SUBTASK = 1000
 """Characters."""
 
 
-class CollectedCheck:
+class SampledFrameCheck:
     """Looks at pictures and frames in the order in which they come, and is told of those that were taken."""
 
-    def __init__(self, info: CollectedInfo) -> None:
+    def __init__(self, info: EpisodeInfo) -> None:
         self._features = {feature.name: feature for feature in info.features}
         self._cameras = {camera.name: camera for camera in info.cameras}
         self._last: dict[str, int] = {}
@@ -46,7 +46,7 @@ class CollectedCheck:
         self._last["camera " + camera] = int(stamp_ns)
         self._num_pictures[camera] += 1
 
-    def check_frame(self, frame: CollectedFrame) -> None:
+    def check_frame(self, frame: SampledFrame) -> None:
         """Raise RecordingError unless it can be the next frame."""
         what = f"frame {self._num_frames}"
         _check_names(what, "feature", frame.samples, self._features)
@@ -76,7 +76,7 @@ class CollectedCheck:
             self._check_stamp(f"the feature {name!r} of {what}", "feature " + name, stamp, may_repeat=True)
         self._check_stamp(what, "frames", frame.time_ns, may_repeat=False)
 
-    def note_frame(self, frame: CollectedFrame) -> None:
+    def note_frame(self, frame: SampledFrame) -> None:
         """The next frame was taken."""
         for name in self._features:
             self._last["feature " + name] = int(frame.samples[name].stamp_ns)
@@ -97,7 +97,7 @@ class CollectedCheck:
             )
 
 
-def _check_picture(camera: CollectedCamera, data: NDArray[Any] | bytes) -> None:
+def _check_picture(camera: Camera, data: NDArray[Any] | bytes) -> None:
     if camera.kept and not camera.is_depth:
         if not isinstance(data, bytes) or not data:
             raise RecordingError(

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from demorec.core.errors import RecordingError, in_words
 from demorec.core.plain import to_json
-from demorec.episode.collected import COLLECTED_VERSION, CollectedInfo
+from demorec.episode.external import COLLECTED_VERSION, EpisodeInfo
 from demorec.episode.validity import from_description
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.metadata import COLLECTED, check_seal, sealed
@@ -17,7 +17,7 @@ from demorec.mcap.video import VideoSettings
 _MOST_TOLD = 5
 
 
-def collected_metadata(info: CollectedInfo, cameras: Mapping[str, VideoSettings]) -> dict[str, str]:
+def external_metadata(info: EpisodeInfo, cameras: Mapping[str, VideoSettings]) -> dict[str, str]:
     """The record that makes an MCAP file a recording of a collected episode; the first few values are for people.
 
     The URDF is not in it but a message of its own; its SHA-256 is.
@@ -40,7 +40,7 @@ def urdf_sha256(urdf: str) -> str:
     return hashlib.sha256(urdf.encode()).hexdigest() if urdf else ""
 
 
-def read_collected_metadata(metadata: Mapping[str, str]) -> tuple[CollectedInfo, dict[str, VideoSettings], str]:
+def read_external_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, VideoSettings], str]:
     """Inverse of `collected_metadata`, with the SHA-256 of the URDF, which `info` lacks.
 
     Raises:
@@ -54,7 +54,7 @@ def read_collected_metadata(metadata: Mapping[str, str]) -> tuple[CollectedInfo,
             f"to {COLLECTED_VERSION}: use the demorec that wrote it, or a newer one"
         )
     try:
-        info = from_description(metadata["info"], CollectedInfo)
+        info = from_description(metadata["info"], EpisodeInfo)
         cameras = from_description(metadata["cameras"], dict[str, VideoSettings])
         wrong = what_is_wrong(info)
         for camera in info.cameras:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
-from demorec.episode.collected import DEPTH_UNITS, NO_PICTURE, CollectedColumns, CollectedInfo, CollectedOutcome
+from demorec.episode.external import DEPTH_UNITS, NO_PICTURE, Columns, EpisodeInfo, ExternalOutcome
 from demorec.mcap import messages
 from demorec.mcap.channels import description_topic, video_topic
 from demorec.mcap.chunks import Block
@@ -56,7 +56,7 @@ class _Table:
         return np.concatenate([np.empty(0, np.int64), *self._times]), np.concatenate(self._values)
 
 
-class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
+class Recording(EpisodeFile[ExternalOutcome, VideoSettings]):
     """What one file holds of a collected episode; a context manager.
 
     Attributes:
@@ -70,21 +70,21 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
             all methods.
     """
 
-    info: CollectedInfo
+    info: EpisodeInfo
 
     def _read_metadata(self) -> None:
         found = self._container.metadata(COLLECTED)
         if found is None:
             raise RecordingError(f"The file holds no collected episode: {self.path}")
         try:
-            info, self._cameras, urdf_sha256 = metadata.read_collected_metadata(found)
-            self._read_end(FRAMES, CollectedOutcome)
+            info, self._cameras, urdf_sha256 = metadata.read_external_metadata(found)
+            self._read_end(FRAMES, ExternalOutcome)
             self.info = self._with_urdf(info, urdf_sha256)
         except RecordingError as error:
             text = str(error).removesuffix(f": {self.path}")
             raise RecordingError(f"{text}: {self.path}") from error
 
-    def _with_urdf(self, info: CollectedInfo, sha256: str) -> CollectedInfo:
+    def _with_urdf(self, info: EpisodeInfo, sha256: str) -> EpisodeInfo:
         if not sha256:
             return info
         urdf = ""
@@ -125,12 +125,12 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
         """How the pictures of a camera were coded."""
         return self._camera(camera)
 
-    def columns(self) -> CollectedColumns:
+    def columns(self) -> Columns:
         """All numbers, one row a frame, to the bit as they were written, and which pictures the frames hold."""
         return self._columns
 
     @cached_property
-    def _columns(self) -> CollectedColumns:
+    def _columns(self) -> Columns:
         """Read once: an export and a check look at them from several sides."""
         streams = feature_streams(self.info)
         picture_topics = {camera: self._picture_topic(camera) for camera in self._cameras_in_order}
@@ -162,7 +162,7 @@ class CollectedRecording(EpisodeFile[CollectedOutcome, VideoSettings]):
                 raise RecordingError(
                     f"A frame holds a picture of the camera {name!r} that is none of its {count}: {self.path}"
                 )
-        return CollectedColumns(
+        return Columns(
             time_ns=time_ns, features=features, stamps=stamps, pictures=pictures, picture_stamps=picture_stamps
         )
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.collected import CollectedFeature, CollectedInfo
+from demorec.episode.external import EpisodeInfo, Feature
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
 
@@ -48,7 +48,7 @@ class FeatureStream:
         return self.layout.decode_rows(rows).astype(self.dtype)
 
 
-def feature_streams(info: CollectedInfo) -> dict[str, FeatureStream]:
+def feature_streams(info: EpisodeInfo) -> dict[str, FeatureStream]:
     """Feature -> its messages: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
     streams = {}
     for feature in info.features:
@@ -62,13 +62,13 @@ def feature_streams(info: CollectedInfo) -> dict[str, FeatureStream]:
     return streams
 
 
-def frames_layout(info: CollectedInfo) -> Layout:
+def frames_layout(info: EpisodeInfo) -> Layout:
     """Of `/frames`: std_msgs/Int64MultiArray, whose label names the columns."""
     columns = [feature.name for feature in info.features] + [camera.name for camera in info.cameras]
     return _array_layout(messages.INT64_ARRAY, columns)
 
 
-def _joints_layout(feature: CollectedFeature) -> Layout:
+def _joints_layout(feature: Feature) -> Layout:
     """Velocity and effort are empty: they are not known, and zeros would be invented."""
     names = tuple(joint or name for name, joint in zip(feature.names, feature.joints, strict=True))
     return layout(messages.JOINT_STATE, (Slot.TIME, ""), names, (Slot.VALUE,) * len(names), (), ())

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.episode.collected import NO_PICTURE, Origin
-from demorec.mcap.external.reader import CollectedRecording
+from demorec.episode.external import NO_PICTURE, Origin
+from demorec.mcap.external.reader import Recording
 from demorec.mcap.summary import StreamSummary, common_facts
 from demorec.mcap.video import VideoSettings
 
@@ -27,7 +27,7 @@ class FeatureSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedCameraSummary:
+class ExternalCameraSummary:
     """One camera: how its pictures are coded, how many there are, how many frames have none, the oldest in seconds."""
 
     name: str
@@ -40,7 +40,7 @@ class CollectedCameraSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedSummary:
+class ExternalSummary:
     """What `demorec info` tells of a collected episode; times in seconds.
 
     Attributes:
@@ -65,19 +65,19 @@ class CollectedSummary:
     seconds: float
     rate: float
     features: tuple[FeatureSummary, ...]
-    cameras: tuple[CollectedCameraSummary, ...]
+    cameras: tuple[ExternalCameraSummary, ...]
     streams: tuple[StreamSummary, ...]
     origin: Origin
     digest: str
     versions: Mapping[str, str]
 
 
-def summarize_collected(path: Path) -> CollectedSummary:
+def summarize_external(path: Path) -> ExternalSummary:
     """Read a recording, all of its content included, and tell what it holds; RecordingError: it is none, or damaged."""
-    with CollectedRecording(path) as recording:
+    with Recording(path) as recording:
         info, outcome, columns = recording.info, recording.outcome, recording.columns()
         seconds = float(columns.time_ns[-1] - columns.time_ns[0]) / 1e9 if columns.num_frames else 0.0
-        return CollectedSummary(
+        return ExternalSummary(
             **common_facts(recording),
             robot=info.robot,
             has_urdf=bool(info.urdf),
@@ -98,7 +98,7 @@ def summarize_collected(path: Path) -> CollectedSummary:
                 for feature in info.features
             ),
             cameras=tuple(
-                CollectedCameraSummary(
+                ExternalCameraSummary(
                     name=camera.name,
                     video=recording.video_settings(camera.name),
                     is_kept=bool(camera.kept),

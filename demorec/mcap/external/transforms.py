@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.collected import CollectedFeature, CollectedFrame, CollectedInfo, Vector
+from demorec.episode.external import EpisodeInfo, Feature, SampledFrame, Vector
 from demorec.mcap.streams import transforms_layout
 from demorec.mcap.transforms import RERUN_ROOT, WORLD, MovingJoints, Row, camera_frame
 from demorec.robots.urdf import Urdf
@@ -21,7 +21,7 @@ class JointPositions:
         joints: Their names, each once.
     """
 
-    def __init__(self, features: Sequence[CollectedFeature]) -> None:
+    def __init__(self, features: Sequence[Feature]) -> None:
         places: dict[str, tuple[str, int, float]] = {}
         for feature in features:
             if feature.name.partition(".")[0] != "observation":
@@ -40,7 +40,7 @@ class JointPositions:
         return np.stack(columns, axis=-1).astype(np.float64)
 
 
-class CollectedTree:
+class ExternalTree:
     """Which coordinate frames hang on which; a joint of the URDF that is not observed stays at 0.
 
     Attributes:
@@ -48,7 +48,7 @@ class CollectedTree:
         is_moving: Whether any joint is known to move.
     """
 
-    def __init__(self, info: CollectedInfo) -> None:
+    def __init__(self, info: EpisodeInfo) -> None:
         urdf = Urdf.parse(info.urdf)
         self._positions = JointPositions(info.features)
         self._joints = MovingJoints(urdf, self._positions.joints)
@@ -65,7 +65,7 @@ class CollectedTree:
             ),
         )
 
-    def encode(self, frames: Sequence[CollectedFrame]) -> list[bytes]:
+    def encode(self, frames: Sequence[SampledFrame]) -> list[bytes]:
         """tf2_msgs/TFMessage of each frame, at its time."""
         names = frames[0].samples
         features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in names}

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from demorec.core.config import MAX_PIXELS
-from demorec.episode.collected import CollectedCamera, CollectedFeature, CollectedInfo
+from demorec.episode.external import Camera, EpisodeInfo, Feature
 from demorec.robots.urdf import Urdf
 
 _FEATURE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*")
@@ -22,12 +22,12 @@ MAX_CAMERAS = 64
 _MAX_TEXT = 10_000
 
 
-def what_is_wrong(info: CollectedInfo) -> list[str]:
+def what_is_wrong(info: EpisodeInfo) -> list[str]:
     """Everything that makes a description impossible, in words; empty when nothing does."""
     return list(_info(info))
 
 
-def _info(info: CollectedInfo) -> Iterator[str]:
+def _info(info: EpisodeInfo) -> Iterator[str]:
     if not 0 <= info.episode_index < 2**31:
         yield f"episode_index is {info.episode_index}, allowed are 0 to {2**31 - 1}"
     if not 1 <= info.fps <= 10_000:
@@ -60,7 +60,7 @@ def _info(info: CollectedInfo) -> Iterator[str]:
         yield from _camera(camera, links)
 
 
-def _feature(feature: CollectedFeature, joints: frozenset[str]) -> Iterator[str]:
+def _feature(feature: Feature, joints: frozenset[str]) -> Iterator[str]:
     name = feature.name
     if not _FEATURE.fullmatch(name):
         yield f"a feature is called {name!r}, allowed are words of letters, digits and _, with dots between them"
@@ -79,7 +79,7 @@ def _feature(feature: CollectedFeature, joints: frozenset[str]) -> Iterator[str]
     yield from _unique(f"joints of the feature {name!r}", named)
 
 
-def _camera(camera: CollectedCamera, links: frozenset[str]) -> Iterator[str]:
+def _camera(camera: Camera, links: frozenset[str]) -> Iterator[str]:
     what = f"the camera {camera.name!r}"
     if not _CAMERA.fullmatch(camera.name):
         yield f"a camera is called {camera.name!r}, allowed are letters, digits and _, beginning with a letter"

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.episode.collected import NO_PICTURE, CollectedCamera, CollectedFrame, CollectedInfo, CollectedOutcome
+from demorec.episode.external import NO_PICTURE, Camera, EpisodeInfo, ExternalOutcome, SampledFrame
 from demorec.mcap import messages
 from demorec.mcap.cdr import encode
 from demorec.mcap.channels import TF, TF_STATIC, camera_topic, description_topic
 from demorec.mcap.depth import encode_distances
 from demorec.mcap.external import metadata
-from demorec.mcap.external.frame_check import CollectedCheck
+from demorec.mcap.external.frame_check import SampledFrameCheck
 from demorec.mcap.external.streams import FRAMES, SUBTASK, feature_streams, frames_layout
-from demorec.mcap.external.transforms import CollectedTree
+from demorec.mcap.external.transforms import ExternalTree
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.file_writer import FileWriter
 from demorec.mcap.metadata import COLLECTED
@@ -35,7 +35,7 @@ _SECOND_NS = 1_000_000_000
 class _Pictures(PictureCoder):
     """The pictures of one camera on their way into the file."""
 
-    def __init__(self, camera: CollectedCamera, video: VideoConfig, fps: int) -> None:
+    def __init__(self, camera: Camera, video: VideoConfig, fps: int) -> None:
         super().__init__(camera, video, fps)
         self._stamps: list[int] = []
 
@@ -65,7 +65,7 @@ class _Pictures(PictureCoder):
         return taken
 
 
-class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
+class EpisodeWriter(FileWriter[ExternalOutcome, _Pictures]):
     """Context manager that writes one collected episode; left without `finish`, NAME.mcap.part stays for `recover`.
 
     Frames must not be changed after they were given.
@@ -86,7 +86,7 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
     def __init__(
         self,
         path: Path,
-        info: CollectedInfo,
+        info: EpisodeInfo,
         *,
         video: VideoConfig | None = None,
         overwrite: bool = False,
@@ -95,12 +95,12 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
         if begins:
             self._describe(info)
         self._cameras = {camera.name: _Pictures(camera, video or VideoConfig(), info.fps) for camera in info.cameras}
-        self._pending: list[CollectedFrame] = []
+        self._pending: list[SampledFrame] = []
         super().__init__(path, origin=info.origin, overwrite=overwrite)
         if begins:
             self._write_description()
 
-    def begin(self, info: CollectedInfo) -> None:
+    def begin(self, info: EpisodeInfo) -> None:
         """Say what the episode is, of which only the cameras were known; before its first image and frame.
 
         Raises:
@@ -110,20 +110,20 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
         self._describe(info)
         self._write_description()
 
-    def _describe(self, info: CollectedInfo) -> None:
+    def _describe(self, info: EpisodeInfo) -> None:
         if wrong := what_is_wrong(info):
             raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
         self._info = info
-        self._check = CollectedCheck(info)
+        self._check = SampledFrameCheck(info)
         self._streams = feature_streams(info)
         self._frames_layout = frames_layout(info)
-        self._tree = CollectedTree(info) if info.urdf else None
+        self._tree = ExternalTree(info) if info.urdf else None
 
     def _write_description(self) -> None:
         """Write what is said once, or leave nothing."""
         try:
             settings = {name: camera.settings for name, camera in self._cameras.items()}
-            self._file.metadata(COLLECTED, metadata.collected_metadata(self._info, settings))
+            self._file.metadata(COLLECTED, metadata.external_metadata(self._info, settings))
             if self._tree is not None:
                 urdf = encode(messages.STRING, self._info.urdf)
                 self._file.log(description_topic(), messages.STRING, urdf, 0, latched=True)
@@ -158,7 +158,7 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
         self._check.note_picture(camera, stamp_ns)
         return self._cameras[camera].add(int(stamp_ns), data)
 
-    def write(self, frame: CollectedFrame) -> None:
+    def write(self, frame: SampledFrame) -> None:
         """Add the next frame.
 
         Raises:
@@ -215,7 +215,7 @@ class CollectedWriter(FileWriter[CollectedOutcome, _Pictures]):
                 return index
         return len(self._pending)
 
-    def _row(self, frame: CollectedFrame) -> list[int]:
+    def _row(self, frame: SampledFrame) -> list[int]:
         stamps = [int(frame.samples[name].stamp_ns) for name in self._streams]
         return stamps + [int(frame.pictures.get(name, NO_PICTURE)) for name in self._cameras]
 

@@ -19,8 +19,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.collected import CollectedCamera, CollectedFrame, CollectedInfo
-from demorec.mcap import CollectedWriter
+from demorec.episode.external import Camera, EpisodeInfo, SampledFrame
+from demorec.mcap import EpisodeWriter
 
 WhenFull = Literal["error", "drop", "wait"]
 
@@ -39,7 +39,7 @@ WaitingPictures = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
 class Buffers:
     """Memory for pictures that wait, used again and again: fresh memory costs as much as copying into it."""
 
-    def __init__(self, cameras: Sequence[CollectedCamera]) -> None:
+    def __init__(self, cameras: Sequence[Camera]) -> None:
         self._free: dict[tuple[int, ...], deque[NDArray[np.uint8]]] = {
             (camera.height, camera.width, 3): deque() for camera in cameras
         }
@@ -77,27 +77,27 @@ class Coder:
 
     def __init__(
         self,
-        writer: CollectedWriter,
+        writer: EpisodeWriter,
         buffers: Buffers,
         *,
-        cameras: Sequence[CollectedCamera],
+        cameras: Sequence[Camera],
         fps: int,
         waits: bool = False,
     ) -> None:
         self.writer, self._buffers, self._waits = writer, buffers, waits
-        self.info: CollectedInfo | None = None
+        self.info: EpisodeInfo | None = None
         self.error: BaseException | None = None
         frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
         most = _MAX_WAITING_BYTES // max(frame_bytes, 1)
         self.capacity = max(_MIN_WAITING_FRAMES, min(round(_WAITING_SECONDS * fps), most))
-        self._queue: Queue[tuple[CollectedFrame, WaitingPictures] | None] = Queue(self.capacity)
+        self._queue: Queue[tuple[SampledFrame, WaitingPictures] | None] = Queue(self.capacity)
         self._last: dict[str, int] = {}
         self._flushed_at = time.monotonic()
         self._pool = ThreadPoolExecutor(max(len(cameras), 1), thread_name_prefix="demorec-camera")
         self._thread = threading.Thread(target=self._run, name="demorec-coder", daemon=True)
         self._thread.start()
 
-    def put(self, frame: CollectedFrame, pictures: WaitingPictures) -> bool:
+    def put(self, frame: SampledFrame, pictures: WaitingPictures) -> bool:
         """Copy the pictures that a frame holds and queue both; False when the queue is full and is not waited for.
 
         Only one thread may put frames.
@@ -147,7 +147,7 @@ class Coder:
         self.writer.flush()
         self._flushed_at = time.monotonic()
 
-    def _write(self, frame: CollectedFrame, pictures: WaitingPictures) -> None:
+    def _write(self, frame: SampledFrame, pictures: WaitingPictures) -> None:
         if self.info is not None:
             self.writer.begin(self.info)
             self.info = None

@@ -18,22 +18,22 @@ from demorec.core.closing import Closing
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError, in_words
 from demorec.core.registry import nearest_match
-from demorec.episode.collected import (
-    CollectedCamera,
-    CollectedFeature,
-    CollectedFrame,
-    CollectedInfo,
-    CollectedOutcome,
+from demorec.episode.external import (
+    Camera,
+    EpisodeInfo,
+    ExternalOutcome,
+    Feature,
     Sample,
+    SampledFrame,
 )
-from demorec.mcap import CollectedWriter
-from demorec.mcap.external.frame_check import CollectedCheck
+from demorec.mcap import EpisodeWriter
+from demorec.mcap.external.frame_check import SampledFrameCheck
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.recorder.coder import Buffers, Coder, WaitingPictures, WhenFull
 from demorec.mcap.recorder.robot import RobotLike, robot_facts
 from demorec.mcap.recorder.vectors import NamedVectors, Vectors, as_declared, features_of, named_vectors
 from demorec.mcap.video import size_problem
-from demorec.runs.collected import CollectedFolder, open_collected_run
+from demorec.runs.external import ExternalFolder, open_external_run
 
 Image = NDArray[np.uint8] | tuple[NDArray[np.uint8], int]
 """(H, W, 3) uint8 RGB, alone or with the stamp (ns) of when it was taken."""
@@ -56,14 +56,14 @@ class RecordedEpisode:
         num_frames: Frames that were taken.
     """
 
-    def __init__(self, run: Recorder, info: CollectedInfo, coder: Coder) -> None:
+    def __init__(self, run: Recorder, info: EpisodeInfo, coder: Coder) -> None:
         self.success: bool | None = None
         self.drops: dict[str, int] = {}
         self.num_frames = 0
         self._run = run
         self._info = info
         self._coder: Coder | None = coder
-        self._features: dict[str, CollectedFeature] = {}
+        self._features: dict[str, Feature] = {}
         self._picture_stamps: dict[str, int] = {}
 
     @property
@@ -122,11 +122,11 @@ class RecordedEpisode:
         vectors = named_vectors(observation, action)
         if not self._features:
             info = self._coder.info = self._run.described(self._info, vectors)
-            self._check = CollectedCheck(info)
+            self._check = SampledFrameCheck(info)
             self._features = {feature.name: feature for feature in info.features}
         samples = self._samples(vectors, time_ns, stamps or {})
         pictures = self._pictures(images or {}, time_ns)
-        return self._queue(CollectedFrame(time_ns=time_ns, samples=samples), pictures)
+        return self._queue(SampledFrame(time_ns=time_ns, samples=samples), pictures)
 
     def _samples(
         self,
@@ -161,7 +161,7 @@ class RecordedEpisode:
             pictures[camera] = stamp_ns, None if is_same else pixels
         return pictures
 
-    def _queue(self, frame: CollectedFrame, pictures: WaitingPictures) -> bool:
+    def _queue(self, frame: SampledFrame, pictures: WaitingPictures) -> bool:
         assert self._coder is not None
         self._check.check_frame(frame)
         new = {camera: (stamp, pixels) for camera, (stamp, pixels) in pictures.items() if pixels is not None}
@@ -207,7 +207,7 @@ class RecordedEpisode:
         if coder.error is not None:
             coder.writer.close()
             raise _as_recording_error(coder.error)
-        outcome = CollectedOutcome(success=self.success, num_frames=self.num_frames, drops=self.drops, reason=reason)
+        outcome = ExternalOutcome(success=self.success, num_frames=self.num_frames, drops=self.drops, reason=reason)
         path = coder.writer.finish(outcome).path
         self._run.add(path)
         return path
@@ -258,10 +258,10 @@ class Recorder(Closing):
         folder: str | Path,
         *,
         robot: RobotLike,
-        cameras: Mapping[str, tuple[int, int] | CollectedCamera] | None = None,
+        cameras: Mapping[str, tuple[int, int] | Camera] | None = None,
         fps: int,
         task: str = "",
-        features: Sequence[CollectedFeature] = (),
+        features: Sequence[Feature] = (),
         video: VideoConfig | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         when_full: WhenFull = "error",
@@ -276,13 +276,13 @@ class Recorder(Closing):
         self._buffers = Buffers(self._cameras)
         self._stack = ExitStack()
         self._open: RecordedEpisode | None = None
-        self._folder: CollectedFolder = self._stack.enter_context(open_collected_run(Path(folder)))
+        self._folder: ExternalFolder = self._stack.enter_context(open_external_run(Path(folder)))
         self.path = self._folder.path
         self.recovered = tuple(self._folder.recovered)
 
     def _check_request(self) -> None:
         """Refuse at once what no first frame could make good."""
-        placeholder = CollectedFeature(name="observation.state", names=("0",))
+        placeholder = Feature(name="observation.state", names=("0",))
         asked = self._info(self._features or (placeholder,), 0, self._task or "placeholder")
         wrong = what_is_wrong(asked)
         sizes = [size_problem(self._video, camera.width, camera.height) for camera in self._cameras]
@@ -324,14 +324,14 @@ class Recorder(Closing):
             raise ConfigError("The episode has no task text: give Recorder(task=...) or recorder.episode(task=...).")
         info = self._info(self._features, self._folder.next_index, instruction)
         path = self._folder.path_of(info.episode_index)
-        writer = CollectedWriter(path, info, video=self._video, begins=False)
+        writer = EpisodeWriter(path, info, video=self._video, begins=False)
         coder = Coder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
         self._open = RecordedEpisode(self, info, coder)
         return self._open
 
     # ------------------------------------------------------------------------------- for the episode
 
-    def described(self, info: CollectedInfo, vectors: NamedVectors) -> CollectedInfo:
+    def described(self, info: EpisodeInfo, vectors: NamedVectors) -> EpisodeInfo:
         """An episode whose first frame has these vectors; ConfigError when the run has episodes of another kind."""
         info = replace(info, features=self._features or features_of(vectors, self._robot))
         if wrong := what_is_wrong(info):
@@ -343,8 +343,8 @@ class Recorder(Closing):
         """Take a finished recording into the run."""
         self._folder.add(recording)
 
-    def _info(self, features: tuple[CollectedFeature, ...], episode_index: int, instruction: str) -> CollectedInfo:
-        return CollectedInfo(
+    def _info(self, features: tuple[Feature, ...], episode_index: int, instruction: str) -> EpisodeInfo:
+        return EpisodeInfo(
             episode_index=episode_index,
             instruction=instruction,
             robot=self._robot.name,
@@ -362,8 +362,8 @@ def _text(task: object) -> str:
     return task
 
 
-def _camera(name: str, camera: tuple[int, int] | CollectedCamera) -> CollectedCamera:
-    if isinstance(camera, CollectedCamera):
+def _camera(name: str, camera: tuple[int, int] | Camera) -> Camera:
+    if isinstance(camera, Camera):
         if camera.name != name or camera.kept:
             raise ConfigError(
                 f"The camera {name!r} is described as {camera.name!r}{' of kept packets' if camera.kept else ''}: a "
@@ -372,7 +372,7 @@ def _camera(name: str, camera: tuple[int, int] | CollectedCamera) -> CollectedCa
         return camera
     try:
         height, width = camera
-        return CollectedCamera(name=name, width=int(width), height=int(height))
+        return Camera(name=name, width=int(width), height=int(height))
     except (TypeError, ValueError):
         raise ConfigError(f"The camera {name!r} is {camera!r}, it must be (height, width) in pixels.") from None
 

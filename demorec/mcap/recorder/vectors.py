@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.registry import nearest_match
-from demorec.episode.collected import CollectedFeature
+from demorec.episode.external import Feature
 from demorec.episode.features import ACTION, STATE
 from demorec.mcap.recorder.robot import RobotFacts
 
@@ -80,7 +80,7 @@ def _vector(name: str, value: ArrayLike) -> NDArray[Any]:
     return vector if vector.dtype in (np.float32, np.float64) else vector.astype(np.float64)
 
 
-def as_declared(feature: CollectedFeature, vector: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
+def as_declared(feature: Feature, vector: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
     """The vector in the feature's type and order of elements, where no bit is lost by that.
 
     Raises:
@@ -98,7 +98,7 @@ def as_declared(feature: CollectedFeature, vector: NDArray[Any], names: tuple[st
     return vector.astype(np.float64) if feature.dtype == "float64" else vector
 
 
-def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[CollectedFeature, ...]:
+def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[Feature, ...]:
     """What the first frame says of the features that nobody described."""
     found = []
     for name, (vector, given) in vectors.items():
@@ -106,7 +106,7 @@ def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[CollectedFeat
         names = given or (_element_names(len(vector), robot.joints) if is_robot else _numbers(len(vector)))
         joints = tuple(_joint(element, robot) if is_robot else "" for element in names)
         found.append(
-            CollectedFeature(
+            Feature(
                 name=name,
                 dtype="float32" if vector.dtype == np.float32 else "float64",
                 names=names,

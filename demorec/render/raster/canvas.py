@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.scene import Camera, Light
+from demorec.episode.scene import Light, SceneCamera
 from demorec.render.raster.batch import Batch, Floats32
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.antialias import STILL, centre_of_mixed, resolve, shade_edges
@@ -61,7 +61,7 @@ class Canvas:
 
     def __init__(
         self,
-        camera: Camera,
+        camera: SceneCamera,
         batch: Batch,
         stage: Stage,
         light: Light,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from demorec.core.geometry import Pose, look_at
-from demorec.episode.scene import Camera, Light, Texture
+from demorec.episode.scene import Light, SceneCamera, Texture
 from demorec.render import Visual, VisualBody, VisualKind
 from demorec.render.raster.batch import make_batch
 from demorec.render.raster.canvas import Canvas
@@ -25,7 +25,7 @@ def rehearse() -> None:
     bodies = [_body("box", 0.3, 0.3, 0.1, is_fixed=True, texture=texture), _body("sphere", 0.1, is_fixed=False)]
     instances = make_instances(bodies, ModelStore())
     light = Light()
-    camera = Camera(
+    camera = SceneCamera(
         name="rehearsal",
         width=32,
         height=24,

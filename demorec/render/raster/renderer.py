@@ -9,7 +9,7 @@ from typing import Self
 
 from demorec.core.geometry import Array
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.render import RenderSetup
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.cache import folder_lock
@@ -92,7 +92,7 @@ class RasterRenderer:
             )
             self._views.append(CameraView(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
 
-    def _level(self, instance: Instance, camera: Camera, setup: RenderSetup) -> int | None:
+    def _level(self, instance: Instance, camera: SceneCamera, setup: RenderSetup) -> int | None:
         """How many faces an instance keeps for a camera."""
         distance = WORKING_DISTANCE["world" if camera.mount == "world" else "link"]
         pixels = 2 * instance.radius * float(camera.intrinsics[1, 1]) / distance

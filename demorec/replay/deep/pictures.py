@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
-from demorec.mcap import Recording
+from demorec.mcap import SimulatedRecording
 from demorec.mcap.depth import decode_depth
 from demorec.mcap.fields import message_fields
 from demorec.mcap.labels import decode_labels
@@ -38,7 +38,7 @@ _LEVELS_OF_THE_MEAN = 3.0
 def picture_differences(
     recorded: Contents,
     again: Contents,
-    remade: Recording,
+    remade: SimulatedRecording,
     painter: Painter,
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
@@ -91,7 +91,7 @@ def _coded(contents: Contents, topic: str) -> list[bytes]:
     return pictures
 
 
-def _drawn(remade: Recording, painter: Painter, camera: str) -> Iterator[Rgb]:
+def _drawn(remade: SimulatedRecording, painter: Painter, camera: str) -> Iterator[Rgb]:
     columns, info = remade.columns(), remade.info
     world = RecordedWorld(
         info.robot, info.scene, joint_position=columns.joint_position, object_poses=columns.object_poses

@@ -10,9 +10,9 @@ from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.plain import digest, from_plain
 from demorec.core.tables import RENDERERS
-from demorec.episode.episode import EpisodeInfo
+from demorec.episode.episode import SimulatedInfo
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
@@ -21,7 +21,7 @@ from demorec.replay.rerender import recorded_view, view_painter
 from demorec.robots.assets import allow_models
 
 
-def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:
+def recorded_config(info: SimulatedInfo, allowed: Collection[str]) -> GenerateConfig:
     """The config that an episode says it was made with.
 
     Raises:
@@ -34,7 +34,7 @@ def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConf
     return config
 
 
-def remake(recording: Recording, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
+def remake(recording: SimulatedRecording, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
     """Make the episode of a recording again, as a recording of the same format version.
 
     A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
@@ -56,20 +56,20 @@ def remake(recording: Recording, path: Path, workshop: Workshop, allowed: Sequen
         generate_again(recording.info, path, workshop, allowed)
 
 
-def generate_again(recorded: EpisodeInfo, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
+def generate_again(recorded: SimulatedInfo, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
     """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
     config = recorded_config(recorded, allowed)
     episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
     info = replace(episode.info, format_version=recorded.format_version)
     world, renderer = workshop.equip(info)
     session = Session.of_episode(world, episode, renderer)
-    with EpisodeWriter(path, info, video=config.video) as writer:
+    with SimulatedWriter(path, info, video=config.video) as writer:
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
         writer.finish(session.outcome)
 
 
-def _send_again(recording: Recording, path: Path, workshop: Workshop, allowed: Sequence[str]) -> None:
+def _send_again(recording: SimulatedRecording, path: Path, workshop: Workshop, allowed: Sequence[str]) -> None:
     allow_models(allowed)
     options = ReplayOptions(allowed=tuple(allowed))
     demonstration = open_demonstration(recording, options)
@@ -77,7 +77,7 @@ def _send_again(recording: Recording, path: Path, workshop: Workshop, allowed: S
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
     world, renderer = workshop.equip(info)
     painter = recorded_painter(info, renderer, allowed)
-    with EpisodeWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
+    with SimulatedWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
             told = recording.outcome
@@ -99,7 +99,7 @@ def _recorded[T](config: object, kind: type[T]) -> T:
         raise ConfigError(f"The recorded config is none of this version ({error}).") from error
 
 
-def recorded_painter(info: EpisodeInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
+def recorded_painter(info: SimulatedInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
     """Draws what the recording shows, from where its cameras really were; None without cameras."""
     if renderer is None:
         return None

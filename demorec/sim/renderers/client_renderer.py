@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import Camera
+from demorec.episode.scene import SceneCamera
 from demorec.render import RenderSetup
 from demorec.render.setup_checks import check_setup, world_from_camera
 from demorec.sim.client import connect
@@ -69,7 +69,7 @@ class ClientRenderer:
         self._mirror.follow(poses)
         return {camera.name: self._draw(self._mirror, camera, poses) for camera in self._mirror.setup.cameras}
 
-    def _draw(self, mirror: SceneMirror, camera: Camera, poses: Array) -> CameraImages:
+    def _draw(self, mirror: SceneMirror, camera: SceneCamera, poses: Array) -> CameraImages:
         client, setup = self._client, mirror.setup
         pose = world_from_camera(setup, camera, poses)
         light = setup.light
@@ -115,7 +115,7 @@ def view_matrix(world_from_camera: Pose) -> list[float]:
     return [float(v) for v in matrix.T.reshape(-1)]
 
 
-def _metric_depth(buffer: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+def _metric_depth(buffer: NDArray[np.float32], camera: SceneCamera) -> NDArray[np.float32]:
     """OpenGL's depth buffer (0..1) in metres along the optical axis; 0 where nothing is hit."""
     near, far = camera.near, camera.far
     metres = near * far / (far - (far - near) * buffer.astype(np.float64))

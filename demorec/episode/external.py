@@ -31,7 +31,7 @@ Vector = NDArray[np.float32] | NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedFeature:
+class Feature:
     """A vector that every frame has.
 
     Attributes:
@@ -53,7 +53,7 @@ class CollectedFeature:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedCamera:
+class Camera:
     """A camera, as far as it is known.
 
     Attributes:
@@ -112,7 +112,7 @@ class Origin:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedInfo:
+class EpisodeInfo:
     """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
 
     Attributes:
@@ -139,8 +139,8 @@ class CollectedInfo:
     robot: str
     urdf: str = ""
     fps: int
-    features: tuple[CollectedFeature, ...]
-    cameras: tuple[CollectedCamera, ...] = ()
+    features: tuple[Feature, ...]
+    cameras: tuple[Camera, ...] = ()
     origin: Origin = field(default_factory=Origin)
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -164,7 +164,7 @@ class Sample:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CollectedFrame:
+class SampledFrame:
     """One control step.
 
     Attributes:
@@ -183,7 +183,7 @@ class CollectedFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedOutcome:
+class ExternalOutcome:
     """How a collected episode ended.
 
     Attributes:
@@ -210,7 +210,7 @@ class CollectedOutcome:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CollectedColumns:
+class Columns:
     """All numbers of a collected episode, one row a frame (T rows); the pictures are read on their own.
 
     Attributes:

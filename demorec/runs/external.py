@@ -18,8 +18,8 @@ from demorec.core.errors import ConfigError, RecordingError, in_words, resource_
 from demorec.core.files import make_folder, read_json_limited
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.replacing import shown
-from demorec.episode.collected import CollectedInfo
-from demorec.mcap import CollectedRecording, recover
+from demorec.episode.external import EpisodeInfo
+from demorec.mcap import Recording, recover
 from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import (
     COLLECTED,
@@ -38,7 +38,7 @@ from demorec.runs.run_file import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedEpisode:
+class ExternalEpisode:
     """One episode: a line of run.json.
 
     Attributes:
@@ -74,7 +74,7 @@ class CollectedSession:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedRun:
+class ExternalRun:
     """The content of run.json.
 
     Attributes:
@@ -86,7 +86,7 @@ class CollectedRun:
 
     robot: str
     fps: int
-    episodes: tuple[CollectedEpisode, ...] = ()
+    episodes: tuple[ExternalEpisode, ...] = ()
     sessions: tuple[CollectedSession, ...] = ()
 
     @property
@@ -96,7 +96,7 @@ class CollectedRun:
         return sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
-def is_collected_run(folder: Path) -> bool:
+def is_external_run(folder: Path) -> bool:
     """Whether the folder has a run.json of a run whose episodes were collected."""
     try:
         plain = read_json_limited(folder / RUN_NAME, MAX_RUN_FILE_BYTES)
@@ -105,7 +105,7 @@ def is_collected_run(folder: Path) -> bool:
     return isinstance(plain, dict) and plain.get("kind") == COLLECTED
 
 
-def load_collected_run(folder: Path) -> CollectedRun:
+def load_external_run(folder: Path) -> ExternalRun:
     """Read run.json.
 
     Raises:
@@ -121,13 +121,13 @@ def load_collected_run(folder: Path) -> CollectedRun:
             raise ConfigError(f"The folder holds a run of another kind: choose another folder: {folder}")
         for derived in ("format", "kind", "digest"):
             plain.pop(derived)
-        return from_plain(plain, CollectedRun)
+        return from_plain(plain, ExternalRun)
     except (OSError, ValueError, KeyError, TypeError) as error:
         damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
         raise resource_error(error, path) or damaged from error
 
 
-class CollectedFolder:
+class ExternalFolder:
     """An opened run.
 
     Attributes:
@@ -144,10 +144,10 @@ class CollectedFolder:
         self.path = path
         self.recovered: list[Path] = []
         self._session = CollectedSession(started=_now())
-        known, is_damaged = CollectedRun(robot="", fps=1), False
+        known, is_damaged = ExternalRun(robot="", fps=1), False
         if os.path.lexists(path / RUN_NAME):
             try:
-                known = load_collected_run(path)
+                known = load_external_run(path)
             except DamagedRunFileError:  # the recordings know what it said
                 is_damaged = True
         if recovers:
@@ -170,12 +170,12 @@ class CollectedFolder:
             part.rename(free_name(part.with_name(f"{part.name}.recovered")))
             self.recovered.append(target)
 
-    def _line(self, file: Path, known: Mapping[str, CollectedEpisode]) -> CollectedEpisode:
+    def _line(self, file: Path, known: Mapping[str, ExternalEpisode]) -> ExternalEpisode:
         """What run.json says of a recording, or what it says itself where that is not the same file."""
         line = known.get(f"{EPISODES}/{file.name}")
         if line is not None and line.num_bytes == file.stat().st_size:
             return line
-        return collected_line(file)
+        return external_line(file)
 
     @property
     def next_index(self) -> int:
@@ -192,14 +192,14 @@ class CollectedFolder:
         """Where the recording of an episode goes."""
         return episode_path(self.path, episode_index)
 
-    def kind(self) -> CollectedInfo | None:
+    def kind(self) -> EpisodeInfo | None:
         """Description of the last episode, which new ones must be like; None of an empty run."""
         if not self.episodes:
             return None
-        with CollectedRecording(self.path / self.episodes[-1].file) as recording:
+        with Recording(self.path / self.episodes[-1].file) as recording:
             return recording.info
 
-    def check_fits(self, info: CollectedInfo) -> None:
+    def check_fits(self, info: EpisodeInfo) -> None:
         """Raise ConfigError with everything in which a new episode differs from the last one that is there."""
         kind = self.kind()
         if kind is not None and (different := differences(kind, info)):
@@ -208,12 +208,12 @@ class CollectedFolder:
                 f"{self.path}"
             )
 
-    def has(self, info: CollectedInfo) -> bool:
+    def has(self, info: EpisodeInfo) -> bool:
         """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
         path = self.path_of(info.episode_index)
         if not path.exists():
             return False
-        with CollectedRecording(path) as recording:
+        with Recording(path) as recording:
             if recording.info == info and recording.outcome is not None:
                 return True
         raise ConfigError(
@@ -221,13 +221,13 @@ class CollectedFolder:
             f"{path}"
         )
 
-    def add(self, recording: Path) -> CollectedEpisode:
+    def add(self, recording: Path) -> ExternalEpisode:
         """Take a finished recording into run.json."""
-        line = collected_line(recording)
+        line = external_line(recording)
         self.extend([line])
         return line
 
-    def extend(self, lines: Iterable[CollectedEpisode]) -> None:
+    def extend(self, lines: Iterable[ExternalEpisode]) -> None:
         """Take finished recordings into run.json, by their `collected_line`."""
         self.episodes = sorted([*self.episodes, *lines], key=lambda line: line.episode_index)
         self.save()
@@ -237,7 +237,7 @@ class CollectedFolder:
         if (info := self.kind()) is None:
             return
         session = replace(self._session, ended=_now()) if ended else self._session
-        run = CollectedRun(
+        run = ExternalRun(
             robot=info.robot, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
         )
         plain = to_plain(run)
@@ -253,8 +253,8 @@ class CollectedFolder:
 
 
 @contextmanager
-def open_collected_run(path: Path, *, recovers: bool = True) -> Iterator[CollectedFolder]:
-    """Open, continue or begin a run, locked until the context ends; arguments as of `CollectedFolder`.
+def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[ExternalFolder]:
+    """Open, continue or begin a run, locked until the context ends; arguments as of `ExternalFolder`.
 
     Raises:
         ConfigError: The folder is in use, holds another kind of run or somebody's files, or cannot be written to.
@@ -263,11 +263,11 @@ def open_collected_run(path: Path, *, recovers: bool = True) -> Iterator[Collect
     path = path.absolute()
     if path.exists() and not path.is_dir():
         raise ConfigError(f"This is a file, no folder for a run: choose another: {path}")
-    if path.is_dir() and not is_collected_run(path):
+    if path.is_dir() and not is_external_run(path):
         _refuse_strangers(path)
     make_folder(path / EPISODES)
     with run_lock(path):
-        folder = CollectedFolder(path, recovers=recovers)
+        folder = ExternalFolder(path, recovers=recovers)
         folder.save()
         try:
             yield folder
@@ -279,7 +279,7 @@ def _refuse_strangers(path: Path) -> None:
     """Raise ConfigError for a folder without a readable run.json that holds other things than collected episodes."""
     if (path / RUN_NAME).exists():
         with suppress(DamagedRunFileError):
-            load_collected_run(path)
+            load_external_run(path)
     strangers = [
         entry.name
         for entry in sorted(path.iterdir())
@@ -294,11 +294,11 @@ def episode_path(run: Path, episode_index: int) -> Path:
     return run / EPISODES / recording_name(episode_index, 0, success=True)
 
 
-def collected_line(file: Path) -> CollectedEpisode:
+def external_line(file: Path) -> ExternalEpisode:
     """The line of run.json that a recording speaks for; RecordingError when it is damaged."""
-    with CollectedRecording(file) as recording:
+    with Recording(file) as recording:
         info, outcome = recording.info, recording.outcome
-        return CollectedEpisode(
+        return ExternalEpisode(
             episode_index=info.episode_index,
             instruction=info.instruction,
             success=None if outcome is None else outcome.success,
@@ -312,7 +312,7 @@ def collected_line(file: Path) -> CollectedEpisode:
         )
 
 
-def differences(there: CollectedInfo, new: CollectedInfo) -> list[str]:
+def differences(there: EpisodeInfo, new: EpisodeInfo) -> list[str]:
     """In what two episodes differ that one run or dataset must have in common, in words."""
     traits = [("robot", there.robot, new.robot), ("fps", str(there.fps), str(new.fps))]
     for kind, old_ones, new_ones in (
@@ -325,11 +325,11 @@ def differences(there: CollectedInfo, new: CollectedInfo) -> list[str]:
     return [f"{what} is {asked} instead of {found}" for what, found, asked in traits if found != asked]
 
 
-def _features(info: CollectedInfo) -> dict[str, str]:
+def _features(info: EpisodeInfo) -> dict[str, str]:
     return {one.name: f"{one.dtype} of {', '.join(one.names)}" for one in info.features}
 
 
-def _cameras(info: CollectedInfo) -> dict[str, str]:
+def _cameras(info: EpisodeInfo) -> dict[str, str]:
     return {one.name: f"{one.width}x{one.height} {one.kept}".strip() for one in info.cameras}
 
 

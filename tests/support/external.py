@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.episode.collected import (
-    CollectedCamera,
-    CollectedFeature,
-    CollectedFrame,
-    CollectedInfo,
-    CollectedOutcome,
+from demorec.episode.external import (
+    Camera,
+    EpisodeInfo,
+    ExternalOutcome,
+    Feature,
     Sample,
+    SampledFrame,
 )
-from demorec.mcap import CollectedWriter
+from demorec.mcap import EpisodeWriter
 
 URDF = """<robot name="two_joints">
  <link name="base"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>
@@ -32,17 +32,17 @@ URDF = """<robot name="two_joints">
   <origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="3"/></joint>
 </robot>
 """
-STATE = CollectedFeature(
+STATE = Feature(
     name="observation.state",
     dtype="float32",
     names=("shoulder.pos", "elbow.pos", "gripper.pos"),
     units=("rad", "rad", ""),
     joints=("shoulder", "elbow", ""),
 )
-ACTION = CollectedFeature(name="action", names=("shoulder.pos", "elbow.pos", "gripper.pos"), joints=STATE.joints)
-FORCE = CollectedFeature(name="observation.force", names=("x", "y", "z"), units=("N", "N", "N"))
-TOP = CollectedCamera(name="top", width=64, height=48, intrinsics=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0))
-WRIST = CollectedCamera(name="wrist", width=32, height=32)
+ACTION = Feature(name="action", names=("shoulder.pos", "elbow.pos", "gripper.pos"), joints=STATE.joints)
+FORCE = Feature(name="observation.force", names=("x", "y", "z"), units=("N", "N", "N"))
+TOP = Camera(name="top", width=64, height=48, intrinsics=(60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0))
+WRIST = Camera(name="wrist", width=32, height=32)
 START_NS = 1_700_000_000_123_456_789
 
 
@@ -55,23 +55,23 @@ class Episode:
         pictures: Camera -> (stamp, pixels) in order.
     """
 
-    info: CollectedInfo
-    frames: list[CollectedFrame]
+    info: EpisodeInfo
+    frames: list[SampledFrame]
     pictures: dict[str, list[tuple[int, NDArray[np.uint8]]]]
-    outcome: CollectedOutcome
+    outcome: ExternalOutcome
 
 
-def make_collected(
+def make_external(
     *,
     num_frames: int = 45,
-    cameras: tuple[CollectedCamera, ...] = (TOP, WRIST),
+    cameras: tuple[Camera, ...] = (TOP, WRIST),
     urdf: str = URDF,
     episode_index: int = 0,
     success: bool | None = True,
 ) -> Episode:
     """An episode: frames 20 to 45 ms apart; the camera `wrist` sends every second frame a picture, held by two."""
     random = np.random.default_rng(episode_index)
-    info = CollectedInfo(
+    info = EpisodeInfo(
         episode_index=episode_index,
         instruction="stack the cups",
         robot="two_joints",
@@ -94,7 +94,7 @@ def make_collected(
             if pictures[camera.name]:  # the wrist has none at the first frame
                 held[camera.name] = len(pictures[camera.name]) - 1
         frames.append(
-            CollectedFrame(
+            SampledFrame(
                 time_ns=time_ns,
                 samples={
                     STATE.name: Sample(
@@ -106,11 +106,11 @@ def make_collected(
                 pictures=held,
             )
         )
-    outcome = CollectedOutcome(success=success, num_frames=num_frames, drops={"wrist": 2})
+    outcome = ExternalOutcome(success=success, num_frames=num_frames, drops={"wrist": 2})
     return Episode(info=info, frames=frames, pictures=pictures, outcome=outcome)
 
 
-def _picture(camera: CollectedCamera, index: int) -> NDArray[np.uint8]:
+def _picture(camera: Camera, index: int) -> NDArray[np.uint8]:
     """A ramp whose brightness tells the frame."""
     pixels = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     pixels[..., 0] = np.linspace(0, 200, camera.width).astype(np.uint8)
@@ -119,7 +119,7 @@ def _picture(camera: CollectedCamera, index: int) -> NDArray[np.uint8]:
     return pixels
 
 
-def write_pictures_and_frames(writer: CollectedWriter, episode: Episode) -> None:
+def write_pictures_and_frames(writer: EpisodeWriter, episode: Episode) -> None:
     """Everything but the end."""
     given = dict.fromkeys(episode.pictures, 0)
     for frame in episode.frames:
@@ -131,10 +131,10 @@ def write_pictures_and_frames(writer: CollectedWriter, episode: Episode) -> None
         writer.write(frame)
 
 
-def write_collected(path: Path, episode: Episode | None = None, *, video: VideoConfig | None = None) -> Path:
+def write_external(path: Path, episode: Episode | None = None, *, video: VideoConfig | None = None) -> Path:
     """A recording of a collected episode."""
-    episode = episode or make_collected()
-    with CollectedWriter(path, episode.info, video=video) as writer:
+    episode = episode or make_external()
+    with EpisodeWriter(path, episode.info, video=video) as writer:
         write_pictures_and_frames(writer, episode)
         writer.finish(episode.outcome)
     return path
