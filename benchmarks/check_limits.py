@@ -94,7 +94,7 @@ def record(config: GenerateConfig, index: int, path: Path) -> bool:
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
         writer.finish(session.outcome)
-    return session.outcome.success
+    return bool(session.outcome.success)
 
 
 def written(table: LimitTable) -> str:

@@ -96,8 +96,8 @@ def run_episode(config: GenerateConfig, index: int, against: str = "") -> Row:
     grasps, slip = lifted(episode, frames)
     row = replace(
         row,
-        success=session.outcome.success,
-        first_try=session.outcome.success and session.outcome.num_retries == 0,
+        success=bool(session.outcome.success),
+        first_try=bool(session.outcome.success) and session.outcome.num_retries == 0,
         grasps=grasps,
         depth=depth,
         deepest=deepest,

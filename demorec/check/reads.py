@@ -22,7 +22,7 @@ from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.episode.scene import Body, RobotPlacement, Scene, SceneCamera, Shape
 from demorec.mcap import channels
 from demorec.mcap.external.streams import SUBTASK
-from demorec.mcap.metadata import COLLECTED, EPISODE, OUTCOME, RECOVERED, CameraStreams
+from demorec.mcap.metadata import EPISODE, EXTERNAL, OUTCOME, RECOVERED, CameraStreams
 from demorec.mcap.streams import frame_streams
 from demorec.mcap.transforms import FrameTree
 from demorec.runs.run_file import IMPORT_NAME, RunFile
@@ -96,7 +96,7 @@ def everything() -> Iterator[tuple[SourceKind, str]]:
     for name, kind in (("info", SimulatedInfo), ("cameras", CameraStreams), ("outcome", Outcome), ("run", RunFile)):
         for field in _leaves(kind, name):
             yield "field", field
-    yield "field", f"metadata {COLLECTED}"
+    yield "field", f"metadata {EXTERNAL}"
     yield "field", IMPORT_NAME
     for topic in ("/frames", "/{feature}", SUBTASK):
         yield "topic", topic

@@ -12,7 +12,6 @@ from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.exported import exported
 from demorec.datasets.options import CommonOptions, parse_episodes
 from demorec.episode.episode import POLICY_PHASE, Outcome, interventions
-from demorec.episode.external import ExternalOutcome
 from demorec.mcap import AnyRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
@@ -158,7 +157,7 @@ class Intake:
         if profile.is_silent:
             self.silent.append(path.name)
 
-    def leave_out(self, outcome: Outcome | ExternalOutcome | None) -> None:
+    def leave_out(self, outcome: Outcome | None) -> None:
         """Note a failed attempt, or one of unknown outcome, that only counts for the success rate."""
         if outcome is None:
             self.skipped_unknown += 1

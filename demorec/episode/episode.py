@@ -210,22 +210,26 @@ class Outcome:
     """How an episode ended.
 
     Attributes:
-        success: Whether every check passed.
+        success: Whether it succeeded, for a simulated one whether every check passed; None when nobody said.
         checks: The task's conditions, with the values found.
-        failure_phase: Phase in which it went wrong, "" on success.
-        failure_reason: Name of the first failed check or of what made the expert give up, "" on success.
+        failure_phase: Phase in which it went wrong, "" on success and where it is not known.
+        failure_reason: Name of the first failed check, what made the expert give up, or why in somebody's words; "" on
+            success and when nobody said.
         num_frames: Length.
         num_retries: How often the expert tried again within the episode.
-        final_state_digest: SHA-256 (hex) over positions and velocities of all joints and movable bodies at the end.
+        final_state_digest: SHA-256 (hex) over positions and velocities of all joints and movable bodies at the end, ""
+            where nobody knows them.
+        drops: "frames", or a camera's name -> how many of them could not be taken; what is not named lost none.
     """
 
-    success: bool
-    checks: tuple[SuccessCheck, ...]
+    success: bool | None = None
+    checks: tuple[SuccessCheck, ...] = ()
     failure_phase: str = ""
     failure_reason: str = ""
     num_frames: int
     num_retries: int = 0
     final_state_digest: str = ""
+    drops: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

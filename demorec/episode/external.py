@@ -182,33 +182,6 @@ class SampledFrame:
     subtask: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExternalOutcome:
-    """How a collected episode ended.
-
-    Attributes:
-        success: None when nobody said.
-        num_frames: Length.
-        drops: "frames", or a camera's name -> how many of them could not be taken; what is not named lost none.
-        reason: Why it is no success, in words, "" when nobody said.
-    """
-
-    success: bool | None = None
-    num_frames: int
-    drops: Mapping[str, int] = field(default_factory=dict)
-    reason: str = ""
-
-    @property
-    def failure_phase(self) -> str:
-        """Nobody states any."""
-        return ""
-
-    @property
-    def failure_reason(self) -> str:
-        """Why it is no success, in words, "" when nobody said."""
-        return self.reason
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Columns:
     """All numbers of a collected episode, one row a frame (T rows); the pictures are read on their own.

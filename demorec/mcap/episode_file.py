@@ -8,12 +8,13 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import ClassVar
 
 from demorec.core.closing import Closing
 from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json, to_plain
 from demorec.episode.episode import Outcome, SimulatedInfo
-from demorec.episode.external import EpisodeInfo, ExternalOutcome
+from demorec.episode.external import EpisodeInfo
 from demorec.mcap import messages, metadata
 from demorec.mcap.channels import camera_topic
 from demorec.mcap.chunks import Block
@@ -22,7 +23,7 @@ from demorec.mcap.pixels import PixelCounter, PixelStatistics
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode
 
 
-class EpisodeFile[O: (Outcome, ExternalOutcome), C](Closing):
+class EpisodeFile[C](Closing):
     """Context manager over the file of one episode.
 
     Attributes:
@@ -34,9 +35,11 @@ class EpisodeFile[O: (Outcome, ExternalOutcome), C](Closing):
     """
 
     info: SimulatedInfo | EpisodeInfo
-    outcome: O | None
+    outcome: Outcome | None
     num_frames: int
     is_recovered: bool
+    _record: ClassVar[str]
+    """Name of the metadata record that makes the file a recording."""
     _cameras: Mapping[str, C]
     """What is known of each camera."""
 
@@ -57,10 +60,10 @@ class EpisodeFile[O: (Outcome, ExternalOutcome), C](Closing):
     def _read_metadata(self) -> None:
         """Read what is known without reading messages."""
 
-    def _read_end(self, topic: str, kind: type[O]) -> None:
+    def _read_end(self, topic: str) -> None:
         """Read how it ended; RecordingError unless its end is that of as many frames as `topic` has messages."""
         outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
-        self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome, kind)
+        self.outcome = None if outcome is None else metadata.read_outcome_metadata(self._record, outcome)
         self.num_frames = self._container.counts.get(topic, 0)
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
@@ -85,7 +88,11 @@ class EpisodeFile[O: (Outcome, ExternalOutcome), C](Closing):
         described = to_plain(self.info)
         del described["versions"], described["format_version"]
         result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        result.update(
+            b"no outcome"
+            if self.outcome is None
+            else to_json(metadata.plain_outcome(self._record, self.outcome)).encode()
+        )
         return result
 
     @property

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 from demorec.core.closing import Closing
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Outcome
-from demorec.episode.external import ExternalOutcome, Origin
+from demorec.episode.external import Origin
 from demorec.mcap.metadata import OUTCOME, outcome_metadata
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.pictures import PictureCoder
@@ -35,7 +36,7 @@ class WriteStats:
     video_bytes: Mapping[str, int]
 
 
-class FileWriter[O: (Outcome, ExternalOutcome), C: PictureCoder](Closing):
+class FileWriter[C: PictureCoder](Closing):
     """Writes one episode; leaving its block without `finish` leaves NAME.mcap.part for `recover`.
 
     Args:
@@ -47,6 +48,8 @@ class FileWriter[O: (Outcome, ExternalOutcome), C: PictureCoder](Closing):
         num_frames: So far.
     """
 
+    _record: ClassVar[str]
+    """Name of the metadata record that makes the file a recording."""
     _cameras: Mapping[str, C]
 
     def __init__(self, path: Path, *, origin: str | Origin, overwrite: bool) -> None:
@@ -57,7 +60,7 @@ class FileWriter[O: (Outcome, ExternalOutcome), C: PictureCoder](Closing):
         """End it and leave NAME.mcap.part as it is; harmless when called twice, and after `finish`."""
         self._file.close()
 
-    def finish(self, outcome: O) -> WriteStats:
+    def finish(self, outcome: Outcome) -> WriteStats:
         """Write the rest, make the file durable and give it its name.
 
         Raises:
@@ -72,7 +75,7 @@ class FileWriter[O: (Outcome, ExternalOutcome), C: PictureCoder](Closing):
         for camera in self._cameras.values():
             if (statistics := camera.statistics()) is not None:
                 self._file.log(*statistics, camera.last_ns)
-        self._file.metadata(OUTCOME, outcome_metadata(outcome))
+        self._file.metadata(OUTCOME, outcome_metadata(self._record, outcome))
         self._file.publish()
         return WriteStats(
             path=self._file.path,

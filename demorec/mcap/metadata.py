@@ -9,20 +9,30 @@ import json
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from demorec.core.errors import RecordingError, in_words
-from demorec.core.plain import to_json
+from demorec.core.plain import from_plain, to_json, to_plain
 from demorec.episode.episode import FORMAT_VERSION, Outcome, SimulatedInfo
-from demorec.episode.external import ExternalOutcome
 from demorec.episode.validity import from_description, read_episode_info
 from demorec.mcap.video import VideoSettings
 
 EPISODE = "demorec.episode"
-COLLECTED = "demorec.collected"
-"""In place of EPISODE in the recordings of `demorec.mcap.external`."""
+EXTERNAL = "demorec.collected"
+"""In place of EPISODE in recordings of episodes that demorec did not simulate."""
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
 """Of a recording that a crash cut off."""
+_OUTCOME_KEYS: Mapping[str, Mapping[str, str]] = {
+    EPISODE: {
+        name: name
+        for name in (
+            "success", "checks", "failure_phase", "failure_reason", "num_frames", "num_retries", "final_state_digest"
+        )
+    },
+    EXTERNAL: {"success": "success", "num_frames": "num_frames", "drops": "drops", "reason": "failure_reason"},
+}  # fmt: skip
+"""Record at the start -> key in that at the end -> field of `Outcome`."""
 _CHECKSUM = "crc32"
 _KNOWN_VERSIONS = tuple(str(version) for version in range(1, FORMAT_VERSION + 1))
 
@@ -57,10 +67,16 @@ def episode_metadata(info: SimulatedInfo, cameras: Mapping[str, CameraStreams]) 
     )
 
 
-def outcome_metadata(outcome: Outcome | ExternalOutcome) -> dict[str, str]:
-    """The record that ends a complete recording."""
+def plain_outcome(record: str, outcome: Outcome) -> dict[str, Any]:
+    """An outcome as recordings with this record (EPISODE or EXTERNAL) have it, as plain data."""
+    plain = to_plain(outcome)
+    return {key: plain[name] for key, name in _OUTCOME_KEYS[record].items()}
+
+
+def outcome_metadata(record: str, outcome: Outcome) -> dict[str, str]:
+    """The record that ends a complete recording, of one that has this record at its start."""
     success = "unknown" if outcome.success is None else str(outcome.success).lower()
-    return sealed({"success": success, "outcome": to_json(outcome)})
+    return sealed({"success": success, "outcome": to_json(plain_outcome(record, outcome))})
 
 
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[SimulatedInfo, dict[str, CameraStreams]]:
@@ -97,15 +113,19 @@ def _check_cameras(info: SimulatedInfo, cameras: Mapping[str, CameraStreams]) ->
             raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
 
 
-def read_outcome_metadata[O: Outcome | ExternalOutcome](metadata: Mapping[str, str], kind: type[O]) -> O:
-    """Inverse of `outcome_metadata`, of such an outcome; RecordingError on damage."""
+def read_outcome_metadata(record: str, metadata: Mapping[str, str]) -> Outcome:
+    """Inverse of `outcome_metadata`; RecordingError on damage."""
     check_seal(OUTCOME, metadata)
+    names = _OUTCOME_KEYS[record]
     try:
-        outcome = from_description(metadata["outcome"], kind)
-        is_ours = isinstance(outcome, Outcome)
-        counts = [outcome.num_retries] if isinstance(outcome, Outcome) else outcome.drops.values()
-        if min(outcome.num_frames, *counts, 0) < 0:
-            raise ValueError(f"a number of frames or {'retries' if is_ours else 'drops'} below 0")
+        plain = from_description(metadata["outcome"], dict[str, Any])
+        if unknown := plain.keys() - names.keys():
+            raise ValueError(f"unknown fields {', '.join(sorted(unknown)[:5])[:80]}")
+        outcome = from_plain({names[key]: value for key, value in plain.items()}, Outcome)
+        if record == EPISODE and outcome.success is None:
+            raise ValueError("it does not say whether the episode succeeded")
+        if min(outcome.num_frames, outcome.num_retries, *outcome.drops.values(), 0) < 0:
+            raise ValueError("a number of frames, retries or drops below 0")
     except (KeyError, ValueError) as error:
         raise RecordingError(f"The recording's outcome cannot be read ({in_words(error)})") from error
     return outcome

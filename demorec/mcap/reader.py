@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json
-from demorec.episode.episode import Event, JointSample, Outcome, SimulatedColumns, SimulatedInfo, frame_time_ns
+from demorec.episode.episode import Event, JointSample, SimulatedColumns, SimulatedInfo, frame_time_ns
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
@@ -28,7 +28,7 @@ class NotSimulatedError(RecordingError):
     """The recording is one of a collected episode, which `Recording` reads."""
 
 
-class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
+class RecordingReader(EpisodeFile[metadata.CameraStreams]):
     """What one file holds: numbers as columns, pictures as packets or decoded, labels; a context manager.
 
     Attributes:
@@ -41,6 +41,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
     """
 
+    _record = metadata.EPISODE
     info: SimulatedInfo
     _said: tuple[tuple[int, bytes], ...] | None = None
     """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
@@ -49,7 +50,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
 
     def _read_metadata(self) -> None:
         found = self._container.metadata(metadata.EPISODE)
-        if found is None and metadata.COLLECTED in self._container.metadata_names:
+        if found is None and metadata.EXTERNAL in self._container.metadata_names:
             raise NotSimulatedError(
                 "This needs an episode that demorec simulated; this one was collected from another robot or program "
                 f"and has no scene: {self.path}"
@@ -58,7 +59,7 @@ class RecordingReader(EpisodeFile[Outcome, metadata.CameraStreams]):
             raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
         try:
             self.info, self._cameras = metadata.read_episode_metadata(found)
-            self._read_end(channels.GRIPPER, Outcome)
+            self._read_end(channels.GRIPPER)
             if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
                 raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
         except RecordingError as error:

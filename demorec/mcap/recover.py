@@ -16,8 +16,8 @@ from mcap.records import Metadata
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.core.files import make_folder
-from demorec.episode.episode import Outcome, frame_time_ns
-from demorec.episode.external import ExternalOutcome, Origin
+from demorec.episode.episode import frame_time_ns
+from demorec.episode.external import Origin
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import SalvagedMessage, salvage
 from demorec.mcap.external.metadata import read_external_metadata
@@ -123,7 +123,7 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
         if isinstance(item, Metadata) and item.name == metadata.EPISODE:
             info, _ = metadata.read_episode_metadata(item.metadata)
             return bool(origin) and info.origin == origin
-        if isinstance(item, Metadata) and item.name == metadata.COLLECTED:
+        if isinstance(item, Metadata) and item.name == metadata.EXTERNAL:
             collected, _, _ = read_external_metadata(item.metadata)
             return collected.origin.kind == "import" and collected.origin == origin
         if isinstance(item, str):
@@ -140,13 +140,11 @@ class _Frames(NamedTuple):
         num_frames: That all streams have in common.
         keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
         reader: Of such recordings.
-        outcome: Of such episodes.
     """
 
     num_frames: int
     keeps: Callable[[SalvagedMessage, int], bool]
     reader: type[SimulatedRecording] | type[Recording]
-    outcome: type[Outcome] | type[ExternalOutcome]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,12 +185,12 @@ def _survey(source: Path) -> _Survey:
             found[item.name] = item.metadata
         elif item is not None:
             counts[item.topic] += 1
-    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.COLLECTED, _frames_of_external)):
+    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.EXTERNAL, _frames_of_external)):
         if name not in found:
             continue
         frames, outcome, reason = look(found[name], counts), found.get(metadata.OUTCOME), reason or "the end is missing"
         if outcome is not None:
-            ended = metadata.read_outcome_metadata(outcome, frames.outcome)
+            ended = metadata.read_outcome_metadata(name, outcome)
             outcome = outcome if ended.num_frames == frames.num_frames else None
         if frames.num_frames:
             return _Survey(episode=(name, found[name]), outcome=outcome, frames=frames, reason=reason)
@@ -207,7 +205,7 @@ def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
     num_frames = min(counts[topic] for topic in topics)
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, SimulatedRecording, Outcome)
+    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, SimulatedRecording)
 
 
 def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
@@ -219,4 +217,4 @@ def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frame
     def keeps(message: SalvagedMessage, count: int) -> bool:
         return message.topic not in topics | {channels.TF} or count <= num_frames
 
-    return _Frames(num_frames, keeps, Recording, ExternalOutcome)
+    return _Frames(num_frames, keeps, Recording)

@@ -15,7 +15,7 @@ import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import Event, Frame, JointSample, Outcome, SimulatedInfo, frame_time_ns
+from demorec.episode.episode import Event, Frame, JointSample, SimulatedInfo, frame_time_ns
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.cdr import encode
 from demorec.mcap.file_writer import FileWriter
@@ -41,7 +41,7 @@ class _Pending(NamedTuple):
     changes: list[tuple[str, str, bytes]]
 
 
-class SimulatedWriter(FileWriter[Outcome, CameraRecorder]):
+class SimulatedWriter(FileWriter[CameraRecorder]):
     """Context manager that writes one episode; leaving it without `finish` leaves NAME.mcap.part for `recover`.
 
     Depth and segmentation are recorded when the first frame has them.
@@ -57,6 +57,8 @@ class SimulatedWriter(FileWriter[Outcome, CameraRecorder]):
             replay or rendering of the same recording left is replaced.
         RecordingError: It cannot be written, or the robot's joints are not those of its URDF.
     """
+
+    _record = metadata.EPISODE
 
     def __init__(
         self, path: Path, info: SimulatedInfo, *, video: VideoConfig | None = None, overwrite: bool = False

@@ -308,7 +308,7 @@ def external_line(file: Path) -> ExternalEpisode:
             num_frames=recording.num_frames,
             num_bytes=file.stat().st_size,
             drops={} if outcome is None else outcome.drops,
-            reason="cut off by a crash" if outcome is None else outcome.reason,
+            reason="cut off by a crash" if outcome is None else outcome.failure_reason,
         )
 
 

@@ -41,7 +41,7 @@ def inspect_recording(path: Path) -> Inspected:
             episode_index=info.episode_index,
             attempt=info.attempt,
             seed=info.root_seed,
-            success=outcome.success,
+            success=bool(outcome.success),
             file=path.name,
             sha256=sha256_of(path),
             digest=recording.digest(),

@@ -14,7 +14,8 @@ from typing import Any, Self, cast
 import numpy as np
 
 from demorec.core.config import VideoConfig
-from demorec.episode.external import DEPTH_UNITS, EpisodeInfo, ExternalOutcome, Kept, Sample, SampledFrame
+from demorec.episode.episode import Outcome
+from demorec.episode.external import DEPTH_UNITS, EpisodeInfo, Kept, Sample, SampledFrame
 from demorec.mcap import EpisodeWriter
 from demorec.sources.channel import BagError
 from demorec.sources.clock import Int, Timeline
@@ -211,5 +212,5 @@ class ImportedEpisodeWriter:
         if self._next_row < len(self._rows.times_ns):
             missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
             raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
-        self._writer.finish(ExternalOutcome(success=self._rows.window.success, num_frames=self._next_row))
+        self._writer.finish(Outcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True

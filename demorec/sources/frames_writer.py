@@ -9,8 +9,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.episode.episode import frame_time_ns
-from demorec.episode.external import EpisodeInfo, ExternalOutcome, Sample, SampledFrame, Vector
+from demorec.episode.episode import Outcome, frame_time_ns
+from demorec.episode.external import EpisodeInfo, Sample, SampledFrame, Vector
 from demorec.mcap import EpisodeWriter
 from demorec.runs.external import ExternalFolder
 
@@ -80,7 +80,7 @@ def write_frames(
             subtask = (subtasks or {}).get(count, "")
             writer.write(SampledFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
             count += 1
-        writer.finish(ExternalOutcome(success=success, num_frames=count))
+        writer.finish(Outcome(success=success, num_frames=count))
     except BaseException:
         writer.discard()
         raise

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.episode.episode import Event, Outcome, SimulatedInfo
-from demorec.episode.external import EpisodeInfo, ExternalOutcome
+from demorec.episode.external import EpisodeInfo
 
 Distances = NDArray[np.uint16] | NDArray[np.float32]
 """(H, W) millimetres or metres."""
@@ -92,7 +92,7 @@ class PlayedExternal(_Shown):
     """
 
     info: EpisodeInfo
-    outcome: ExternalOutcome | None
+    outcome: Outcome | None
     joint_position: Mapping[str, NDArray[np.float64]]
 
     @property
@@ -100,7 +100,7 @@ class PlayedExternal(_Shown):
         """The outcome in a word or two."""
         if self.outcome is None or self.outcome.success is None:
             return "outcome unknown"
-        return "success" if self.outcome.success else f"failure: {self.outcome.reason or 'no reason given'}"
+        return "success" if self.outcome.success else f"failure: {self.outcome.failure_reason or 'no reason given'}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

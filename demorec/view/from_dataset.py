@@ -20,7 +20,7 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SimulatedInfo, SuccessCheck
-from demorec.episode.external import Camera, EpisodeInfo, ExternalOutcome, Feature, Origin
+from demorec.episode.external import Camera, EpisodeInfo, Feature, Origin
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE_KINDS, state_names
 from demorec.episode.validity import read_episode_info
 from demorec.mcap.external.transforms import JointPositions
@@ -150,13 +150,13 @@ def _camera(described: DatasetInfo, name: str) -> Camera:
     return Camera(name=name, width=width, height=height)
 
 
-def _external_outcome(row: Mapping[str, Any], data: Mapping[str, Array], num_frames: int) -> ExternalOutcome:
+def _external_outcome(row: Mapping[str, Any], data: Mapping[str, Array], num_frames: int) -> Outcome:
     """As the sidecar has it, or else as the last row says."""
     if row:
-        return ExternalOutcome(success=row["success"], num_frames=num_frames, reason=row["failure_reason"])
+        return Outcome(success=row["success"], num_frames=num_frames, failure_reason=row["failure_reason"])
     ends = data.get("next.success")
     success = None if ends is None or not num_frames else bool(ends[-1, 0])
-    return ExternalOutcome(success=success, num_frames=num_frames)
+    return Outcome(success=success, num_frames=num_frames)
 
 
 def _tcp_poses(info: SimulatedInfo, state: Array, robot: DatasetRobot | None) -> Array:

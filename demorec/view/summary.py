@@ -49,7 +49,7 @@ def properties(episode: PlayedEpisode | PlayedExternal) -> dict[str, str | int |
         "source": episode.source,
     }
     if outcome is not None:
-        values["success"] = outcome.success
+        values["success"] = bool(outcome.success)
         values["retries"] = outcome.num_retries
     if info.config_digest:
         values["config_digest"] = info.config_digest

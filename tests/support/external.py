@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
+from demorec.episode.episode import Outcome
 from demorec.episode.external import (
     Camera,
     EpisodeInfo,
-    ExternalOutcome,
     Feature,
     Sample,
     SampledFrame,
@@ -58,7 +58,7 @@ class Episode:
     info: EpisodeInfo
     frames: list[SampledFrame]
     pictures: dict[str, list[tuple[int, NDArray[np.uint8]]]]
-    outcome: ExternalOutcome
+    outcome: Outcome
 
 
 def make_external(
@@ -106,7 +106,7 @@ def make_external(
                 pictures=held,
             )
         )
-    outcome = ExternalOutcome(success=success, num_frames=num_frames, drops={"wrist": 2})
+    outcome = Outcome(success=success, num_frames=num_frames, drops={"wrist": 2})
     return Episode(info=info, frames=frames, pictures=pictures, outcome=outcome)
 
 

@@ -24,11 +24,11 @@ from support.external import (
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.episode.episode import Outcome
 from demorec.episode.external import (
     NO_PICTURE,
     Camera,
     EpisodeInfo,
-    ExternalOutcome,
     Origin,
     Sample,
     SampledFrame,
@@ -300,4 +300,4 @@ def test_an_outcome_of_another_length_is_refused(tmp_path: Path) -> None:
     with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         write_pictures_and_frames(writer, episode)
         with pytest.raises(RecordingError, match="The outcome has 4 frames, the recording 3"):
-            writer.finish(ExternalOutcome(num_frames=4))
+            writer.finish(Outcome(num_frames=4))

@@ -16,7 +16,6 @@ from demorec.datasets.lerobot.prepare import PreparedEpisode, dataset_features, 
 from demorec.datasets.options import ProgressCallback
 from demorec.datasets.sources import ExportSource, Profile, goes_in, is_wanted
 from demorec.episode.episode import Outcome
-from demorec.episode.external import ExternalOutcome
 from demorec.mcap import open_recording
 
 _BYTES_THAT_PAY = 1 << 30
@@ -43,7 +42,7 @@ class Reading:
 
     path: Path
     attempt: AttemptRecord
-    outcome: Outcome | ExternalOutcome | None
+    outcome: Outcome | None
     prepared: PreparedEpisode | None = None
     profile: Profile = field(default_factory=Profile)
     features: dict[str, DatasetFeature] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from demorec.core.plain import to_json
 from demorec.episode.external import COLLECTED_VERSION, EpisodeInfo
 from demorec.episode.validity import from_description
 from demorec.mcap.external.validity import what_is_wrong
-from demorec.mcap.metadata import COLLECTED, check_seal, sealed
+from demorec.mcap.metadata import EXTERNAL, check_seal, sealed
 from demorec.mcap.video import VideoSettings
 
 _MOST_TOLD = 5
@@ -46,7 +46,7 @@ def read_external_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, di
     Raises:
         RecordingError: It is damaged, or of an unknown format version.
     """
-    check_seal(COLLECTED, metadata)
+    check_seal(EXTERNAL, metadata)
     version = metadata.get("format_version", "")
     if version not in map(str, range(1, COLLECTED_VERSION + 1)):
         raise RecordingError(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
-from demorec.episode.external import DEPTH_UNITS, NO_PICTURE, Columns, EpisodeInfo, ExternalOutcome
+from demorec.episode.external import DEPTH_UNITS, NO_PICTURE, Columns, EpisodeInfo
 from demorec.mcap import messages
 from demorec.mcap.channels import description_topic, video_topic
 from demorec.mcap.chunks import Block
@@ -22,7 +22,7 @@ from demorec.mcap.episode_file import EpisodeFile
 from demorec.mcap.external import metadata
 from demorec.mcap.external.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.mcap.external.validity import what_is_wrong
-from demorec.mcap.metadata import COLLECTED
+from demorec.mcap.metadata import EXTERNAL
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 
 _READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
@@ -56,7 +56,7 @@ class _Table:
         return np.concatenate([np.empty(0, np.int64), *self._times]), np.concatenate(self._values)
 
 
-class Recording(EpisodeFile[ExternalOutcome, VideoSettings]):
+class Recording(EpisodeFile[VideoSettings]):
     """What one file holds of a collected episode; a context manager.
 
     Attributes:
@@ -70,15 +70,16 @@ class Recording(EpisodeFile[ExternalOutcome, VideoSettings]):
             all methods.
     """
 
+    _record = EXTERNAL
     info: EpisodeInfo
 
     def _read_metadata(self) -> None:
-        found = self._container.metadata(COLLECTED)
+        found = self._container.metadata(EXTERNAL)
         if found is None:
             raise RecordingError(f"The file holds no collected episode: {self.path}")
         try:
             info, self._cameras, urdf_sha256 = metadata.read_external_metadata(found)
-            self._read_end(FRAMES, ExternalOutcome)
+            self._read_end(FRAMES)
             self.info = self._with_urdf(info, urdf_sha256)
         except RecordingError as error:
             text = str(error).removesuffix(f": {self.path}")

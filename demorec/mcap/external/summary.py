@@ -82,7 +82,7 @@ def summarize_external(path: Path) -> ExternalSummary:
             robot=info.robot,
             has_urdf=bool(info.urdf),
             is_recovered=recording.is_recovered,
-            reason="" if outcome is None else outcome.reason,
+            reason="" if outcome is None else outcome.failure_reason,
             drops={} if outcome is None else outcome.drops,
             seconds=seconds,
             rate=(columns.num_frames - 1) / seconds if seconds else 0.0,

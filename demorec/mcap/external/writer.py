@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.episode.external import NO_PICTURE, Camera, EpisodeInfo, ExternalOutcome, SampledFrame
+from demorec.episode.external import NO_PICTURE, Camera, EpisodeInfo, SampledFrame
 from demorec.mcap import messages
 from demorec.mcap.cdr import encode
 from demorec.mcap.channels import TF, TF_STATIC, camera_topic, description_topic
@@ -25,7 +25,7 @@ from demorec.mcap.external.streams import FRAMES, SUBTASK, feature_streams, fram
 from demorec.mcap.external.transforms import ExternalTree
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.file_writer import FileWriter
-from demorec.mcap.metadata import COLLECTED
+from demorec.mcap.metadata import EXTERNAL
 from demorec.mcap.pictures import PictureCoder
 from demorec.mcap.transforms import camera_frame
 
@@ -65,7 +65,7 @@ class _Pictures(PictureCoder):
         return taken
 
 
-class EpisodeWriter(FileWriter[ExternalOutcome, _Pictures]):
+class EpisodeWriter(FileWriter[_Pictures]):
     """Context manager that writes one collected episode; left without `finish`, NAME.mcap.part stays for `recover`.
 
     Frames must not be changed after they were given.
@@ -82,6 +82,8 @@ class EpisodeWriter(FileWriter[ExternalOutcome, _Pictures]):
             not to be replaced. What a killed import of the same files by the same mapping left is replaced.
         RecordingError: It cannot be written.
     """
+
+    _record = EXTERNAL
 
     def __init__(
         self,
@@ -123,7 +125,7 @@ class EpisodeWriter(FileWriter[ExternalOutcome, _Pictures]):
         """Write what is said once, or leave nothing."""
         try:
             settings = {name: camera.settings for name, camera in self._cameras.items()}
-            self._file.metadata(COLLECTED, metadata.external_metadata(self._info, settings))
+            self._file.metadata(EXTERNAL, metadata.external_metadata(self._info, settings))
             if self._tree is not None:
                 urdf = encode(messages.STRING, self._info.urdf)
                 self._file.log(description_topic(), messages.STRING, urdf, 0, latched=True)

@@ -18,10 +18,10 @@ from demorec.core.closing import Closing
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError, in_words
 from demorec.core.registry import nearest_match
+from demorec.episode.episode import Outcome
 from demorec.episode.external import (
     Camera,
     EpisodeInfo,
-    ExternalOutcome,
     Feature,
     Sample,
     SampledFrame,
@@ -207,7 +207,7 @@ class RecordedEpisode:
         if coder.error is not None:
             coder.writer.close()
             raise _as_recording_error(coder.error)
-        outcome = ExternalOutcome(success=self.success, num_frames=self.num_frames, drops=self.drops, reason=reason)
+        outcome = Outcome(success=self.success, num_frames=self.num_frames, drops=self.drops, failure_reason=reason)
         path = coder.writer.finish(outcome).path
         self._run.add(path)
         return path
