@@ -17,8 +17,8 @@ from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.reader import PacketReader
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
+from demorec.datasets.lerobot.videos import PacketReader
 
 
 @dataset_check(

@@ -20,8 +20,8 @@ from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import SIDECAR_DIR, is_dataset
 from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transcode
-from demorec.datasets.lerobot.reader import PacketReader
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH
+from demorec.datasets.lerobot.videos import PacketReader
 from demorec.mcap import SimulatedRecording
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,3 +117,28 @@ def parse_episodes(text: str) -> Callable[[int], bool]:
     if not parts:
         return lambda index: True
     return lambda index: any(index in part for part in parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exporter[O: CommonOptions]:
+    """A format that recordings are exported to.
+
+    Its module is loaded for `--help`, so what is heavy is imported when `export` is called.
+
+    Attributes:
+        summary: What comes out, in one line.
+        options: Its flags; a dataclass with a docstring below each field.
+        function: "module:name" of (sources, out, options, progress) -> report. It reads recordings and nothing else,
+            takes those that `demorec.datasets.sources` finds, and makes `out` whole or not at all. Raises ConfigError,
+            ExportError and RecordingError.
+    """
+
+    summary: str
+    options: type[O]
+    function: str
+
+    def export(self, sources: Sequence[Path], out: Path, options: O, progress: ProgressCallback | None) -> ExportReport:
+        """Call it."""
+        module, _, name = self.function.partition(":")
+        report: ExportReport = getattr(importlib.import_module(module), name)(sources, out, options, progress)
+        return report

@@ -14,9 +14,8 @@ from support.present import present
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.bitstream import parameter_sets
 from demorec.datasets.lerobot.depth import code_values, depth_video, quantised
-from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
+from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer, parameter_sets
 from demorec.mcap import VideoPacket, VideoSettings
 from demorec.mcap.video import decode, is_keyframe, make_encoder
 

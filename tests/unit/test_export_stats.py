@@ -10,9 +10,15 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from demorec.datasets.lerobot.data_stats import data_statistics
 from demorec.datasets.lerobot.layout import DatasetFeature, data_schema
-from demorec.datasets.lerobot.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
+from demorec.datasets.lerobot.stats import (
+    QUANTILES,
+    PixelHistogram,
+    Statistics,
+    colour_levels,
+    data_statistics,
+    vector_statistics,
+)
 from demorec.datasets.lerobot.writer import merge_statistics
 
 

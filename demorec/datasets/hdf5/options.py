@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from demorec.core.errors import OptionError, check_option
-from demorec.datasets.exporter import Exporter
-from demorec.datasets.options import CommonOptions
+from demorec.datasets.options import CommonOptions, Exporter
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,9 +5,11 @@ Everything in it is read back from the finished dataset, so it is right after an
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +20,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from demorec.core.config import GenerateConfig, parse_config
+from demorec.core.errors import ConfigError
 from demorec.core.text import markdown, printable
-from demorec.datasets.lerobot.attempts import ATTEMPT_SCHEMA
-from demorec.datasets.lerobot.commands import making_commands
 from demorec.datasets.lerobot.files import read_table
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
@@ -28,7 +30,8 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
 from demorec.datasets.lerobot.robots import ROBOTS_DIR
-from demorec.datasets.lerobot.stills import pictures_at
+from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
+from demorec.datasets.lerobot.videos import images_at
 from demorec.datasets.lerobot.writer import write_text
 from demorec.datasets.staging import sync_file
 from demorec.episode.features import (
@@ -329,7 +332,7 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
         label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
         draw.text((4, top + 1), printable(label), fill="black", font=font)
         moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
-        for column, picture in enumerate(pictures_at(root, info, key, place, moments)):
+        for column, picture in enumerate(images_at(root, info, key, place, moments)):
             corner = column * (size[0] + _GAP), top + _LABEL
             sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
             time = f"{moments[column] / info.fps:.1f} s"
@@ -342,3 +345,54 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
     sheet.save(path, quality=85)
     sync_file(path)
     return True
+
+
+_NOT_TOLD = ("append", "overwrite", "verify", "workers", "push_to_hub", "public")
+"""Options of an export that leave the dataset's content alone."""
+
+
+def making_commands(root: Path, configs: Mapping[str, Any], options: ExportOptions) -> list[str]:
+    """The two commands that generate the run and export it; none where that is not all of the dataset's story.
+
+    That is so when it was made from several runs or by several exports, from replayed or rendered episodes, or by
+    another version of demorec whose configuration this one does not understand.
+
+    Args:
+        root: The finished dataset.
+        configs: Config digest -> configuration of the runs.
+        options: Of the export.
+    """
+    files = sorted((root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+    rows = [row for file in files for row in read_table(file, ["run_episode_index", "origin"]).to_pylist()]
+    if options.append or len(configs) != 1 or any(row["origin"] for row in rows):
+        return []
+    try:
+        config = parse_config(next(iter(configs.values())), GenerateConfig, source="the configuration")
+        config.check_names(config.modules)
+    except ConfigError:
+        return []
+    num_episodes = 1 + max(row["run_episode_index"] for row in rows)
+    generating = [f"--num-episodes {num_episodes}", *flags(config, GenerateConfig()), "--no-export --out run"]
+    exporting = [f"--repo-id {shlex.quote(options.repo_id)}", *flags(options, ExportOptions(repo_id=options.repo_id))]
+    return [
+        f"generate-dataset {' '.join(generating)}",
+        f"demorec export lerobot run --out dataset {' '.join(exporting)}",
+    ]
+
+
+def flags(values: Any, defaults: Any) -> Iterator[str]:
+    """The flags that turn one dataclass into another of its kind: `--seed 7`, `--no-antialias`, `--cameras front`."""
+    for field in dataclasses.fields(values):
+        value, default = getattr(values, field.name), getattr(defaults, field.name)
+        name = field.name.replace("_", "-")
+        if field.name in _NOT_TOLD or value == default:
+            continue
+        if dataclasses.is_dataclass(value):
+            yield from flags(value, default)
+        elif isinstance(value, bool):
+            yield f"--{name}" if value else f"--no-{name}"
+        elif isinstance(value, tuple):
+            words = value or (("none",) if default else ())  # --cameras none, but a bare --language names no kinds
+            yield " ".join([f"--{name}", *(shlex.quote(str(word)) for word in words)])
+        else:
+            yield f"--{name} {'auto' if value is None else shlex.quote(str(value))}"

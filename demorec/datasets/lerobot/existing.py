@@ -17,11 +17,13 @@ from demorec.datasets.lerobot.facts import facts_of
 from demorec.datasets.lerobot.files import open_table, read_json, read_table
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
+    CODEBASE_VERSION,
     STATS_PATH,
     TASKS_PATH,
     DatasetFeature,
     DatasetInfo,
     FilePosition,
+    how_to_convert,
 )
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.progress import PROGRESS_PATH, PROPORTIONS_PATH
@@ -68,6 +70,10 @@ def open_existing(root: Path) -> Existing:
         ExportError: No LeRobot dataset of this format, or one that is not whole.
     """
     info = DatasetInfo.load(root)
+    if info.is_old:
+        raise ExportError(
+            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to; {how_to_convert(root)}"
+        )
     tables = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
     episodes = frames = 0
     try:

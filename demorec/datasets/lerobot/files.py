@@ -13,8 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, in_words, resource_error
 from demorec.core.files import open_regular, read_text_limited
@@ -48,6 +50,18 @@ def read_json(path: Path) -> Any:
         ValueError: It is no JSON, or nested very deeply.
     """
     return parse_json(read_text_limited(path, MAX_JSON_BYTES), allow_nan=True)
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The objects of a file with one in each line; ExportError when it cannot be read, or holds anything else."""
+    try:
+        lines = read_text_limited(path, MAX_JSON_BYTES).splitlines()
+        found = [parse_json(line, allow_nan=True) for line in lines if line.strip()]
+        if not all(isinstance(line, dict) for line in found):
+            raise ValueError("a line is no object")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The table cannot be read ({in_words(error)}): {path}") from error
+    return found
 
 
 def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
@@ -121,6 +135,14 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.S
             raise _too_large(path, allowed)
     with _table_errors(path):
         return pa.Table.from_batches(batches, schema=batches[0].schema if batches else found)
+
+
+def column_numbers(column: pa.Array) -> NDArray[Any]:
+    """(T, D) numbers of a data column, D = 1 for a scalar one."""
+    if pa.types.is_fixed_size_list(column.type) or pa.types.is_list(column.type):
+        flat = column.flatten().to_numpy(zero_copy_only=False)
+        return np.asarray(flat).reshape(len(column), -1)
+    return np.asarray(column.to_numpy(zero_copy_only=False)).reshape(-1, 1)
 
 
 @contextmanager

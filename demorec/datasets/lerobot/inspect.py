@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.core.errors import ExportError, in_words, resource_error, without_path
-from demorec.datasets.lerobot.digest import combined_digest, episode_digest
 from demorec.datasets.lerobot.files import check_video, open_table, read_json, read_table
-from demorec.datasets.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo
+from demorec.datasets.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.reader import PacketReader, RowReader, episode_places, read_tasks
+from demorec.datasets.lerobot.reader import RowReader, episode_places, read_tasks
+from demorec.datasets.lerobot.videos import PacketReader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,18 +84,18 @@ def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
     """
     problems: list[str] = []
     rows: dict[str, int] = {}
-    for place in ("data", "meta/episodes"):
+    for place in ("data", *(() if info.is_old else ("meta/episodes",))):
         rows[place] = 0
         for file in sorted((path / place).glob("*/*.parquet")):
             with _noted(problems, path):
                 rows[place] += open_table(file).metadata.num_rows
     if not problems:
         for place, said in (("data", info.total_frames), ("meta/episodes", info.total_episodes)):
-            if rows[place] != said:
+            if rows.get(place, said) != said:
                 problems.append(f"The tables in {place} have {rows[place]} rows, {INFO_PATH} counts {said}")
     with _noted(problems, path):
         read_tasks(path)
-    if not (path / STATS_PATH).exists():
+    if not info.is_old and not (path / STATS_PATH).exists():
         problems.append(f"The statistics are missing: {STATS_PATH}")
     with _noted(problems, path):
         check_tables(path)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from demorec.annotate.kinds import STATES
 from demorec.core.errors import ExportError, in_words
-from demorec.datasets.lerobot.files import table_batches
 from demorec.episode.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
@@ -225,33 +224,27 @@ class SpokenEpisode:
     differing: list[int] = field(default_factory=list)
 
 
-def spoken_episodes(root: Path) -> Iterator[SpokenEpisode]:
-    """The language of every episode in order, from the data files of a dataset that has both columns.
+def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> SpokenEpisode:
+    """The language of one episode, from its rows of both columns, in a dataset in the folder `path`.
 
     Raises:
         ExportError: They cannot be read.
     """
-    current: tuple[int, SpokenEpisode, pa.Array] | None = None
-    names = ["episode_index", *COLUMNS]
-    for path in sorted((root / "data").glob("*/*.parquet")):
-        try:
-            for batch in table_batches(path, names):
-                indices, persistent, events = (batch.column(name) for name in names)
-                if not is_language(persistent.type) or not is_language(events.type):
-                    raise ValueError("language columns of another type")
-                for row, index in enumerate(indices.to_pylist()):
-                    state = persistent[row].values
-                    if current is None or current[0] != index:
-                        if current is not None:
-                            yield current[1]
-                        current = index, SpokenEpisode(persistent=persistent[row].as_py() or []), state
-                    _, episode, first = current
-                    if not (first is state or (first is not None and state is not None and state.equals(first))):
-                        episode.differing.append(episode.num_rows)
-                    if told := events[row].as_py():
-                        episode.events[episode.num_rows] = told
-                    episode.num_rows += 1
-        except (OSError, ValueError, pa.ArrowException) as error:
-            raise ExportError(f"The language of the dataset cannot be read ({in_words(error)}): {path}") from error
-    if current is not None:
-        yield current[1]
+    episode, first = SpokenEpisode(persistent=[]), None
+    try:
+        for batch in batches:
+            persistent, events = (batch.column(name) for name in COLUMNS)
+            if not is_language(persistent.type) or not is_language(events.type):
+                raise ValueError("language columns of another type")
+            for row in range(len(batch)):
+                state = persistent[row].values
+                if not episode.num_rows:
+                    episode.persistent, first = persistent[row].as_py() or [], state
+                elif (state is None) != (first is None) or (state is not None and not state.equals(first)):
+                    episode.differing.append(episode.num_rows)
+                if found := events[row].as_py():
+                    episode.events[episode.num_rows] = found
+                episode.num_rows += 1
+    except (ValueError, pa.ArrowException) as error:
+        raise ExportError(f"The language of the dataset cannot be read ({in_words(error)}): {path}") from error
+    return episode

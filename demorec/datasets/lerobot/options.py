@@ -9,8 +9,7 @@ from typing import Literal
 from demorec.annotate.kinds import KINDS, LanguageKind
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, OptionError
-from demorec.datasets.exporter import Exporter
-from demorec.datasets.options import CommonOptions
+from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 
 

@@ -30,8 +30,7 @@ from demorec.datasets.exported import exported
 from demorec.datasets.lerobot.depth import code_values, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.prepare import prepare_episode
-from demorec.datasets.lerobot.transcode import reason_to_transcode
+from demorec.datasets.lerobot.prepare import prepare_episode, reason_to_transcode
 from demorec.mcap import AnyRecording, open_recording
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"

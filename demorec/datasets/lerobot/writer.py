@@ -18,8 +18,6 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.data_stats import data_statistics
-from demorec.datasets.lerobot.digest import episode_digest
 from demorec.datasets.lerobot.facts import fact_type
 from demorec.datasets.lerobot.language import REPEATING, EpisodeLanguage, language_arrays, language_digests
 from demorec.datasets.lerobot.layout import (
@@ -33,12 +31,20 @@ from demorec.datasets.lerobot.layout import (
     DatasetInfo,
     FilePosition,
     data_schema,
+    episode_digest,
     merged_video_info,
 )
 from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, vector_statistics
+from demorec.datasets.lerobot.stats import (
+    NAMES,
+    PixelHistogram,
+    Statistics,
+    data_statistics,
+    merge_statistics,
+    vector_statistics,
+)
 from demorec.datasets.staging import sync_file
 
 _EPISODES_PER_TABLE = 100
@@ -308,28 +314,6 @@ class DatasetWriter:
 
 def _sizes(info: DatasetInfo) -> dict[str, Any]:
     return {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
-
-
-def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """Of several sets of pictures together: exact but for the quantiles, which are averaged as LeRobot does."""
-    if len(parts) == 1:
-        return parts[0]
-    counts = np.array([part.count for part in parts], dtype=np.float64)
-    weights = counts / counts.sum()
-
-    def weighted(name: str) -> NDArray[np.float64]:
-        return np.asarray(sum(w * part.values[name] for w, part in zip(weights, parts, strict=True)))
-
-    mean = weighted("mean")
-    variance = sum(
-        w * (part.values["std"] ** 2 + (part.values["mean"] - mean) ** 2)
-        for w, part in zip(weights, parts, strict=True)
-    )
-    values = {name: weighted(name) for name in NAMES if name.startswith("q")}
-    values["min"] = np.min([part.values["min"] for part in parts], axis=0)
-    values["max"] = np.max([part.values["max"] for part in parts], axis=0)
-    values["mean"], values["std"] = mean, np.sqrt(np.asarray(variance))
-    return Statistics(values=values, count=int(counts.sum()), is_camera=parts[0].is_camera)
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
