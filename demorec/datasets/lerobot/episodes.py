@@ -99,6 +99,7 @@ class LeRobotDataset:
         self._cameras: dict[str, Camera] = {}
         self._videos: dict[tuple[str, int], EpisodeVideo] = {}
         self._stored: dict[str, StoredImages] = {}
+        self._robots: dict[str, DatasetRobot] = {}
 
     def __len__(self) -> int:
         return len(self.places)
@@ -194,6 +195,12 @@ class LeRobotDataset:
             height, width = next(StoredImages(self.root, self.info, key).read(place)).shape[:2]
         return Camera(name=name, width=width, height=height, kept=kept, source=key)
 
+    def robot(self, digest: str) -> DatasetRobot:
+        """The arm that episodes call by this digest; ExportError when it cannot be used."""
+        if digest not in self._robots:
+            self._robots[digest] = read_robot(self.root, digest)
+        return self._robots[digest]
+
     def video(self, key: str, place: EpisodePlace) -> EpisodeVideo:
         """The images of a video feature in an episode."""
         found = self._videos.get((key, place.episode_index))
@@ -269,7 +276,7 @@ class DatasetRecording:
     def robot(self) -> DatasetRobot | None:
         """The arm that the sidecar keeps, or one of ours that has joints of these names; None for neither."""
         if (name := self.known.get("robot_digest")) is not None:
-            return read_robot(self.path, str(name))
+            return self.dataset.robot(str(name))
         state = self.dataset.info.features.get(STATE)
         return recognised_robot(state.names) if state is not None and state.names and not self.known else None
 
