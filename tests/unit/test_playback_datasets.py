@@ -156,16 +156,22 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
             list(episode.videos["front"].packets())
 
 
-def test_an_episode_of_another_length_than_its_rows_is_one_sentence(dataset: Path, tmp_path: Path) -> None:
-    spoilt = tmp_path / "d"
-    shutil.copytree(dataset, spoilt)
-    (path,) = (spoilt / "meta" / "episodes").glob("*/*.parquet")
+@pytest.mark.parametrize(
+    ("lengths", "words"),
+    [
+        ([8, 13], "Episode 1 has 13 frames, its data file ends before"),
+        ([5, 8], "rows of episode 1 are those of others"),
+    ],
+)
+def test_an_episode_of_another_length_than_its_rows_is_one_sentence(
+    lengths: list[int], words: str, tmp_path: Path
+) -> None:
+    export(make_run(tmp_path / "run", (8, 8), cameras=("front",)), tmp_path / "d")
+    (path,) = (tmp_path / "d" / "meta" / "episodes").glob("*/*.parquet")
     table = pq.read_table(path)
-    (length,) = table.column("length").to_pylist()
-    longer = pa.array([length + 5], table.schema.field("length").type)
-    pq.write_table(table.set_column(table.schema.get_field_index("length"), "length", longer), path)
-    told = f"Episode 0 has {length + 5} frames, its data file ends before"
-    with pytest.raises(ExportError, match=told), open_dataset_episode(spoilt, 0):
+    column = pa.array(lengths, table.schema.field("length").type)
+    pq.write_table(table.set_column(table.schema.get_field_index("length"), "length", column), path)
+    with pytest.raises(ExportError, match=words), open_dataset_episode(tmp_path / "d", 1):
         pass
 
 

@@ -42,7 +42,7 @@ from demorec.episode.features import DEPTH_SUFFIX, IMAGE_PREFIX, STATE
 from demorec.mcap.external.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
-_SUCCESS = "next.success"
+_SUCCESS, _EPISODE = "next.success", "episode_index"
 _TIME_TOLERANCE_S = 1e-4
 """By which LeRobot lets a row's time be off the grid."""
 _UNNAMED_ROBOT = "unknown"
@@ -145,7 +145,7 @@ class LeRobotDataset:
     def rows(self) -> RowReader:
         """Of the features, of times, tasks and outcomes."""
         names = [*(feature.name for feature in self.features), "timestamp", "task_index"]
-        names += [_SUCCESS] if _SUCCESS in self.info.features else []
+        names += [name for name in (_SUCCESS, _EPISODE) if name in self.info.features]
         return RowReader(self.root, replace(self.info, features={name: self.info.features[name] for name in names}))
 
     @cached_property
@@ -296,6 +296,10 @@ class DatasetRecording:
     @cached_property
     def _rows(self) -> Mapping[str, NDArray[Any]]:
         rows, info, number = self.dataset.rows.read(self.place), self.dataset.info, self.place.episode_index
+        if _EPISODE in rows and (rows[_EPISODE] != number).any():
+            raise ExportError(
+                f"The rows of episode {number} are those of others, by its place in the table: {self.path}"
+            )
         off = np.abs(rows["timestamp"][:, 0].astype(np.float64) - np.arange(self.num_frames) / int(info.fps))
         if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
             raise ExportError(
