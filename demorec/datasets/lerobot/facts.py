@@ -16,6 +16,7 @@ import pyarrow as pa
 from demorec.datasets.lerobot.files import open_table
 from demorec.datasets.lerobot.progress import STAGE_COLUMNS
 from demorec.episode.episode import SimulatedColumns, SuccessCheck
+from demorec.episode.scene import Scene
 from demorec.mcap import SimulatedRecording
 
 _TYPES: dict[str, pa.DataType] = {
@@ -75,25 +76,21 @@ def episode_facts(recording: SimulatedRecording, columns: SimulatedColumns) -> d
         "run_episode_index": info.episode_index,
         "attempt": info.attempt,
         "num_goals": len(info.scene.goals),
-        **_first_goal(recording),
+        **first_goal(info.scene),
     }
     facts |= {DRAWN + name: value for name, value in sorted(_drawn(recording).items())}
     return facts | {CHECKED + name: value for name, value in _nearest_to_limit(checks).items()}
 
 
-def _first_goal(recording: SimulatedRecording) -> dict[str, Any]:
-    scene = recording.info.scene
-    if not scene.goals:
-        return {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
-    goal = scene.goals[0]
-    here, there = scene.body(goal.object).world_from_body.position, scene.world_from_goal(goal).position
-    return {
-        "object": goal.object,
-        "object_x": float(here[0]),
-        "object_y": float(here[1]),
-        "goal_x": float(there[0]),
-        "goal_y": float(there[1]),
-    }
+def first_goal(scene: Scene | None) -> dict[str, Any]:
+    """The first object to be moved, where it is and where it shall be at the start (m, world frame)."""
+    found: dict[str, Any] = {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
+    if scene is not None and scene.goals:
+        goal = scene.goals[0]
+        here, there = scene.body(goal.object).world_from_body.position, scene.world_from_goal(goal).position
+        found |= {"object": goal.object, "object_x": float(here[0]), "object_y": float(here[1])}
+        found |= {"goal_x": float(there[0]), "goal_y": float(there[1])}
+    return found
 
 
 def _drawn(recording: SimulatedRecording) -> Mapping[str, float]:
