@@ -22,9 +22,6 @@ from support.export import episode_rows, export
 
 from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.episodes import LeRobotDataset
-from demorec.datasets.lerobot.layout import DatasetInfo
-from demorec.datasets.lerobot.reader import episode_places
-from demorec.datasets.lerobot.videos import images_at
 from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
 from demorec.sources.import_run import import_bags
@@ -109,10 +106,10 @@ def test_whole_episodes_between_keyframes(expected: list[Pictures], dataset: Pat
 
 
 def test_single_pictures(expected: list[Pictures], dataset: Path) -> None:
-    info = DatasetInfo.load(dataset)
-    for place, pictures in zip(episode_places(dataset, info), expected, strict=True):
-        frames = [0, 1, GOP, place.length - 1]
-        for frame, found in zip(frames, images_at(dataset, info, KEY, place, frames), strict=True):
+    found_in = LeRobotDataset(dataset)
+    for number, pictures in enumerate(expected):
+        frames = [0, 1, GOP, len(pictures) - 1]
+        for frame, found in zip(frames, found_in.recording(number).images_at("high", frames), strict=True):
             assert np.array_equal(found, pictures[frame])
 
 

@@ -12,7 +12,7 @@ where it is there. Memory is that of an episode's numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -364,12 +364,12 @@ class DatasetRecording:
             return self.dataset.video(key, self.place).images(-self._lead(camera))
         return self.dataset.stored_images(key, self.place)
 
-    def picture(self, camera: str, number: int) -> Rgb:
-        """One decoded image of a camera, (H, W, 3) uint8 RGB, by its own number."""
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
+        """What some frames, in rising order, show of a camera, (H, W, 3) uint8 RGB."""
         key = self.dataset.keys[camera]
         if self.dataset.info.features[key].is_video:
-            return next(self.dataset.video(key, self.place).images(number - self._lead(camera)))
-        return list(self.images(camera))[number]
+            return self.dataset.video(key, self.place).images_at(frames)
+        return (image for frame, image in enumerate(self.images(camera)) if frame in frames)
 
     def distances(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """The images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""

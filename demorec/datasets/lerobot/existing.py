@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, ExportError, in_words
-from demorec.datasets.lerobot.facts import facts_of
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, facts_of
 from demorec.datasets.lerobot.files import open_table, read_json, read_table
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -25,7 +25,6 @@ from demorec.datasets.lerobot.layout import (
     how_to_convert,
 )
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.progress import PROGRESS_PATH, PROPORTIONS_PATH
 from demorec.datasets.lerobot.reader import read_tasks
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import Statistics

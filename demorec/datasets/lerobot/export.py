@@ -21,12 +21,12 @@ from demorec.datasets.exported import exported
 from demorec.datasets.lerobot.boxes import BoxWriter, EpisodeBoxes
 from demorec.datasets.lerobot.card import CardFacts, has_own_card, write_card
 from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
+from demorec.datasets.lerobot.facts import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetFeature, DatasetInfo, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import dataset_features, episode_boxes, prepare_episode, reasons_to_transcode
-from demorec.datasets.lerobot.progress import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
 from demorec.datasets.lerobot.sidecar import EpisodeRecord, SidecarWriter, attempt_row
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData, WriterStart

@@ -18,12 +18,11 @@ from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import EpisodeBoxes
 from demorec.datasets.lerobot.depth import depth_info, depth_video
-from demorec.datasets.lerobot.facts import episode_facts
+from demorec.datasets.lerobot.facts import EpisodeProgress, episode_facts
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, DatasetFeature
 from demorec.datasets.lerobot.mp4 import CodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.progress import EpisodeProgress
 from demorec.datasets.lerobot.stats import PixelHistogram, colour_levels
 from demorec.datasets.lerobot.writer import EpisodeData
 from demorec.episode.features import ACTION, IMAGE_PREFIX
