@@ -131,7 +131,7 @@ def episode_differences(
     try:
         with SimulatedRecording(recording_file) as recording:
             exporting = exported(recording, options)
-            expected = prepare_episode(exporting, options, code_depth=False)
+            expected = prepare_episode(exporting, options, encode_depth=False)
             record = EpisodeRecord.of(exporting)
             # Encoded anew, images have the bytes of the version and machine that encoded them.
             transcoded = {camera.feature for camera, reason in reasons_to_transcode(exporting).items() if reason}

@@ -163,7 +163,9 @@ def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
     step, last = 30, len(frames) - 1
     with SimulatedRecording(path) as recording:
         options = ExportOptions(language=())
-        told = prepare_episode(exported(recording, options), options, code_depth=False, about=[2 * step, last]).language
+        told = prepare_episode(
+            exported(recording, options), options, encode_depth=False, about=[2 * step, last]
+        ).language
     there = {row: events for row, (_, events) in enumerate(frames) if events}
     assert len(there) > 3
     assert {row: list(entries) for row, entries in told.events.items()} == {

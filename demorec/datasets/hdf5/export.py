@@ -21,7 +21,7 @@ from demorec.datasets.hdf5.file import (
     ENV_ARGUMENTS,
     EXTERNAL_ARGUMENTS,
     EXTERNAL_ENVIRONMENT,
-    PICTURE_ARGUMENTS,
+    IMAGE_ARGUMENTS,
     UNFINISHED,
     NewFile,
 )
@@ -44,7 +44,7 @@ from demorec.mcap import open_recording
 def export_hdf5(
     sources: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None = None
 ) -> ExportReport:
-    """Write the recordings into the file `out`: whole, or not at all. One picture is in memory at a time.
+    """Write the recordings into the file `out`: whole, or not at all. One image is in memory at a time.
 
     Args:
         sources: Recordings, runs, or folders of recordings.
@@ -55,7 +55,7 @@ def export_hdf5(
     Raises:
         ConfigError: Impossible options, nothing to export, or a file in the way.
         ExportError: Recordings that differ, a full disk. What was at `out` is still there then.
-        RecordingError: A recording is damaged, or lacks pictures that were asked for.
+        RecordingError: A recording is damaged, or lacks images that were asked for.
     """
     options.validate()
     found = find_recordings(sources, include_failures=options.include_failures)
@@ -178,7 +178,7 @@ class RobomimicWriter:
         for name, camera in zip(images, episode.cameras, strict=True):
             settings = episode.recording.video_settings(camera.name)
             shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
-            _add_pictures(group, name, shape, episode.images(camera), self.options.compression)
+            _add_images(group, name, shape, episode.images(camera), self.options.compression)
 
     def finish(self) -> None:
         """Write what is known of all episodes together: their number of samples, and who is for validation."""
@@ -250,7 +250,7 @@ def _environment(simulated: Simulated, episode: ExportEpisode, arguments: dict[s
         "action": options.action,
         "privileged": options.privileged,
     }
-    assert arguments.keys() - PICTURE_ARGUMENTS == ENV_ARGUMENTS
+    assert arguments.keys() - IMAGE_ARGUMENTS == ENV_ARGUMENTS
     described = {"env_name": environment_name(info.task), "type": _GYM, "env_kwargs": arguments}
     return {"env_args": json.dumps(described), "task": info.task}
 
@@ -276,16 +276,16 @@ def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], comp
     stored.attrs["names"] = json.dumps(components)
 
 
-def _add_pictures(
-    group: h5py.Group, name: str, shape: tuple[int, ...], pictures: Iterable[NDArray[np.generic]], compression: int
+def _add_images(
+    group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
 ) -> None:
-    """A stream of pictures, each a compressed chunk of its own, so that one is read by itself.
+    """A stream of images, each a compressed chunk of its own, so that one is read by itself.
 
     Args:
         group: Where it goes.
         name: Of the dataset.
-        shape: Of all pictures: (T, H, W, 3) of colours, uint8; (T, H, W, 1) of distances, float32.
-        pictures: One after the other.
+        shape: Of all images: (T, H, W, 3) of colours, uint8; (T, H, W, 1) of distances, float32.
+        images: One after the other.
         compression: Level of gzip, 0 for none.
     """
     stored = group.create_dataset(
@@ -296,5 +296,5 @@ def _add_pictures(
         compression="gzip" if compression else None,
         compression_opts=compression or None,
     )
-    for index, picture in enumerate(pictures):
-        stored[index] = picture.reshape(shape[1:])
+    for index, image in enumerate(images):
+        stored[index] = image.reshape(shape[1:])

@@ -110,7 +110,7 @@ def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistic
     if part is None:
         return None
     if any(value.shape != info.features[key].shape[-1:] for value in part.values.values()) or part.count < 0:
-        raise ValueError(f"the statistics of {key} are none of its pictures")
+        raise ValueError(f"the statistics of {key} are none of its images")
     # LeRobot's streaming writer counts pixels; as a weight beside ours a frame must count as one.
     return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
 

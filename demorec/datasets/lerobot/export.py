@@ -363,7 +363,7 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
 def readings(
     sources: Sequence[ExportSource], options: ExportOptions, progress: ProgressCallback | None, *, aside: Path
 ) -> Iterator[Reading]:
-    """Every wanted recording in order; several processes read ahead where that pays, and leave pictures in `aside`."""
+    """Every wanted recording in order; several processes read ahead where that pays, and leave images in `aside`."""
     workers = options.workers or _workers_that_pay(sources, options)
     one = partial(read, options=options) if workers == 1 else partial(_read_aside, options=options, folder=aside)
     for done, reading in enumerate(in_turn(one, sources, workers, ahead=_AHEAD), start=1):
@@ -380,7 +380,7 @@ def _workers_that_pay(sources: Sequence[ExportSource], options: ExportOptions) -
 
 
 def _read_aside(source: ExportSource, options: ExportOptions, folder: Path) -> Reading | None:
-    """`read`, with the pictures in files: through a pipe they cost as much as all the rest."""
+    """`read`, with the images in files: through a pipe they cost as much as all the rest."""
     reading = read(source, options)
     if reading is None or reading.data is None:
         return reading

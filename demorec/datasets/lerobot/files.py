@@ -1,7 +1,7 @@
 """The files of a dataset of unknown origin, opened within bounds: JSON, Parquet tables, mp4 videos.
 
 Anyone writes LeRobot datasets, and people pass them on. A table of a few kB can claim a thousand million rows, a video
-as many pictures, and under the name of either may lie something that is no file at all.
+as many images, and under the name of either may lie something that is no file at all.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def _most_bytes(size: int) -> int:
 
 
 def check_video(path: Path) -> None:
-    """Refuse what no decoder should be given: no regular mp4 file, or one that claims more pictures than it can hold.
+    """Refuse what no decoder should be given: no regular mp4 file, or one that claims more images than it can hold.
 
     Raises:
         ExportError: That.
@@ -219,7 +219,7 @@ def check_video(path: Path) -> None:
     except (OSError, ValueError, struct.error) as error:
         raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
     if claimed > size:
-        raise ExportError(f"The video claims {claimed:,} bytes or pictures, but has {size:,} bytes: {path}")
+        raise ExportError(f"The video claims {claimed:,} bytes or images, but has {size:,} bytes: {path}")
 
 
 def _samples(file: BinaryIO, size: int) -> Iterator[int]:

@@ -170,10 +170,10 @@ def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
             columns = rows.read(place)
             videos = {}
             for key, packets in cameras.items():
-                pictures = hashlib.sha256()
+                images = hashlib.sha256()
                 for sample in packets.read(place):
-                    pictures.update(sample)
-                videos[key] = pictures.hexdigest()
+                    images.update(sample)
+                videos[key] = images.hexdigest()
             task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
             if not 0 <= task_index < len(tasks):  # which NaN, what a null was read as, is neither
                 raise ExportError(f"Episode {place.episode_index} has no task: {path}")

@@ -1,4 +1,4 @@
-"""One recording to one episode of a dataset: features, coded pictures, statistics of the pixels, sidecar row."""
+"""One recording to one episode of a dataset: features, encoded images, statistics of the pixels, sidecar row."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from demorec.datasets.lerobot.depth import depth_info, depth_video
 from demorec.datasets.lerobot.facts import EpisodeProgress, episode_facts
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, DatasetFeature
-from demorec.datasets.lerobot.mp4 import CodedVideo
+from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.stats import PixelHistogram, colour_levels
 from demorec.datasets.lerobot.writer import EpisodeData
@@ -57,19 +57,19 @@ def _camera_feature(episode: ExportEpisode, camera: ExportCamera, options: Expor
 
 
 def reasons_to_transcode(episode: ExportEpisode) -> dict[ExportCamera, str]:
-    """Colour camera -> why its images have to be coded anew, "" where they pass through."""
+    """Colour camera -> why its images have to be encoded anew, "" where they pass through."""
     return {camera: reason_to_transcode(episode, camera) for camera in episode.cameras if not camera.is_depth}
 
 
 def prepare_episode(
-    episode: ExportEpisode, options: ExportOptions, *, code_depth: bool = True, about: Collection[int] | None = None
+    episode: ExportEpisode, options: ExportOptions, *, encode_depth: bool = True, about: Collection[int] | None = None
 ) -> EpisodeData:
     """Read an episode into memory, as the dataset wants it.
 
     Args:
         episode: Of an open recording.
         options: How.
-        code_depth: Whether depth videos, which must be coded, are made.
+        encode_depth: Whether depth videos, which must be encoded, are made.
         about: The rows whose images are spoken of, if language is asked for; None for all.
 
     Raises:
@@ -78,15 +78,15 @@ def prepare_episode(
         RecordingError: It is damaged.
     """
     wanted = dataset_features(episode, options)
-    videos = coded_videos(episode, reasons_to_transcode(episode), options.transcode)
+    videos = encoded_videos(episode, reasons_to_transcode(episode), options.transcode)
     pixels = {}
     for camera in episode.cameras:
         if not camera.is_depth:
             statistics = episode.recording.pixel_statistics(camera.name)
             pixels[camera.feature] = PixelHistogram(
-                counts=statistics.counts, level_values=colour_levels(), num_pictures=statistics.num_images
+                counts=statistics.counts, level_values=colour_levels(), num_images=statistics.num_images
             )
-        elif code_depth:
+        elif encode_depth:
             videos[camera.feature], pixels[camera.feature] = depth_video(episode.images(camera), fps=episode.fps)
         else:
             episode.numbers(camera)  # says what is missing
@@ -197,9 +197,9 @@ def dataset_settings(episode: ExportEpisode, camera: ExportCamera, video: VideoC
     return replace(settings, fps=episode.fps, gop=settings.gop if _stride(episode) == 1 else 1)
 
 
-def coded_videos(
+def encoded_videos(
     episode: ExportEpisode, reasons: Mapping[ExportCamera, str], video: VideoConfig
-) -> dict[str, CodedVideo]:
+) -> dict[str, EncodedVideo]:
     """Camera feature -> its images, one a frame: the recorded packets wherever there is no reason to transcode."""
     recording = episode.recording
     recorded = recording.coded_pictures([camera.name for camera, reason in reasons.items() if not reason])
@@ -212,7 +212,7 @@ def coded_videos(
             units = [unit for image in episode.images(camera) for unit in encoder.encode(image)]
             units += encoder.finish()
             lengths = [len(unit) for unit in units]
-            videos[camera.feature] = CodedVideo.of_access_units(codec, *size, b"".join(units), lengths)
+            videos[camera.feature] = EncodedVideo.of_access_units(codec, *size, b"".join(units), lengths)
             continue
         numbers = episode.numbers(camera)
         is_whole = _stride(episode) == 1
@@ -221,7 +221,7 @@ def coded_videos(
         if lead or len(block) != len(numbers):
             taken = np.arange(numbers[0] - lead, numbers[-1] + 1) if is_whole else numbers
             block = block.select(taken.astype(np.intp))
-        coded = CodedVideo.of_access_units(codec, *size, block.joined(), block.lengths, lead)
+        coded = EncodedVideo.of_access_units(codec, *size, block.joined(), block.lengths, lead)
         if not is_whole and not coded.is_keyframe.all():
             gop = recording.video_settings(camera.name).gop
             raise ExportError(
@@ -238,7 +238,7 @@ def mp4_codec(settings: VideoSettings) -> str:
 
 
 def video_info(settings: VideoSettings) -> dict[str, Any]:
-    """The `info` of a camera feature: what LeRobot reads from a file, and how it was coded, null where unknown.
+    """The `info` of a camera feature: what LeRobot reads from a file, and how it was encoded, null where unknown.
 
     LeRobot codes anew with these settings when it takes episodes out of a dataset, and takes its own for those that are
     null; a GOP of 0 it refuses.

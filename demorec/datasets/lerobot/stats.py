@@ -1,4 +1,4 @@
-"""The ten numbers that LeRobot keeps of every feature, exact: of vectors from the values, of pictures from histograms.
+"""The ten numbers that LeRobot keeps of every feature, exact: of vectors from the values, of images from histograms.
 
 LeRobot estimates quantiles with histograms of 5,000 bins; here each is what `numpy.quantile` gives.
 """
@@ -31,7 +31,7 @@ class Statistics:
     Attributes:
         values: Every name of `NAMES` but "count" -> (D,) float64.
         count: Frames.
-        is_camera: Pictures have the shape (channels, 1, 1) in LeRobot's files.
+        is_camera: Images have the shape (channels, 1, 1) in LeRobot's files.
     """
 
     values: Mapping[str, Array]
@@ -66,25 +66,25 @@ class PixelHistogram:
     Attributes:
         counts: (channels, levels) int64.
         level_values: (levels,) what a level stands for: 0..1 for colour, metres for depth.
-        num_pictures: Of how many pictures.
+        num_images: Of how many images.
     """
 
     counts: NDArray[np.int64]
     level_values: Array
-    num_pictures: int
+    num_images: int
 
     def __add__(self, other: PixelHistogram) -> PixelHistogram:
         return PixelHistogram(
             counts=self.counts + other.counts,
             level_values=self.level_values,
-            num_pictures=self.num_pictures + other.num_pictures,
+            num_images=self.num_images + other.num_images,
         )
 
     def statistics(self) -> Statistics:
         """Exact, over all counted pixels."""
         channels = [_of_levels(counts, self.level_values) for counts in self.counts]
         values = {name: np.array([channel[name] for channel in channels]) for name in NAMES if name != "count"}
-        return Statistics(values=values, count=self.num_pictures, is_camera=True)
+        return Statistics(values=values, count=self.num_images, is_camera=True)
 
 
 def _of_levels(counts: NDArray[np.int64], levels: Array) -> dict[str, float]:
@@ -148,7 +148,7 @@ def _two_dimensional(column: NDArray[Any]) -> NDArray[Any]:
 
 
 def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """Of several sets of pictures together: exact but for the quantiles, which are averaged as LeRobot does."""
+    """Of several sets of images together: exact but for the quantiles, which are averaged as LeRobot does."""
     if len(parts) == 1:
         return parts[0]
     counts = np.array([part.count for part in parts], dtype=np.float64)

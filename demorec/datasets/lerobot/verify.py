@@ -1,6 +1,6 @@
 """Opens a finished dataset with the installed LeRobot and compares samples of it with the recordings.
 
-Nothing of the writing code is used to read: LeRobot finds the rows, the files and the pictures by itself. It runs in
+Nothing of the writing code is used to read: LeRobot finds the rows, the files and the images by itself. It runs in
 a process of its own, since LeRobot brings PyTorch (seconds to load, hundreds of megabytes) and keeps copies of the
 tables in a cache, which here is a temporary folder.
 """
@@ -39,7 +39,7 @@ MAX_EPISODES = 500
 """Samples are taken of so many episodes, spread evenly, if there are more."""
 
 _TRANSCODED_TOLERANCE = 12.0
-"""Mean absolute difference in levels (0..255) allowed of a picture that was coded anew; others must be equal."""
+"""Mean absolute difference in levels (0..255) allowed of an image that was encoded anew; others must be equal."""
 _DEPTH_TOLERANCE = 6e-4
 """Metres; LeRobot rounds distances to millimetres."""
 
@@ -145,7 +145,7 @@ def _compare_episode(
     length = len(episode.rows)
     # The last frame, where offsets add up, and one more that differs from episode to episode.
     moments = sorted({(number * 37) % length, length - 1})
-    expected = prepare_episode(episode, options, code_depth=False, about=moments)
+    expected = prepare_episode(episode, options, encode_depth=False, about=moments)
     for moment in moments:
         try:
             item = dataset[first + moment]

@@ -34,7 +34,7 @@ from demorec.datasets.lerobot.layout import (
     merged_video_info,
     next_position,
 )
-from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.stats import (
@@ -60,8 +60,8 @@ class EpisodeData:
     Attributes:
         task: Instruction.
         columns: Feature -> (T,) or (T, D), without cameras and the automatic features.
-        videos: Camera feature -> coded pictures, T of them.
-        video_info: Camera feature -> how they were coded, the `info` of the feature.
+        videos: Camera feature -> encoded images, T of them.
+        video_info: Camera feature -> how they were encoded, the `info` of the feature.
         pixels: Camera feature -> histogram, for the statistics.
         language: What is said about it; written where the dataset has the columns for it.
         facts: Column of the table of episodes -> value; written where the dataset has the column.
@@ -69,7 +69,7 @@ class EpisodeData:
 
     task: str
     columns: Mapping[str, NDArray[Any]]
-    videos: Mapping[str, CodedVideo] = field(default_factory=dict)
+    videos: Mapping[str, EncodedVideo] = field(default_factory=dict)
     video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     pixels: Mapping[str, PixelHistogram] = field(default_factory=dict)
     language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
@@ -208,14 +208,14 @@ class DatasetWriter:
             episode_index=self.num_episodes - 1, digest=episode_digest(episode.task, columns, digests)
         )
 
-    def _add_video(self, key: str, video: CodedVideo, frames: int) -> dict[str, int | float]:
+    def _add_video(self, key: str, video: EncodedVideo, frames: int) -> dict[str, int | float]:
         if video.num_frames != frames:
-            raise ExportError(f"{key} has {video.num_frames} pictures for {frames} frames.")
+            raise ExportError(f"{key} has {video.num_frames} images for {frames} frames.")
         file = self._videos.get(key)
         fps = self._info.fps
         if file is not None and (
             file.num_bytes + video.num_bytes >= self._info.video_files_size_in_mb * MEBIBYTE
-            or (file.num_pictures + len(video.sizes)) / fps > _MAX_SECONDS_PER_VIDEO
+            or (file.num_images + len(video.sizes)) / fps > _MAX_SECONDS_PER_VIDEO
             or file.parameter_sets != video.parameter_sets()
         ):
             file.close()
@@ -225,7 +225,7 @@ class DatasetWriter:
         if file is None:
             path = self._root / position.path(VIDEO_PATH, key)
             file = self._videos[key] = Mp4Writer(path, video, fps=fps)
-        start = file.num_pictures + video.lead
+        start = file.num_images + video.lead
         file.add(video)
         return {
             f"videos/{key}/chunk_index": position.chunk,
