@@ -229,7 +229,7 @@ def meshes_in(path: Path) -> set[str]:
     }
 
 
-def test_a_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
+def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     given = collected(num_frames=12)
     degrees = [replace(feature, units=("deg", "rad", "")) for feature in given.info.features[:1]]
     given = replace(given, info=replace(given.info, features=(*degrees, *given.info.features[1:])))

@@ -136,7 +136,7 @@ def test_colours_are_described_as_in_the_recording(tmp_path: Path) -> None:
 def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
     _, units = encoded("av1", 3)
     for nothing in (b"", b"\x12\x00"):  # the second is a temporal delimiter alone
-        with pytest.raises(ExportError, match="no picture"):
+        with pytest.raises(ExportError, match="no image"):
             video_of("av1", [*units, nothing])
     garbage = video_of("h264", [SHORT + NAL["sps"] + SHORT + NAL["idr"]])
     with pytest.raises(ExportError, match=r"cannot be written.*a\.mp4"):
