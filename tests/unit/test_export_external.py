@@ -214,8 +214,6 @@ def test_an_hdf5_file_has_numbers_and_images_of_the_recordings(tmp_path: Path) -
 def test_an_hdf5_file_has_nothing_that_nobody_knows(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", *of_outcomes(True, False, None))
     export(run, tmp_path / "d.hdf5", "hdf5", include_failures=True)
-        run_of(tmp_path / "run", *of_outcomes(True, False, None)), tmp_path / "d.hdf5", "hdf5", include_failures=True
-    )
     with h5py.File(tmp_path / "d.hdf5") as file:
         good, bad, unknown = (file[f"data/demo_{index}"] for index in range(3))
         assert (good["rewards"][:].sum(), bad["rewards"][:].sum()) == (1, 0)

@@ -118,10 +118,6 @@ _ROBOSUITE = {
 """Of simulated arms: feature -> robosuite's observations, and which elements each of them has."""
 
 
-GYM = 2
-"""`EnvType.GYM_TYPE` of robomimic."""
-
-
 class RobomimicWriter:
     """Adds episodes to an empty file; `finish` completes it.
 

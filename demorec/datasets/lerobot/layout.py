@@ -88,13 +88,6 @@ class DatasetFeature:
         """Whether it is a camera whose pixels are distances."""
         return bool((self.info or {}).get("is_depth_map"))
 
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """(height, width) of a camera's images; the channels may be named first."""
-        is_last = self.names is None or not self.names[0].startswith("channel")
-        height, width = self.shape[:2] if is_last else self.shape[1:3]
-        return height, width
-
     def to_json(self) -> dict[str, Any]:
         """The entry as info.json has it."""
         entry: dict[str, Any] = {
