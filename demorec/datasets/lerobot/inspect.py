@@ -1,11 +1,10 @@
-"""What a dataset holds: a summary, and the digest of its content recomputed from its files."""
+"""What a dataset holds: attempts, what is missing, and the digest of its content recomputed from its files."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.core.errors import ExportError, in_words, resource_error, without_path
@@ -16,65 +15,18 @@ from demorec.datasets.lerobot.reader import RowReader, episode_places, read_task
 from demorec.datasets.lerobot.videos import PacketReader
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetSummary:
-    """What `demorec info` tells about a dataset.
-
-    Attributes:
-        path: Folder.
-        fps, robot_type, num_episodes, num_frames: As info.json says.
-        tasks: Instructions.
-        features: (name, dtype, shape, component names or None).
-        cameras: (name, width, height, codec).
-        num_files, num_bytes: On disk.
-        num_successes: Episodes that succeeded, None in a dataset that does not tell.
-        num_attempts: Attempts that were made for it, None where unknown.
-    """
-
-    path: Path
-    fps: int
-    robot_type: str | None
-    num_episodes: int
-    num_frames: int
-    tasks: tuple[str, ...]
-    features: tuple[tuple[str, str, tuple[int, ...], tuple[str, ...] | None], ...]
-    cameras: tuple[tuple[str, int, int, str], ...]
-    num_files: int
-    num_bytes: int
-    num_successes: int | None
-    num_attempts: int | None
-
-
-def dataset_info(path: Path) -> DatasetSummary:
-    """Read the summary of a LeRobot v3.0 dataset, whoever wrote it.
+def attempt_counts(path: Path) -> tuple[int, int] | None:
+    """(episodes that succeeded, attempts that were made) of a dataset that demorec wrote; None for anybody else's.
 
     Raises:
-        ExportError: None there, or damaged.
+        ExportError: Its tables are damaged.
     """
-    info = DatasetInfo.load(path)
-    files = [file for file in path.rglob("*") if file.is_file()]
-    attempts = sorted((path / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
-    successes = sorted((path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts) if attempts else None
+    successes, attempts = (sorted((path / SIDECAR_DIR / name).glob("*/*.parquet")) for name in ("episodes", "attempts"))
+    if not attempts:
+        return None
     columns = [read_table(file, ["success"]).column("success") for file in successes]
-    return DatasetSummary(
-        path=path,
-        fps=info.fps,
-        robot_type=info.robot_type,
-        num_episodes=info.total_episodes,
-        num_frames=info.total_frames,
-        tasks=tuple(read_tasks(path)) if info.total_tasks else (),
-        features=tuple((name, item.dtype, item.shape, item.names) for name, item in info.features.items()),
-        cameras=tuple(
-            (name, item.shape[1], item.shape[0], str((item.info or {}).get("video.codec", "")))
-            for name, item in info.features.items()
-            if item.is_video
-        ),
-        num_files=len(files),
-        num_bytes=sum(file.stat().st_size for file in files),
-        num_successes=sum(column.to_pylist().count(True) for column in columns) if columns else None,
-        num_attempts=num_attempts,
-    )
+    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts)
+    return sum(column.to_pylist().count(True) for column in columns), num_attempts
 
 
 def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
