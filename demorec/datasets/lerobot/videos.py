@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -140,21 +140,19 @@ class EpisodeVideo:
         self._root, self._feature, self._key, self._fps = root, info.features[key], key, int(info.fps)
         self._episode = place.episode_index
 
-    @contextmanager
-    def _at_first(
-        self, frame: int = 0
-    ) -> Iterator[tuple[av.container.InputContainer, av.video.stream.VideoStream, Fraction]]:
-        """The video, before a frame or earlier; the last value is frames a tick of its clock."""
-        with opened_video(self.path) as (container, stream):
-            assert stream.time_base is not None
-            container.seek(round((self.first + frame) / (self._fps * stream.time_base)), stream=stream)
-            yield container, stream, self._fps * stream.time_base
+    def _seek(
+        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream, frame: int = 0
+    ) -> Fraction:
+        """Go to a frame or before it; return how many frames a tick of the video's clock is."""
+        assert stream.time_base is not None
+        container.seek(round((self.first + frame) / (self._fps * stream.time_base)), stream=stream)
+        return self._fps * stream.time_base
 
     @cached_property
     def lead(self) -> int:
         """How many images there are from the keyframe on that the first frame needs, less that frame."""
-        with self._at_first() as (container, stream, rate):
-            keyframe = 0
+        with opened_video(self.path) as (container, stream):
+            rate, keyframe = self._seek(container, stream), 0
             for packet in container.demux(stream):
                 if packet.size and packet.pts is not None:
                     frame = round(packet.pts * rate) - self.first
@@ -165,8 +163,8 @@ class EpisodeVideo:
 
     def packets(self) -> Iterator[tuple[int, bytes, bool]]:
         """(frame, access unit, whether it is a keyframe) of the `lead`, whose frames are below 0, and of T frames."""
-        with self._at_first() as (container, stream, rate):
-            codec = codec_of(stream)
+        with opened_video(self.path) as (container, stream):
+            rate, codec = self._seek(container, stream), codec_of(stream)
             claimed = str((self._feature.info or {}).get("video.codec"))
             if PACKET_CODECS.get(claimed, codec) != codec:
                 raise ValueError(f"its codec is {codec}, and meta/info.json says {claimed}")
@@ -207,32 +205,39 @@ class EpisodeVideo:
 
     def images_at(self, frames: Sequence[int]) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of some frames, numbered from 0 within the episode."""
-        for frame in frames:
-            with closing(self._frames(frame)) as found:
-                for image in found:
-                    yield cast(Rgb, image.to_ndarray(format="rgb24"))
-                    break
+        with opened_video(self.path) as (container, stream):
+            for frame in frames:
+                image = next(self._decoded(container, stream, frame))
+                yield cast(Rgb, image.to_ndarray(format="rgb24"))
 
-    def _frames(self, begin: int = 0, size: tuple[int, int] | None = None) -> Any:
-        """A generator of the decoded images from a frame on, one a frame; the size is what info.json claims."""
-        with self._at_first(begin) as (container, stream, rate):
-            found, number = (stream.codec_context.width, stream.codec_context.height), begin
+    def _frames(self, begin: int = 0, size: tuple[int, int] | None = None) -> Iterator[av.VideoFrame]:
+        """The decoded images from a frame on, one a frame; the size is what info.json claims."""
+        with opened_video(self.path) as (container, stream):
+            found = (stream.codec_context.width, stream.codec_context.height)
             if size not in (None, found):
                 raise ValueError(f"it has {found[0]}x{found[1]} pixels, and meta/info.json says {size[0]}x{size[1]}")
-            for image in container.decode(stream) if begin < self.length else ():
-                frame = begin - 1 if image.pts is None else round(image.pts * rate) - self.first
-                if frame < begin:
-                    continue
-                if frame != number:
-                    break
-                if (image.width, image.height) != found:
-                    raise ValueError(f"it changes its size to {image.width}x{image.height}")
-                yield image
-                number += 1
-                if number == self.length:
-                    return
-            if number < self.length:
-                raise ValueError(f"episode {self._episode} has {self.length} frames, and frame {number} no image")
+            if begin < self.length:
+                yield from self._decoded(container, stream, begin)
+
+    def _decoded(
+        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream, begin: int
+    ) -> Iterator[av.VideoFrame]:
+        """As `_frames`, of an opened video; ValueError when an image is missing or of another size."""
+        rate, number = self._seek(container, stream, begin), begin
+        size = (stream.codec_context.width, stream.codec_context.height)
+        for image in container.decode(stream):
+            frame = begin - 1 if image.pts is None else round(image.pts * rate) - self.first
+            if frame < begin:
+                continue
+            if frame != number:
+                break
+            if (image.width, image.height) != size:
+                raise ValueError(f"it changes its size to {image.width}x{image.height}")
+            yield image
+            number += 1
+            if number == self.length:
+                return
+        raise ValueError(f"episode {self._episode} has {self.length} frames, and frame {number} no image")
 
 
 def codec_of(stream: av.video.stream.VideoStream) -> PacketCodec:
