@@ -8,6 +8,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.commands import exit_code
@@ -144,3 +145,22 @@ def test_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for camera in ("front", "wrist", "front_depth", "wrist_depth"):
         a, b = (list((tmp_path / name / "videos").glob(f"*.{camera}/*/*.mp4")) for name in "ab")
         assert [path.read_bytes() for path in a] == [path.read_bytes() for path in b]
+
+
+def test_what_nobody_would_keep_beside_a_dataset_is_not_believed(run: Path, tmp_path: Path) -> None:
+    """A camera that is none, a pose without a rotation, control characters in a reason."""
+    export(run, tmp_path / "a", include_failures=True)
+    (path,) = (tmp_path / "a" / "demorec" / "episodes").glob("*/*.parquet")
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    for row in rows:
+        row["failure_reason"] = "\x1b[31mred"
+        top = row["cameras"][0] | {"mount_from_camera": [0.0] * 7, "intrinsics": [float("nan")] * 9}
+        row["cameras"] = [None, top]
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), path)
+    for file in recordings(imported("lerobot", tmp_path / "a", tmp_path / "again")):
+        with Recording(file) as recording:
+            assert recording.outcome is not None
+            assert recording.outcome.reason == ""
+            (camera,) = recording.info.cameras
+            assert (camera.name, camera.intrinsics, camera.mount_from_camera) == ("top", None, None)

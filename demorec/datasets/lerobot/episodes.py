@@ -46,7 +46,7 @@ _SUCCESS, _EPISODE = "next.success", "episode_index"
 _TIME_TOLERANCE_S = 1e-4
 """By which LeRobot lets a row's time be off the grid."""
 _UNNAMED_ROBOT = "unknown"
-_MAX_ELEMENTS = 4096
+_MAX_ELEMENTS, _MAX_REASON = 4096, 10_000
 _RECORDED: Mapping[str, Literal["float32", "float64"]] = {
     **dict.fromkeys(("bool", "int8", "uint8", "int16", "uint16", "float16", "float32"), "float32"),
     **dict.fromkeys(("int32", "uint32", "int64", "uint64", "float64"), "float64"),
@@ -244,7 +244,7 @@ class DatasetRecording:
         """What is known of it; its robot and cameras as the sidecar describes them."""
         robot = None if self.known.get("robot_digest") is None else self.robot
         links = set() if robot is None else {robot.model.root, *(joint.child for joint in robot.model.joints)}
-        described = {camera["name"]: camera for camera in self.known.get("cameras") or ()}
+        described = {camera["name"]: camera for camera in self.known.get("cameras") or () if camera is not None}
         cameras = [
             # A depth camera of a simulated episode has no entry of its own there.
             _described(
@@ -284,6 +284,8 @@ class DatasetRecording:
     def outcome(self) -> ExternalOutcome:
         """As the sidecar has it, or else as the last row says."""
         success, reason = self.known.get("success"), self.known.get("failure_reason") or ""
+        if len(reason) > _MAX_REASON or not reason.isprintable():
+            reason = ""
         if not self.known and _SUCCESS in self._rows and self.num_frames:
             success = bool(self._rows[_SUCCESS][-1, 0])
         return ExternalOutcome(success=success, num_frames=self.num_frames, reason=reason)
@@ -432,7 +434,10 @@ def _described(camera: Camera, found: Mapping[str, Any] | None, links: set[str])
     if intrinsics is not None and len(intrinsics) == 9 and all(map(_is_finite, intrinsics)):
         camera = replace(camera, intrinsics=tuple(intrinsics))
     # A camera that stands in the world of a simulation hangs on no link, and where the arm stands there is not said.
-    if found["mount"] in links and pose is not None and len(pose) == 7 and all(map(_is_finite, pose)):
+    is_pose = (
+        pose is not None and len(pose) == 7 and all(map(_is_finite, pose)) and abs(math.hypot(*pose[3:]) - 1) < 1e-3
+    )
+    if found["mount"] in links and is_pose:
         placed = Pose(position=np.array(pose[:3]), quat_xyzw=np.array(pose[3:]))
         camera = replace(camera, mount=found["mount"], mount_from_camera=placed)
     return camera
