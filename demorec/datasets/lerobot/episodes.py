@@ -111,6 +111,8 @@ class LeRobotDataset:
         for place in (BOXES_DIR, "sarm_progress.parquet"):
             if (self.root / place).exists():
                 yield place, _NO_PLACE
+        if not self.has_one_robot:
+            yield f"{SIDECAR_DIR}/robots", "not all episodes have the same robot there, as those of a run have"
         if any(row["root_seed"] is not None for row in self.known.values()):
             yield f"{SIDECAR_DIR}/episodes", f"scene, phases and checks are of simulated episodes, and {_NO_PLACE}"
 
@@ -168,6 +170,11 @@ class LeRobotDataset:
                 for row in batch.to_pylist():
                     found[row["episode_index"]] = {**dict.fromkeys(_KNOWN), **row}
         return found
+
+    @cached_property
+    def has_one_robot(self) -> bool:
+        """Whether the sidecar describes the same robot for all episodes, or none for any."""
+        return len({self.known.get(place.episode_index, {}).get("robot_digest") for place in self.places}) <= 1
 
     def sidecar_rows(self, table: str, episode_index: int) -> list[dict[str, Any]]:
         """All that a table of the sidecar has of an episode; ExportError when it cannot be read."""
@@ -242,7 +249,7 @@ class DatasetRecording:
     @cached_property
     def info(self) -> EpisodeInfo:
         """What is known of it; its robot and cameras as the sidecar describes them."""
-        robot = None if self.known.get("robot_digest") is None else self.robot
+        robot = self.robot if self.dataset.has_one_robot and self.known.get("robot_digest") is not None else None
         links = set() if robot is None else {robot.model.root, *(joint.child for joint in robot.model.joints)}
         described = {camera["name"]: camera for camera in self.known.get("cameras") or () if camera is not None}
         cameras = [
