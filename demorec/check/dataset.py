@@ -20,10 +20,10 @@ from demorec.check.episode_drawn import drawable_scene
 from demorec.core.errors import ConfigError, ExportError, in_words
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import open_table, read_table
-from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode, spoken_episodes
+from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode, spoken_of
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places, read_tasks
+from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, RowStream, episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.episode.episode import SimulatedInfo
@@ -178,7 +178,10 @@ class Dataset:
     @cached_property
     def spoken(self) -> list[SpokenEpisode]:
         """What the language columns of each episode hold; empty for a dataset without them."""
-        return list(spoken_episodes(self.path)) if set(COLUMNS) <= set(self.info.features) else []
+        if not set(COLUMNS) <= set(self.info.features):
+            return []
+        stream = RowStream(self.path, self.info, COLUMNS, rows=64)
+        return [spoken_of(stream.batches(place), self.path) for place in self.places]
 
     @cached_property
     def infos(self) -> list[SimulatedInfo]:

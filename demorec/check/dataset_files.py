@@ -17,8 +17,8 @@ from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.reader import PacketReader
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
+from demorec.datasets.lerobot.videos import PacketReader
 
 
 @dataset_check(
@@ -164,8 +164,10 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
     needs_pictures=True,
     reads=("meta/info.json",),
 )
-def dataset_opens(dataset: Dataset) -> Measurement:
+def dataset_opens(dataset: Dataset) -> Measurement | None:
     """LeRobot opens the dataset and reads first, middle and last frame, pictures included."""
+    if dataset.info.is_old:  # LeRobot 0.6 reads v3.0 alone
+        return None
     if not lerobot_is_installed():
         raise MissingDependencyError("Opening a dataset as a training does", "lerobot", f"pip install '{LEROBOT}'")
     with tempfile.TemporaryDirectory(prefix="demorec-check-") as cache:

@@ -302,8 +302,8 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     """What the tables say beyond info.json, where demorec understands them, and what is wrong with the dataset."""
-    from demorec.datasets.lerobot import dataset_digest, dataset_info
-    from demorec.datasets.lerobot.inspect import dataset_problems, has_digest
+    from demorec.datasets.lerobot import dataset_digest
+    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_problems, has_digest
     from demorec.datasets.lerobot.layout import DatasetInfo
 
     facts: list[tuple[str, str]] = []
@@ -313,11 +313,13 @@ def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
         problems += dataset_problems(path, info)
         if problems:
             return facts, problems
-        summary = dataset_info(path)
-        if summary.num_attempts is not None:
-            facts.append(("successes", f"{summary.num_successes}, of {summary.num_attempts} attempts"))
-        for name, width, height, codec in summary.cameras:
-            facts.append(("camera", f"{name.removeprefix(IMAGE_PREFIX)} {width}x{height} {codec}"))
+        if (counts := attempt_counts(path)) is not None:
+            facts.append(("successes", f"{counts[0]}, of {counts[1]} attempts"))
+        for name, item in info.features.items():
+            if item.is_video:
+                codec = (item.info or {}).get("video.codec", "")
+                camera = f"{name.removeprefix(IMAGE_PREFIX)} {item.shape[1]}x{item.shape[0]} {codec}"
+                facts.append(("camera", camera))
         if has_digest(info):
             facts.append(("digest", dataset_digest(path)))
     except ExportError as error:

@@ -15,7 +15,7 @@ from demorec.robots.assets import model_name
 
 if TYPE_CHECKING:
     from demorec.check.base import Check
-    from demorec.datasets.exporter import Exporter
+    from demorec.datasets.options import Exporter
     from demorec.render import Renderer
     from demorec.render.cameras import CameraPreset
     from demorec.robots.robot import RobotSpec

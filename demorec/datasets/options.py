@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,11 +36,11 @@ class CommonOptions:
     format itself needs (times, indices) stay whatever is named. Fewer features make training faster. Only when named:
     observation.effort, observation.contact_force, observation.wrench and command, of simulated episodes."""
     depth: bool = False
-    """Add depth pictures of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
+    """Add depth images of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
     hold_pictures: float = 0.0
-    """Of external episodes: seconds for which a frame without a picture of a camera shows the camera's last one, as a
+    """Of external episodes: seconds for which a frame without an image of a camera shows the camera's last one, as a
     policy would see it; 0: such a frame is an error."""
     overwrite: bool = False
     """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
@@ -67,7 +68,7 @@ class ExportReport:
         skipped_failures: Failed episodes that were left out.
         skipped_unknown: Episodes that were left out since their recordings end before the outcome.
         skipped_unwanted: Recordings that `episodes` and `corrected_only` left out.
-        transcoded: Cameras whose pictures had to be coded anew, with the reason.
+        transcoded: Cameras whose images had to be encoded anew, with the reason.
         left_out: Features that the dataset appended to does not have.
         depth_left_out: Depth cameras of external episodes that were not asked for.
         silent: Recordings of external episodes whose language was asked for, but whose source states no subtask.
@@ -116,3 +117,28 @@ def parse_episodes(text: str) -> Callable[[int], bool]:
     if not parts:
         return lambda index: True
     return lambda index: any(index in part for part in parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exporter[O: CommonOptions]:
+    """A format that recordings are exported to.
+
+    Its module is loaded for `--help`, so what is heavy is imported when `export` is called.
+
+    Attributes:
+        summary: What comes out, in one line.
+        options: Its flags; a dataclass with a docstring below each field.
+        function: "module:name" of (sources, out, options, progress) -> report. It reads recordings and nothing else,
+            takes those that `demorec.datasets.sources` finds, and makes `out` whole or not at all. Raises ConfigError,
+            ExportError and RecordingError.
+    """
+
+    summary: str
+    options: type[O]
+    function: str
+
+    def export(self, sources: Sequence[Path], out: Path, options: O, progress: ProgressCallback | None) -> ExportReport:
+        """Call it."""
+        module, _, name = self.function.partition(":")
+        report: ExportReport = getattr(importlib.import_module(module), name)(sources, out, options, progress)
+        return report

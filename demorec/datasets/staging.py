@@ -27,7 +27,7 @@ _RENAME_SWAP_MACOS = 2
 _MARK = b"demorec export\n"
 """What the lock file of a workshop holds."""
 NEW, OLD, CODED, _LOCK = "new", "old", "coded", "lock"
-"""All that a workshop holds: the folder in the making, the one that it replaces, pictures of the export's processes."""
+"""All that a workshop holds: the folder in the making, the one that it replaces, images of the export's processes."""
 
 
 @contextmanager

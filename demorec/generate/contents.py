@@ -9,8 +9,7 @@ from pathlib import Path
 
 from demorec.core.errors import ConfigError
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
-from demorec.datasets.lerobot.kind import DATASET, is_dataset_file
-from demorec.datasets.lerobot.paths import CARD_PATH
+from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, is_dataset_file
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.generate.survey import recordings_of
 from demorec.runs.run_file import DATASET as DATASET_FOLDER

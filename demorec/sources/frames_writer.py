@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ def write_frames(
     frames: Iterable[Mapping[str, Vector]],
     pictures: Mapping[str, Iterator[Picture]],
     *,
-    success: bool | None,
+    outcome: Outcome,
     video: VideoConfig,
     leads: Mapping[str, int] | None = None,
     subtasks: Mapping[int, str] | None = None,
@@ -54,7 +54,7 @@ def write_frames(
         info: What is known of the episode.
         frames: Feature -> its vector, of each frame.
         pictures: Camera -> its pictures, one a frame, its lead in front.
-        success: How it ended; None when nobody said.
+        outcome: How it ended, of as many frames.
         video: How pixels are coded.
         leads: Camera -> how many of its pictures come before the first frame; 0 where not given.
         subtasks: Frame -> what the robot begins to do with it.
@@ -80,7 +80,7 @@ def write_frames(
             subtask = (subtasks or {}).get(count, "")
             writer.write(SampledFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
             count += 1
-        writer.finish(Outcome(success=success, num_frames=count))
+        writer.finish(replace(outcome, num_frames=count))
     except BaseException:
         writer.discard()
         raise

@@ -126,7 +126,11 @@ def task_of(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> str:
 
 
 def success_of(file: ForeignFile, place: str, mapping: Hdf5Mapping, num_rows: int) -> bool | None:
-    """How an episode ended; None where the mapping does not ask. Hdf5Error when the file does not say."""
+    """How an episode ended; None where the mapping does not ask, or other episodes of the file alone say it.
+
+    Raises:
+        Hdf5Error: No episode says it, or this one says something else.
+    """
     name = mapping.episodes.success.strip("/")
     if not name:
         return None
@@ -139,6 +143,8 @@ def success_of(file: ForeignFile, place: str, mapping: Hdf5Mapping, num_rows: in
     if found is not None:
         return bool(found)
     if not file.has(f"{place}/{name}"):
+        if any(file.attribute(other, name) is not None for other in episode_places(file, mapping.episodes)):
+            return None
         near = nearest_match(name, list(file.children(place)))
         raise Hdf5Error(
             f"{place or 'The episode'} has no attribute or dataset {name!r} that says how it ended.{near}".rstrip(".?")

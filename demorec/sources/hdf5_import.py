@@ -16,6 +16,7 @@ from pathlib import Path
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
+from demorec.episode.episode import Outcome
 from demorec.episode.external import EpisodeInfo, Origin, SourceFile, Vector
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.robots.urdf import Urdf
@@ -147,7 +148,8 @@ def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: Video
             with ForeignFile(plan.path) as file, _named(plan.path):
                 episode = _Stored(file, plan.place, mapping)
                 pictures = {camera.name: camera.pictures() for camera in episode.cameras}
-                write_frames(folder, plan.info, episode.frames(), pictures, success=plan.success, video=video)
+                outcome = Outcome(success=plan.success, num_frames=plan.num_frames)
+                write_frames(folder, plan.info, episode.frames(), pictures, outcome=outcome, video=video)
     return len(missing)
 
 

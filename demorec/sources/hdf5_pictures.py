@@ -147,7 +147,7 @@ def _float_scale(array: StoredArray) -> float:
 
 
 def is_camera(array: StoredArray) -> bool:
-    """Whether a dataset holds pictures, JPEG files or, by its name, distances.
+    """Whether a dataset holds pictures, JPEG files or, by its name or its last axis, distances.
 
     Raises:
         Hdf5Error: Its first row cannot be read.
@@ -158,7 +158,8 @@ def is_camera(array: StoredArray) -> bool:
     if form == "pixels" and array.dtype.kind == "f":  # points and transforms are arrays like these
         first = array.read(0, min(1, len(array))).astype(np.float64)
         return min(sorted(array.shape[1:])[1:]) >= _LEAST_SIDE and bool(((first >= 0) & (first <= 255)).all())
-    return form == "pixels" or (form == "depth" and "depth" in place)
+    is_image = len(array.shape) == 4 and min(array.shape[1:3]) >= _LEAST_SIDE  # as our own exports have distances
+    return form == "pixels" or (form == "depth" and (is_image or "depth" in place))
 
 
 def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:

@@ -88,7 +88,7 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
         lines += ["[robot]", f"name = {quoted(_robot(contents, is_aloha))}", *_model(contents), ""]
         lines += ["[task]", *_task(contents, path), ""]
         lines += ["[clock]", *_clock(contents, is_aloha), ""]
-        lines += ["[episodes]", *_episodes(contents, is_aloha)]
+        lines += ["[episodes]", *_episodes(contents, places, is_aloha)]
         lines += [*_features(contents, is_aloha), *_cameras(contents)]
     return lines
 
@@ -162,7 +162,7 @@ def _clock(contents: _Contents, is_aloha: bool) -> list[str]:
     return ["# fps = 20  # rows a second, which the file does not say: look it up"]
 
 
-def _episodes(contents: _Contents, is_aloha: bool) -> Iterator[str]:
+def _episodes(contents: _Contents, places: Sequence[str], is_aloha: bool) -> Iterator[str]:
     if is_aloha:
         yield "# The file is one episode."
         return
@@ -170,7 +170,7 @@ def _episodes(contents: _Contents, is_aloha: bool) -> Iterator[str]:
     masks = list(contents.file.children("mask")) if contents.file.is_group("mask") else []
     if masks:
         yield f"# mask = {quoted(masks[0])}  # only those that one of these lists: {', '.join(map(quoted, masks))}"
-    if contents.file.attribute(contents.place, "success") is not None:
+    if any(contents.file.attribute(place, "success") is not None for place in places):
         yield 'success = "success"'
     elif "rewards" in contents.arrays:
         yield '# success = "rewards"  # where the last one above 0 means a success'

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +15,20 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError, in_words, resource_error
 from demorec.core.geometry import Array, Pose
-from demorec.core.plain import from_json
+from demorec.datasets.lerobot.episodes import DatasetRecording, LeRobotDataset, with_robot
 from demorec.datasets.lerobot.files import read_json
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
+from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import episode_places, read_tasks
+from demorec.datasets.lerobot.reader import episode_places
 from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SimulatedInfo, SuccessCheck
-from demorec.episode.external import Camera, EpisodeInfo, Feature, Origin
-from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE_KINDS, state_names
+from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
 from demorec.episode.validity import read_episode_info
-from demorec.mcap.external.transforms import JointPositions
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.urdf import Urdf, check_primitives
-from demorec.view.dataset_episode import DatasetEpisode, dataset_rows
-from demorec.view.episode import Curves, PlayedEpisode, PlayedExternal
+from demorec.view.episode import Box, Curves, PlayedEpisode, PlayedExternal, Statements, timed
+from demorec.view.from_recording import external_episode, shown_at, video_of
 from demorec.view.held_objects import held_object_poses
 
 
@@ -49,114 +49,96 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
         RecordingError: It cannot be read.
     """
     try:
-        episode = _read_episode(root, episode_index)
+        episode = _read_episode(LeRobotDataset(root), episode_index)
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and odd values in its tables
         unreadable = RecordingError(f"The dataset cannot be read ({in_words(error)}): {root}")
         raise resource_error(error) or unreadable from error
     yield episode
 
 
-def _read_episode(root: Path, episode_index: int) -> PlayedEpisode | PlayedExternal:
-    found = DatasetEpisode(root, episode_index)
-    if found.row.get("episode_info") is None:
-        return _external(found)
-    row, described = found.row, found.described
+def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode | PlayedExternal:
+    root = dataset.root
+    numbers = [number for number, place in enumerate(dataset.places) if place.episode_index == episode_index]
+    if not numbers:
+        raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
+    recording = dataset.recording(numbers[0])
+    group = root.resolve().name
+    known = {
+        "name": f"episode_{episode_index:06d}",
+        "group": group,
+        "source": str(recording.known.get("source", group)),
+    }
+    if recording.known.get("root_seed") is not None:
+        (row,) = dataset.sidecar_rows("episodes", episode_index)
+        return _simulated(recording, row, known | {"identity": f"dataset-{group}-{episode_index}"})
+    info, robot = recording.info, recording.robot
+    if not info.urdf and robot is not None:
+        info = with_robot(info, robot)
+    known["identity"] = hashlib.sha256(f"{root.resolve()} {episode_index}".encode()).hexdigest()[:16]
+    return replace(external_episode(recording, known, info), statements=_statements(recording))
+
+
+def _statements(recording: DatasetRecording) -> Statements:
+    """(time_ns, style, sentence) of what the language columns say."""
+    last, fps, times = recording.num_frames - 1, recording.dataset.info.fps, recording.columns().time_ns
+    return tuple(
+        (int(times[min(round(row["timestamp"] * fps), last)] - times[0]), str(row["style"]), str(row["content"]))
+        for row in recording.spoken.persistent
+    )
+
+
+def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str, Any]) -> PlayedEpisode:
+    dataset, root = recording.dataset, recording.path
+    described, columns = dataset.info, recording.columns()
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
     info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
-    data = found.data
-    num_frames = len(data["action"])
+    data = {name: values.astype(np.float64) for name, values in columns.features.items()}
     num_arm = len(info.robot.arm_joints)
     widths = {len(state_names(info.robot, kind)) for kind in STATE_KINDS}
-    if not num_frames or data["observation.state"].shape[1] not in widths:
-        raise RecordingError(f"The dataset has no rows of episode {episode_index}, or of another robot: {root}")
     state = data["observation.state"]
-    if found.robot is not None:
-        check_primitives(found.robot.urdf)
-    base_from_tcp = (
-        data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, found.robot)
-    )
+    if not len(state) or state.shape[1] not in widths:
+        raise RecordingError(
+            f"The dataset has no rows of episode {recording.place.episode_index}, or of another robot: {root}"
+        )
+    robot = recording.robot
+    if robot is not None:
+        check_primitives(robot.urdf)
+    base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, robot)
     fingers = info.robot.gripper.joint_position(state[:, num_arm])
     ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
+    time_ns = columns.time_ns - columns.time_ns[0]
     return PlayedEpisode(
-        name=f"episode_{episode_index:06d}",
-        group=root.resolve().name,
-        identity=f"dataset-{root.resolve().name}-{episode_index}",
-        source=str(row["source"]),
+        **known,
         info=info,
-        outcome=_outcome(row, num_frames),
-        robot_description=None if found.robot is None else found.robot.urdf,
-        time_ns=found.time_ns,
+        outcome=_outcome(row, len(state)),
+        robot_description=None if robot is None else robot.urdf,
+        time_ns=time_ns,
         joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
         base_from_tcp=base_from_tcp,
         object_poses=_object_poses(info, ends, data, described, base_from_tcp),
         end_poses=ends,
-        world_from_camera=_camera_poses(root, episode_index),
-        phase=_phases(row, num_frames),
-        curves=_curves(info, data, base_from_tcp, found.time_ns, with_targets=export.get("action") == "joint"),
-        videos=found.videos(),
-        depth={name.removesuffix(DEPTH_SUFFIX): read for name, read in found.depth().items()},
-        statements=found.statements(),
-        boxes=found.boxes(),
+        world_from_camera=_camera_poses(recording),
+        phase=_phases(row, len(state)),
+        curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
+        videos={name: video_of(recording, name, shown_at(columns, name, time_ns)) for name in recording.cameras},
+        depth={
+            name.removesuffix(DEPTH_SUFFIX): partial(timed, time_ns, partial(recording.distances, name))
+            for name in recording.depth_cameras
+        },
+        statements=_statements(recording),
+        boxes={name: _boxes(recording, name) for name in recording.cameras},
     )
 
 
-def _external(found: DatasetEpisode) -> PlayedExternal:
-    """An episode as its dataset knows it, at the dataset's rate."""
-    root, row, described, robot = found.root, found.row, found.described, found.robot
-    data, time_ns, videos, depth = found.data, found.time_ns, found.videos(), found.depth()
-    names = {
-        name: described.features[name].names or tuple(str(index) for index in range(values.shape[1]))
-        for name, values in data.items()
-        if name not in AUTOMATIC_FEATURES and not name.startswith("next.")
-    }
-    tasks = read_tasks(root)
-    joints, units = ({}, {}) if robot is None else (robot.record.joints, robot.record.units)
-    features = tuple(
-        Feature(name=name, dtype="float32", names=parts, joints=joints.get(name, ()), units=units.get(name, ()))
-        for name, parts in names.items()
-    )
-    positions = JointPositions(features)
-    values = positions.of(data).T if positions.joints else ()
-    return PlayedExternal(
-        name=f"episode_{found.number:06d}",
-        group=root.resolve().name,
-        identity=hashlib.sha256(f"{root.resolve()} {found.number}".encode()).hexdigest()[:16],
-        source=str(row.get("source", root.resolve().name)),
-        info=EpisodeInfo(
-            episode_index=found.number,
-            instruction=tasks[int(data["task_index"][0, 0])] if len(time_ns) else "",
-            robot=described.robot_type or "",
-            fps=int(described.fps),
-            urdf="" if robot is None else robot.urdf,
-            features=features,
-            cameras=tuple(_camera(described, name) for name in [*videos, *depth]),
-            origin=from_json(row["origin"], Origin) if row else Origin(kind="dataset"),
-        ),
-        outcome=_external_outcome(row, data, len(time_ns)),
-        time_ns=time_ns,
-        joint_position=dict(zip(positions.joints, values, strict=True)),
-        curves={name: Curves(time_ns=time_ns, values=data[name], names=parts) for name, parts in names.items()},
-        videos=videos,
-        depth=depth,
-        statements=found.statements(),
-    )
-
-
-def _camera(described: DatasetInfo, name: str) -> Camera:
-    height, width = described.features[IMAGE_PREFIX + name].shape[:2]
-    return Camera(name=name, width=width, height=height)
-
-
-def _external_outcome(row: Mapping[str, Any], data: Mapping[str, Array], num_frames: int) -> Outcome:
-    """As the sidecar has it, or else as the last row says."""
-    if row:
-        return Outcome(success=row["success"], num_frames=num_frames, failure_reason=row["failure_reason"])
-    ends = data.get("next.success")
-    success = None if ends is None or not num_frames else bool(ends[-1, 0])
-    return Outcome(success=success, num_frames=num_frames)
+def _boxes(recording: DatasetRecording, camera: str) -> dict[int, list[tuple[str, Box]]]:
+    """Frame -> what a camera sees there."""
+    seen: dict[int, list[tuple[str, Box]]] = {}
+    for frame, item in recording.boxes(camera):
+        seen.setdefault(frame, []).append((item.object, item.box))
+    return seen
 
 
 def _tcp_poses(info: SimulatedInfo, state: Array, robot: DatasetRobot | None) -> Array:
@@ -213,11 +195,9 @@ def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _camera_poses(root: Path, episode_index: int) -> dict[str, Array]:
+def _camera_poses(recording: DatasetRecording) -> dict[str, Array]:
     """Camera -> (T, 7) of the cameras that move."""
-    if not (root / SIDECAR_DIR / "camera_poses").is_dir():
-        return {}
-    rows = dataset_rows(root, f"{SIDECAR_DIR}/camera_poses", None, episode_index)
+    rows = recording.dataset.sidecar_rows("camera_poses", recording.place.episode_index)
     names = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
     return {name: np.array([row[name] for row in rows]) for name in names}
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.datasets.lerobot.episodes import DatasetRecording
 from demorec.episode.episode import SimulatedColumns
-from demorec.episode.external import NO_PICTURE, Columns
+from demorec.episode.external import NO_PICTURE, Columns, EpisodeInfo
 from demorec.mcap import AnyRecording, Recording, SimulatedRecording, open_recording
 from demorec.mcap.channels import description_topic
 from demorec.mcap.external.transforms import JointPositions
@@ -37,7 +38,7 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedExternal]:
     }
     with open_recording(path) as recording:
         if isinstance(recording, Recording):
-            yield _external(recording, known)
+            yield external_episode(recording, known, recording.info)
         else:
             yield _simulated(recording, known)
 
@@ -60,7 +61,7 @@ def _simulated(recording: SimulatedRecording, known: dict[str, Any]) -> PlayedEp
         phase=columns.phase,
         events=tuple(recording.events()),
         curves=_curves(recording, columns),
-        videos={name: _video(recording, name, columns.time_ns) for name in recording.cameras},
+        videos={name: video_of(recording, name, columns.time_ns) for name in recording.cameras},
         depth={
             name: partial(timed, columns.time_ns, partial(recording.depth, name))
             for name in recording.cameras
@@ -75,8 +76,11 @@ def _simulated(recording: SimulatedRecording, known: dict[str, Any]) -> PlayedEp
     )
 
 
-def _external(recording: Recording, known: dict[str, Any]) -> PlayedExternal:
-    info, columns = recording.info, recording.columns()
+def external_episode(
+    recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo
+) -> PlayedExternal:
+    """An episode of which nothing is known but what came; `info` may describe its robot."""
+    columns = recording.columns()
     time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
     positions = JointPositions(info.features)
     values = positions.of(columns.features) if positions.joints else np.zeros((len(time_ns), 0))
@@ -93,12 +97,12 @@ def _external(recording: Recording, known: dict[str, Any]) -> PlayedExternal:
             for feature in info.features
         },
         videos={
-            camera: _video(recording, camera, _shown_at(columns, camera, time_ns))
+            camera: video_of(recording, camera, shown_at(columns, camera, time_ns))
             for camera in recording.cameras
             if len(columns.picture_stamps[camera])
         },
         depth={
-            camera: partial(timed, _shown_at(columns, camera, time_ns), partial(recording.distances, camera))
+            camera: partial(timed, shown_at(columns, camera, time_ns), partial(recording.distances, camera))
             for camera in recording.depth_cameras
             if len(columns.picture_stamps[camera])
         },
@@ -106,7 +110,7 @@ def _external(recording: Recording, known: dict[str, Any]) -> PlayedExternal:
     )
 
 
-def _shown_at(columns: Columns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def shown_at(columns: Columns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """(P,) when each picture of a camera is shown: with the first frame that holds it, or the next one after it.
 
     Not at its own stamp, which may be of another clock.
@@ -118,7 +122,7 @@ def _shown_at(columns: Columns, camera: str, time_ns: NDArray[np.int64]) -> NDAr
     return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
 
 
-def _video(recording: AnyRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
+def video_of(recording: AnyRecording | DatasetRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
     """The coded pictures of a camera, each at its time (P,)."""
 
     def packets() -> Iterator[tuple[int, bytes, bool]]:

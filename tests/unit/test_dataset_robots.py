@@ -23,6 +23,7 @@ from demorec.core.errors import ExportError, MissingDependencyError
 from demorec.core.plain import digest, from_json, to_json
 from demorec.datasets.lerobot.robots import RobotRecord, portable_urdf, read_robot
 from demorec.mcap import SimulatedRecording
+from demorec.sources.dataset_import import import_lerobot
 from demorec.view import robot as played_robot
 from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.from_dataset import open_dataset_episode
@@ -229,7 +230,7 @@ def meshes_in(path: Path) -> set[str]:
     }
 
 
-def test_a_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
+def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     given = collected(num_frames=12)
     degrees = [replace(feature, units=("deg", "rad", "")) for feature in given.info.features[:1]]
     given = replace(given, info=replace(given.info, features=(*degrees, *given.info.features[1:])))
@@ -278,6 +279,11 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
     assert names[3] is None
     assert len(list((tmp_path / "d" / "demorec" / "robots").iterdir())) == 4
     assert 'xyz="0.4 0 0"' in read_robot(tmp_path / "d", names[1]).urdf
+    imported = import_lerobot(tmp_path / "d", tmp_path / "run")
+    assert (imported.num_new, "demorec/robots" in imported.left_out) == (4, True)
+    with open_dataset_episode(tmp_path / "d", 1) as played:
+        assert isinstance(played, PlayedExternal)
+        assert 'xyz="0.4 0 0"' in played.info.urdf
     assert level_of(tmp_path / "d", "dataset_robots", "dataset") == "pass"
 
 

@@ -19,7 +19,7 @@ from demorec.cli.export import Export
 from demorec.cli.generate import Generate
 from demorec.cli.shared.flags import parse
 from demorec.core.config import GenerateConfig, VideoConfig
-from demorec.datasets.lerobot.commands import flags
+from demorec.datasets.lerobot.card import flags
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.variation import Ranges
 from demorec.mcap import SimulatedRecording

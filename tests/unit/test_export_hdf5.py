@@ -147,24 +147,19 @@ def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
     env.close()
 
 
-def test_another_hdf5_file_is_not_replaced(run: Path, tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "d.hdf5", "w") as file:
+def test_the_file_of_somebody_else_is_not_replaced(run: Path, tmp_path: Path) -> None:
+    """Of another layout, and of robomimic's, but not by demorec."""
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["thesis"] = np.arange(5)
-    before = (tmp_path / "d.hdf5").read_bytes()
-    with pytest.raises(ConfigError, match="it is not a robomimic dataset"):
-        export(run, tmp_path / "d.hdf5", "hdf5", overwrite=True)
-    assert (tmp_path / "d.hdf5").read_bytes() == before
-
-
-def test_the_robomimic_dataset_of_somebody_else_is_not_replaced(run: Path, tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "d.hdf5", "w") as file:
+    with h5py.File(tmp_path / "b.hdf5", "w") as file:
         data = file.create_group("data")
         data.attrs["env_args"], data.attrs["total"] = json.dumps({"env_name": "Lift", "type": 1, "env_kwargs": {}}), 5
         data.create_group("demo_0")["actions"] = np.zeros((5, 7))
-    before = (tmp_path / "d.hdf5").read_bytes()
-    with pytest.raises(ConfigError, match="it is not a robomimic dataset"):
-        export(run, tmp_path / "d.hdf5", "hdf5", overwrite=True)
-    assert (tmp_path / "d.hdf5").read_bytes() == before
+    for path in sorted(tmp_path.iterdir()):
+        before = path.read_bytes()
+        with pytest.raises(ConfigError, match="it is not a robomimic dataset"):
+            export(run, path, "hdf5", overwrite=True)
+        assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,8 @@ from support.present import present
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.bitstream import parameter_sets
 from demorec.datasets.lerobot.depth import code_values, depth_video, quantised
-from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer, parameter_sets
 from demorec.mcap import VideoPacket, VideoSettings
 from demorec.mcap.video import decode, is_keyframe, make_encoder
 
@@ -39,7 +38,7 @@ def encoded(
 
 def coded(
     codec: str, count: int, *, fps: int = 30, seed: int = 0, crf: int | None = None
-) -> tuple[CodedVideo, list[np.ndarray[Any, Any]]]:
+) -> tuple[EncodedVideo, list[np.ndarray[Any, Any]]]:
     """A video and what a decoder makes of its packets."""
     settings, packets = encoded(codec, count, fps=fps, seed=seed, crf=crf)
     video_packets = [
@@ -50,9 +49,9 @@ def coded(
     return video_of(codec, packets), decoded
 
 
-def video_of(codec: str, packets: list[bytes]) -> CodedVideo:
+def video_of(codec: str, packets: list[bytes]) -> EncodedVideo:
     lengths = [len(packet) for packet in packets]
-    return CodedVideo.of_access_units(codec, WIDTH, HEIGHT, b"".join(packets), lengths)
+    return EncodedVideo.of_access_units(codec, WIDTH, HEIGHT, b"".join(packets), lengths)
 
 
 @pytest.mark.parametrize(("codec", "fps"), [("h264", 30), ("h264", 7), ("h264", 240), ("av1", 30), ("av1", 15)])
@@ -137,7 +136,7 @@ def test_colours_are_described_as_in_the_recording(tmp_path: Path) -> None:
 def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
     _, units = encoded("av1", 3)
     for nothing in (b"", b"\x12\x00"):  # the second is a temporal delimiter alone
-        with pytest.raises(ExportError, match="no picture"):
+        with pytest.raises(ExportError, match="no image"):
             video_of("av1", [*units, nothing])
     garbage = video_of("h264", [SHORT + NAL["sps"] + SHORT + NAL["idr"]])
     with pytest.raises(ExportError, match=r"cannot be written.*a\.mp4"):
@@ -152,7 +151,7 @@ def test_a_file_that_cannot_be_written_is_an_error_of_the_system(tmp_path: Path)
         Mp4Writer(tmp_path / "a.mp4", video, fps=30)
 
 
-def samples_of(video: CodedVideo) -> list[bytes]:
+def samples_of(video: EncodedVideo) -> list[bytes]:
     assert isinstance(video.samples, bytes)
     ends = np.cumsum(video.sizes).tolist()
     assert ends[-1] == len(video.samples)
@@ -258,4 +257,4 @@ def test_depth_codes_are_those_of_lerobots_formula_and_are_kept_without_loss(tmp
         error = np.abs(code_values()[found] - expected)[inside]
         assert error.max() < 0.5 * 13.5 * np.log(13.5 / 3.51) / 4095 * 1.01  # half a step at 10 m
     assert histogram.counts.sum() == 3 * HEIGHT * WIDTH
-    assert histogram.num_pictures == 3
+    assert histogram.num_images == 3

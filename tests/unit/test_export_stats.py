@@ -10,10 +10,16 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from demorec.datasets.lerobot.data_stats import data_statistics
 from demorec.datasets.lerobot.layout import DatasetFeature, data_schema
-from demorec.datasets.lerobot.stats import QUANTILES, PixelHistogram, Statistics, colour_levels, vector_statistics
-from demorec.datasets.lerobot.writer import merge_statistics
+from demorec.datasets.lerobot.stats import (
+    QUANTILES,
+    PixelHistogram,
+    Statistics,
+    colour_levels,
+    data_statistics,
+    merge_statistics,
+    vector_statistics,
+)
 
 
 def check(found: Statistics, column: NDArray[np.generic]) -> None:
@@ -90,7 +96,7 @@ def test_statistics_of_pictures_equal_those_of_numpy() -> None:
     pictures = rng.integers(0, 256, (5, 20, 30, 3)).astype(np.uint8)
     pictures[..., 1] //= 9
     counts = np.stack([np.bincount(pictures[..., c].ravel(), minlength=256) for c in range(3)])
-    found = PixelHistogram(counts=counts, level_values=colour_levels(), num_pictures=5).statistics()
+    found = PixelHistogram(counts=counts, level_values=colour_levels(), num_images=5).statistics()
     expected = pictures.reshape(-1, 3) / 255
     for name, q in QUANTILES.items():
         assert np.allclose(found.values[name], np.quantile(expected, q, axis=0), atol=1e-15)

@@ -8,7 +8,7 @@ from pathlib import Path
 from demorec.cli.shared.output import tell
 from demorec.core.errors import ConfigError
 from demorec.core.replacing import use_as_source
-from demorec.datasets.lerobot.kind import DATASET as DATASET_KIND
+from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
 

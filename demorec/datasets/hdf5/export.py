@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from pathlib import Path
 
-from demorec.core.errors import ExportError
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import ConfigError, ExportError
 from demorec.core.replacing import check_replaceable, written_whole
+from demorec.core.tables import environment_name
+from demorec.datasets.episode import DONE, ExportEpisode, Simulated
 from demorec.datasets.exported import exported
-from demorec.datasets.hdf5.file import DATASET, UNFINISHED, NewFile
+from demorec.datasets.hdf5.file import (
+    DATASET,
+    ENV_ARGUMENTS,
+    EXTERNAL_ARGUMENTS,
+    EXTERNAL_ENVIRONMENT,
+    IMAGE_ARGUMENTS,
+    UNFINISHED,
+    NewFile,
+)
 from demorec.datasets.hdf5.options import Hdf5Options
-from demorec.datasets.hdf5.writer import RobomimicWriter
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import (
     ExportSource,
@@ -21,13 +36,15 @@ from demorec.datasets.sources import (
     is_wanted,
     places_of,
 )
+from demorec.episode.episode import SimulatedColumns, SimulatedInfo
+from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 from demorec.mcap import open_recording
 
 
 def export_hdf5(
     sources: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None = None
 ) -> ExportReport:
-    """Write the recordings into the file `out`: whole, or not at all. One picture is in memory at a time.
+    """Write the recordings into the file `out`: whole, or not at all. One image is in memory at a time.
 
     Args:
         sources: Recordings, runs, or folders of recordings.
@@ -38,7 +55,7 @@ def export_hdf5(
     Raises:
         ConfigError: Impossible options, nothing to export, or a file in the way.
         ExportError: Recordings that differ, a full disk. What was at `out` is still there then.
-        RecordingError: A recording is damaged, or lacks pictures that were asked for.
+        RecordingError: A recording is damaged, or lacks images that were asked for.
     """
     options.validate()
     found = find_recordings(sources, include_failures=options.include_failures)
@@ -88,3 +105,192 @@ def _write(
         skipped_unwanted=intake.skipped_unwanted,
         depth_left_out=intake.depth_left_out,
     )
+
+
+_GYM = 2
+"""`EnvType.GYM_TYPE` of robomimic."""
+_ROBOSUITE = {
+    STATE: {"robot0_joint_pos": slice(None, -1), "robot0_gripper_qpos": slice(-1, None)},
+    VELOCITY: {"robot0_joint_vel": slice(None, -1), "robot0_gripper_qvel": slice(-1, None)},
+    EE_POSE: {"robot0_eef_pos": slice(0, 3), "robot0_eef_quat": slice(3, 7)},
+    ENVIRONMENT_STATE: {"object": slice(None)},
+}
+"""Of simulated arms: feature -> robosuite's observations, and which elements each of them has."""
+
+
+class RobomimicWriter:
+    """Adds episodes to an empty file; `finish` completes it.
+
+    Attributes:
+        options: Of the export.
+        num_episodes, num_frames: Written so far.
+    """
+
+    def __init__(self, file: NewFile, options: Hdf5Options) -> None:
+        self.options = options
+        self.num_episodes = 0
+        self.num_frames = 0
+        self._file = file
+        self._data = file.root.create_group("data")
+
+    def add(self, episode: ExportEpisode) -> None:
+        """Append an episode: numbers at once, images one by one.
+
+        Raises:
+            ConfigError: It has no actions, two of its streams would get one name, or images are missing.
+            ExportError: It has no frames, a number that is not finite, or frames without an image.
+            RecordingError: It is damaged.
+        """
+        demo = self._data.create_group(f"demo_{self.num_episodes}")
+        self._write(demo, episode)
+        if self.num_episodes == 0:
+            self._data.attrs.update(_attributes(episode))
+        self.num_episodes += 1
+        self.num_frames += len(episode.rows)
+        self._file.flush()
+
+    def _write(self, demo: h5py.Group, episode: ExportEpisode) -> None:
+        """Fill in the group of an episode."""
+        observations, images = _observation_names(episode), _image_names(episode)
+        info, count = episode.recording.info, len(episode.rows)
+        demo.attrs["num_samples"] = count
+        demo.attrs["instruction"] = info.instruction
+        demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
+        if episode.origin:
+            demo.attrs["origin"] = episode.origin
+        if urdf := episode.urdf:
+            demo.attrs["model_file"] = urdf
+        dones = episode.scalar_columns[DONE].astype(np.int64)
+        if (success := episode.recording.success) is not None:
+            demo.attrs["success"] = success
+            demo["rewards"] = (dones * success).astype(np.float32)
+        demo["dones"] = dones
+        _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
+        if (simulated := episode.simulated) is not None:
+            _add_vectors(demo, "states", *_states(simulated.columns, episode.rows, simulated.recording.info))
+        group = demo.create_group("obs")
+        for name, (feature, elements) in observations.items():
+            _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
+        for name, camera in zip(images, episode.cameras, strict=True):
+            settings = episode.recording.video_settings(camera.name)
+            shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
+            _add_images(group, name, shape, episode.images(camera), self.options.compression)
+
+    def finish(self) -> None:
+        """Write what is known of all episodes together: their number of samples, and who is for validation."""
+        self._data.attrs["total"] = self.num_frames
+        share = Fraction(self.options.valid_share).limit_denominator(1_000_000)
+        numbers = range(self.num_episodes)
+        valid = [number for number in numbers if int((number + 1) * share) > int(number * share)]
+        train = [number for number in numbers if number not in set(valid)]
+        for name, chosen in (("train", train), ("valid", valid)):
+            self._file.root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
+
+
+def _observation_names(episode: ExportEpisode) -> dict[str, tuple[str, slice]]:
+    """Observation -> which elements of which feature: robosuite's names, or "force" for "observation.force".
+
+    Raises:
+        ConfigError: There are no actions, or two streams would get one name.
+    """
+    wanted = [name for name in episode.names if episode.options.takes(name)]
+    if ACTION not in wanted:
+        raise ConfigError(f"robomimic's layout needs actions, and the episode has none: {episode.recording.path}")
+    known = {} if episode.simulated is None else _ROBOSUITE
+    found = [
+        (name, (feature, elements))
+        for feature in wanted
+        if feature != ACTION
+        for name, elements in known.get(feature, {feature.removeprefix("observation."): slice(None)}).items()
+    ]
+    given = [*(name for name, _ in found), *_image_names(episode)]
+    if twice := sorted({name for name in given if given.count(name) > 1}):
+        raise ConfigError(
+            f"Two streams of the episode would be called {', '.join(twice)} in the file, leave one of them out "
+            f"(--features): {episode.recording.path}"
+        )
+    return dict(found)
+
+
+def _image_names(episode: ExportEpisode) -> list[str]:
+    """Of each camera: "front_image", or of a depth camera what the dataset calls it."""
+    return [
+        camera.feature.removeprefix(IMAGE_PREFIX) + ("" if camera.is_depth else "_image") for camera in episode.cameras
+    ]
+
+
+def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
+    """The attributes of `data`: what robomimic makes an environment from, and what else holds for all episodes.
+
+    Of an external episode there is no environment but its name.
+    """
+    arguments = {
+        "robot": episode.recording.info.robot_name,
+        "fps": episode.fps,
+        "cameras": [camera.name for camera in episode.cameras if not camera.is_depth],
+    }
+    if (simulated := episode.simulated) is None:
+        arguments["observations"] = [*_observation_names(episode), *_image_names(episode)]
+        assert arguments.keys() == EXTERNAL_ARGUMENTS
+        described = {"env_name": EXTERNAL_ENVIRONMENT, "type": _GYM, "env_kwargs": arguments}
+        return {"env_args": json.dumps(described), "fps": episode.fps}
+    return {**_environment(simulated, episode, arguments), "fps": episode.fps}
+
+
+def _environment(simulated: Simulated, episode: ExportEpisode, arguments: dict[str, object]) -> dict[str, str | int]:
+    info, options = simulated.recording.info, episode.options
+    cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
+    arguments |= {
+        "physics_hz": info.physics_hz,
+        **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
+        "action": options.action,
+        "privileged": options.privileged,
+    }
+    assert arguments.keys() - IMAGE_ARGUMENTS == ENV_ARGUMENTS
+    described = {"env_name": environment_name(info.task), "type": _GYM, "env_kwargs": arguments}
+    return {"env_args": json.dumps(described), "task": info.task}
+
+
+def _states(
+    columns: SimulatedColumns, rows: NDArray[np.intp], info: SimulatedInfo
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """(T, D) float64 state of the simulated world as recorded, and the names of its components.
+
+    Positions (rad, fingers m) and velocities (rad/s, m/s) of all joints, then world_from_object of every movable body:
+    xyz (m) and quaternion xyzw.
+    """
+    parts = [columns.joint_position, columns.joint_velocity, *columns.object_poses.values()]
+    joints = info.robot.joint_names
+    names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
+    names += [f"{body}.{axis}" for body in columns.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    return np.concatenate(parts, axis=1)[rows], tuple(names)
+
+
+def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], components: Sequence[str]) -> None:
+    """(T, D) numbers as a dataset whose attribute `names` has those of the D components."""
+    stored = group.create_dataset(name, data=values)
+    stored.attrs["names"] = json.dumps(components)
+
+
+def _add_images(
+    group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
+) -> None:
+    """A stream of images, each a compressed chunk of its own, so that one is read by itself.
+
+    Args:
+        group: Where it goes.
+        name: Of the dataset.
+        shape: Of all images: (T, H, W, 3) of colours, uint8; (T, H, W, 1) of distances, float32.
+        images: One after the other.
+        compression: Level of gzip, 0 for none.
+    """
+    stored = group.create_dataset(
+        name,
+        shape,
+        np.uint8 if shape[-1] == 3 else np.float32,
+        chunks=(1, *shape[1:]),
+        compression="gzip" if compression else None,
+        compression_opts=compression or None,
+    )
+    for index, image in enumerate(images):
+        stored[index] = image.reshape(shape[1:])

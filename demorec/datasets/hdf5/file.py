@@ -19,7 +19,7 @@ from demorec.datasets.hdf5 import trial
 
 ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "privileged"})
 """What `env_args` says of every environment of ours, by which our files are known."""
-PICTURE_ARGUMENTS = frozenset({"width", "height"})
+IMAGE_ARGUMENTS = frozenset({"width", "height"})
 """What it says of environments with cameras beside."""
 EXTERNAL_ENVIRONMENT = "demorec/collected"
 """What stands for an environment in files of external episodes, which have none."""
@@ -58,7 +58,7 @@ def _is_our_dataset(path: Path) -> bool:
             given = set(described["env_kwargs"])
             if described["env_name"] == EXTERNAL_ENVIRONMENT:
                 return given == EXTERNAL_ARGUMENTS
-            return str(described["env_name"]).startswith("demorec/") and given - PICTURE_ARGUMENTS == ENV_ARGUMENTS
+            return str(described["env_name"]).startswith("demorec/") and given - IMAGE_ARGUMENTS == ENV_ARGUMENTS
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, RecursionError):
         return False
 

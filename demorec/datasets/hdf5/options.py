@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from demorec.core.errors import OptionError, check_option
-from demorec.datasets.exporter import Exporter
-from demorec.datasets.options import CommonOptions
+from demorec.datasets.options import CommonOptions, Exporter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,7 +15,7 @@ class Hdf5Options(CommonOptions):
     valid_share: float = 0.1
     """Share of the episodes that mask/valid names, spread evenly; mask/train names the others."""
     compression: int = 4
-    """Level of gzip for pictures, 0 (none) to 9 (smallest)."""
+    """Level of gzip for images, 0 (none) to 9 (smallest)."""
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
@@ -27,7 +26,7 @@ class Hdf5Options(CommonOptions):
 
 
 HDF5 = Exporter(
-    summary="robomimic's layout, one HDF5 file: decoded pictures, the same numbers, masks for training and validation",
+    summary="robomimic's layout, one HDF5 file: decoded images, the same numbers, masks for training and validation",
     options=Hdf5Options,
     function="demorec.datasets.hdf5.export:export_hdf5",
 )

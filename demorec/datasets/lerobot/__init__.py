@@ -1,6 +1,6 @@
 """LeRobot v3.0: recordings to datasets, and datasets read, whoever wrote them.
 
-`export_lerobot` makes one; `dataset_info` and `dataset_digest` tell what is in one. The names are
+`export_lerobot` makes one; `dataset_digest` says what is in one. The names are
 imported when they are used, so that a command's --help need not wait for PyArrow and PyAV.
 """
 
@@ -10,18 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.export import export_lerobot
-    from demorec.datasets.lerobot.inspect import DatasetSummary, dataset_digest, dataset_info
+    from demorec.datasets.lerobot.inspect import dataset_digest
     from demorec.datasets.lerobot.options import ExportOptions
     from demorec.datasets.lerobot.paths import is_dataset
     from demorec.datasets.options import ExportReport, ProgressCallback
 
 __all__ = [
-    "DatasetSummary",
     "ExportOptions",
     "ExportReport",
     "ProgressCallback",
     "dataset_digest",
-    "dataset_info",
     "export_lerobot",
     "is_dataset",
 ]

@@ -1,4 +1,4 @@
-"""COCO annotations of a dataset's pictures, one JSON file for each camera, written as the episodes come."""
+"""COCO annotations of a dataset's images, one JSON file for each camera, written as the episodes come."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class EpisodeBoxes:
     """What one camera sees in one episode.
 
     Attributes:
-        width, height: Of the pictures, px.
+        width, height: Of the images, px.
         num_frames: How many there are.
         objects: What is seen, row by row.
     """
@@ -100,7 +100,7 @@ class BoxWriter:
 
 
 class _CameraFile:
-    """One COCO file; the pictures' descriptions wait in a file beside it, since they come at the same time."""
+    """One COCO file; the images' descriptions wait in a file beside it, since they come at the same time."""
 
     def __init__(self, path: Path, key: str, fps: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

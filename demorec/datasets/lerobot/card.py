@@ -5,22 +5,22 @@ Everything in it is read back from the finished dataset, so it is right after an
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from demorec.core.config import GenerateConfig, parse_config
+from demorec.core.errors import ConfigError
 from demorec.core.text import markdown, printable
-from demorec.datasets.lerobot.attempts import ATTEMPT_SCHEMA
-from demorec.datasets.lerobot.commands import making_commands
 from demorec.datasets.lerobot.files import read_table
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
@@ -28,7 +28,8 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
 from demorec.datasets.lerobot.robots import ROBOTS_DIR
-from demorec.datasets.lerobot.stills import pictures_at
+from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
+from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import write_text
 from demorec.datasets.staging import sync_file
 from demorec.episode.features import (
@@ -175,7 +176,7 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
         yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_meaning(key, item, about)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
     yield from (_SIMULATED_ROWS if about.is_simulated else _EXTERNAL_ROWS, "")
-    yield from _success_section(_read_attempts(root))
+    yield from _success_section(root)
     yield from ("## What stands beside", "", _BESIDE_SIMULATED if about.is_simulated else _BESIDE_EXTERNAL)
     yield from _robot_section(root)
     yield ""
@@ -233,61 +234,35 @@ def _origin_section(root: Path, about: CardFacts) -> Iterable[str]:
 # ------------------------------------------------------------------------------------------------------ success rates
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Attempts:
-    success: NDArray[np.bool_]  # (N,)
-    reasons: list[str]
-    num_unknown: int
-    positions: Mapping[str, NDArray[np.float64]]  # what -> (N, 2), nan where unknown
-
-
-def _read_attempts(root: Path) -> _Attempts:
+def _success_section(root: Path) -> Iterable[str]:
     columns = ["success", "failure_phase", "failure_reason", "object_x", "object_y", "goal_x", "goal_y"]
     files = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
-    table = pa.concat_tables([read_table(file, columns, schema=ATTEMPT_SCHEMA) for file in files])
-    is_known = pc.is_valid(table.column("success"))
-    num_unknown = len(table) - int(pc.sum(is_known).as_py() or 0)
-    table = table.filter(is_known)
-    coordinates = {name: table.column(name).to_numpy().astype(np.float64) for name in columns[3:]}
-    reasons = [
-        f"{reason} in phase {phase}" if phase else reason
-        for phase, reason in zip(
-            table.column("failure_phase").to_pylist(), table.column("failure_reason").to_pylist(), strict=True
-        )
-    ]
-    return _Attempts(
-        success=table.column("success").to_numpy().astype(np.bool_),
-        reasons=reasons,
-        num_unknown=num_unknown,
-        positions={
-            "object": np.stack([coordinates["object_x"], coordinates["object_y"]], axis=1),
-            "goal": np.stack([coordinates["goal_x"], coordinates["goal_y"]], axis=1),
-        },
-    )
-
-
-def _success_section(attempts: _Attempts) -> Iterable[str]:
-    total, good = len(attempts.success), int(attempts.success.sum())
+    rows = [row for file in files for row in read_table(file, columns, schema=ATTEMPT_SCHEMA).to_pylist()]
+    known = [row for row in rows if row["success"] is not None]
+    success = np.array([row["success"] for row in known], dtype=np.bool_)
+    total, good = len(success), int(success.sum())
     yield "## Success"
     yield ""
-    if attempts.num_unknown:
-        yield f"Of {attempts.num_unknown} episodes nobody said whether they succeeded."
+    if num_unknown := len(rows) - total:
+        yield f"Of {num_unknown} episodes nobody said whether they succeeded."
         yield ""
     if not total:
         return
     yield f"{good} of {total} attempts that were made for this dataset succeeded ({100 * good / total:.1f} %)."
     counts: dict[str, int] = {}
-    for reason, success in zip(attempts.reasons, attempts.success, strict=True):
-        if not success:
-            counts[reason] = counts.get(reason, 0) + 1
+    for row in (row for row in known if not row["success"]):
+        phase, reason = row["failure_phase"], str(row["failure_reason"])
+        reason = f"{reason} in phase {phase}" if phase else reason
+        counts[reason] = counts.get(reason, 0) + 1
     for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
         yield f"- {count} failed: {markdown(reason) or 'no reason recorded'}"
     yield ""
-    for what, positions in attempts.positions.items():
+    for what in ("object", "goal"):
+        positions = np.array([[row[f"{what}_x"], row[f"{what}_y"]] for row in known], dtype=np.float64)
         if total >= 2 and np.isfinite(positions).all():
             yield f"By the start position of the {what} (successes / attempts, world frame):"
             yield ""
-            yield from success_table(positions, attempts.success)
+            yield from success_table(positions, success)
             yield ""
 
 
@@ -329,7 +304,7 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
         label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
         draw.text((4, top + 1), printable(label), fill="black", font=font)
         moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
-        for column, picture in enumerate(pictures_at(root, info, key, place, moments)):
+        for column, picture in enumerate(EpisodeVideo(root, info, key, place).images_at(moments)):
             corner = column * (size[0] + _GAP), top + _LABEL
             sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
             time = f"{moments[column] / info.fps:.1f} s"
@@ -342,3 +317,54 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
     sheet.save(path, quality=85)
     sync_file(path)
     return True
+
+
+_NOT_TOLD = ("append", "overwrite", "verify", "workers", "push_to_hub", "public")
+"""Options of an export that leave the dataset's content alone."""
+
+
+def making_commands(root: Path, configs: Mapping[str, Any], options: ExportOptions) -> list[str]:
+    """The two commands that generate the run and export it; none where that is not all of the dataset's story.
+
+    That is so when it was made from several runs or by several exports, from replayed or rendered episodes, or by
+    another version of demorec whose configuration this one does not understand.
+
+    Args:
+        root: The finished dataset.
+        configs: Config digest -> configuration of the runs.
+        options: Of the export.
+    """
+    files = sorted((root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+    rows = [row for file in files for row in read_table(file, ["run_episode_index", "origin"]).to_pylist()]
+    if options.append or len(configs) != 1 or any(row["origin"] for row in rows):
+        return []
+    try:
+        config = parse_config(next(iter(configs.values())), GenerateConfig, source="the configuration")
+        config.check_names(config.modules)
+    except ConfigError:
+        return []
+    num_episodes = 1 + max(row["run_episode_index"] for row in rows)
+    generating = [f"--num-episodes {num_episodes}", *flags(config, GenerateConfig()), "--no-export --out run"]
+    exporting = [f"--repo-id {shlex.quote(options.repo_id)}", *flags(options, ExportOptions(repo_id=options.repo_id))]
+    return [
+        f"generate-dataset {' '.join(generating)}",
+        f"demorec export lerobot run --out dataset {' '.join(exporting)}",
+    ]
+
+
+def flags(values: Any, defaults: Any) -> Iterator[str]:
+    """The flags that turn one dataclass into another of its kind: `--seed 7`, `--no-antialias`, `--cameras front`."""
+    for field in dataclasses.fields(values):
+        value, default = getattr(values, field.name), getattr(defaults, field.name)
+        name = field.name.replace("_", "-")
+        if field.name in _NOT_TOLD or value == default:
+            continue
+        if dataclasses.is_dataclass(value):
+            yield from flags(value, default)
+        elif isinstance(value, bool):
+            yield f"--{name}" if value else f"--no-{name}"
+        elif isinstance(value, tuple):
+            words = value or (("none",) if default else ())  # --cameras none, but a bare --language names no kinds
+            yield " ".join([f"--{name}", *(shlex.quote(str(word)) for word in words)])
+        else:
+            yield f"--{name} {'auto' if value is None else shlex.quote(str(value))}"

@@ -1,7 +1,7 @@
 """The files of a dataset of unknown origin, opened within bounds: JSON, Parquet tables, mp4 videos.
 
 Anyone writes LeRobot datasets, and people pass them on. A table of a few kB can claim a thousand million rows, a video
-as many pictures, and under the name of either may lie something that is no file at all.
+as many images, and under the name of either may lie something that is no file at all.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, in_words, resource_error
 from demorec.core.files import open_regular, read_text_limited
@@ -48,6 +50,18 @@ def read_json(path: Path) -> Any:
         ValueError: It is no JSON, or nested very deeply.
     """
     return parse_json(read_text_limited(path, MAX_JSON_BYTES), allow_nan=True)
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The objects of a file with one in each line; ExportError when it cannot be read, or holds anything else."""
+    try:
+        lines = read_text_limited(path, MAX_JSON_BYTES).splitlines()
+        found = [parse_json(line, allow_nan=True) for line in lines if line.strip()]
+        if not all(isinstance(line, dict) for line in found):
+            raise ValueError("a line is no object")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The table cannot be read ({in_words(error)}): {path}") from error
+    return found
 
 
 def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
@@ -123,6 +137,14 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.S
         return pa.Table.from_batches(batches, schema=batches[0].schema if batches else found)
 
 
+def column_numbers(column: pa.Array) -> NDArray[Any]:
+    """(T, D) numbers of a data column, D = 1 for a scalar one."""
+    if pa.types.is_fixed_size_list(column.type) or pa.types.is_list(column.type):
+        flat = column.flatten().to_numpy(zero_copy_only=False)
+        return np.asarray(flat).reshape(len(column), -1)
+    return np.asarray(column.to_numpy(zero_copy_only=False)).reshape(-1, 1)
+
+
 @contextmanager
 def _table_errors(path: Path) -> Iterator[None]:
     """Turn what PyArrow raises into an ExportError; lack of memory says nothing about the table."""
@@ -185,7 +207,7 @@ def _most_bytes(size: int) -> int:
 
 
 def check_video(path: Path) -> None:
-    """Refuse what no decoder should be given: no regular mp4 file, or one that claims more pictures than it can hold.
+    """Refuse what no decoder should be given: no regular mp4 file, or one that claims more images than it can hold.
 
     Raises:
         ExportError: That.
@@ -197,7 +219,7 @@ def check_video(path: Path) -> None:
     except (OSError, ValueError, struct.error) as error:
         raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
     if claimed > size:
-        raise ExportError(f"The video claims {claimed:,} bytes or pictures, but has {size:,} bytes: {path}")
+        raise ExportError(f"The video claims {claimed:,} bytes or images, but has {size:,} bytes: {path}")
 
 
 def _samples(file: BinaryIO, size: int) -> Iterator[int]:

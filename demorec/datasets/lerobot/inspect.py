@@ -1,80 +1,32 @@
-"""What a dataset holds: a summary, and the digest of its content recomputed from its files."""
+"""What a dataset holds: attempts, what is missing, and the digest of its content recomputed from its files."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.core.errors import ExportError, in_words, resource_error, without_path
-from demorec.datasets.lerobot.digest import combined_digest, episode_digest
 from demorec.datasets.lerobot.files import check_video, open_table, read_json, read_table
-from demorec.datasets.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo
+from demorec.datasets.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.reader import PacketReader, RowReader, episode_places, read_tasks
+from demorec.datasets.lerobot.reader import RowReader, episode_places, read_tasks
+from demorec.datasets.lerobot.videos import PacketReader
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetSummary:
-    """What `demorec info` tells about a dataset.
-
-    Attributes:
-        path: Folder.
-        fps, robot_type, num_episodes, num_frames: As info.json says.
-        tasks: Instructions.
-        features: (name, dtype, shape, component names or None).
-        cameras: (name, width, height, codec).
-        num_files, num_bytes: On disk.
-        num_successes: Episodes that succeeded, None in a dataset that does not tell.
-        num_attempts: Attempts that were made for it, None where unknown.
-    """
-
-    path: Path
-    fps: int
-    robot_type: str | None
-    num_episodes: int
-    num_frames: int
-    tasks: tuple[str, ...]
-    features: tuple[tuple[str, str, tuple[int, ...], tuple[str, ...] | None], ...]
-    cameras: tuple[tuple[str, int, int, str], ...]
-    num_files: int
-    num_bytes: int
-    num_successes: int | None
-    num_attempts: int | None
-
-
-def dataset_info(path: Path) -> DatasetSummary:
-    """Read the summary of a LeRobot v3.0 dataset, whoever wrote it.
+def attempt_counts(path: Path) -> tuple[int, int] | None:
+    """(episodes that succeeded, attempts that were made) of a dataset that demorec wrote; None for anybody else's.
 
     Raises:
-        ExportError: None there, or damaged.
+        ExportError: Its tables are damaged.
     """
-    info = DatasetInfo.load(path)
-    files = [file for file in path.rglob("*") if file.is_file()]
-    attempts = sorted((path / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
-    successes = sorted((path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts) if attempts else None
+    successes, attempts = (sorted((path / SIDECAR_DIR / name).glob("*/*.parquet")) for name in ("episodes", "attempts"))
+    if not attempts:
+        return None
     columns = [read_table(file, ["success"]).column("success") for file in successes]
-    return DatasetSummary(
-        path=path,
-        fps=info.fps,
-        robot_type=info.robot_type,
-        num_episodes=info.total_episodes,
-        num_frames=info.total_frames,
-        tasks=tuple(read_tasks(path)) if info.total_tasks else (),
-        features=tuple((name, item.dtype, item.shape, item.names) for name, item in info.features.items()),
-        cameras=tuple(
-            (name, item.shape[1], item.shape[0], str((item.info or {}).get("video.codec", "")))
-            for name, item in info.features.items()
-            if item.is_video
-        ),
-        num_files=len(files),
-        num_bytes=sum(file.stat().st_size for file in files),
-        num_successes=sum(column.to_pylist().count(True) for column in columns) if columns else None,
-        num_attempts=num_attempts,
-    )
+    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts)
+    return sum(column.to_pylist().count(True) for column in columns), num_attempts
 
 
 def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
@@ -84,18 +36,18 @@ def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
     """
     problems: list[str] = []
     rows: dict[str, int] = {}
-    for place in ("data", "meta/episodes"):
+    for place in ("data", *(() if info.is_old else ("meta/episodes",))):
         rows[place] = 0
         for file in sorted((path / place).glob("*/*.parquet")):
             with _noted(problems, path):
                 rows[place] += open_table(file).metadata.num_rows
     if not problems:
         for place, said in (("data", info.total_frames), ("meta/episodes", info.total_episodes)):
-            if rows[place] != said:
+            if rows.get(place, said) != said:
                 problems.append(f"The tables in {place} have {rows[place]} rows, {INFO_PATH} counts {said}")
     with _noted(problems, path):
         read_tasks(path)
-    if not (path / STATS_PATH).exists():
+    if not info.is_old and not (path / STATS_PATH).exists():
         problems.append(f"The statistics are missing: {STATS_PATH}")
     with _noted(problems, path):
         check_tables(path)
@@ -170,10 +122,10 @@ def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
             columns = rows.read(place)
             videos = {}
             for key, packets in cameras.items():
-                pictures = hashlib.sha256()
+                images = hashlib.sha256()
                 for sample in packets.read(place):
-                    pictures.update(sample)
-                videos[key] = pictures.hexdigest()
+                    images.update(sample)
+                videos[key] = images.hexdigest()
             task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
             if not 0 <= task_index < len(tasks):  # which NaN, what a null was read as, is neither
                 raise ExportError(f"Episode {place.episode_index} has no task: {path}")

@@ -1,17 +1,27 @@
-"""Where everything of a LeRobot v3.0 dataset lies and how its schema is written down; nothing is computed here."""
+"""Where everything of a LeRobot dataset lies, how its schema is written down, and the digest of its content.
+
+The digest is the same whatever the files' sizes, their compression or their number. An episode's covers its task, its
+numbers and the encoded images as they lie in the mp4 file; that of the dataset covers fps, robot, features and the
+episodes in order. Positions in the dataset (`index`, `episode_index`, `task_index`) are left out, so that an episode
+keeps its digest wherever it is put.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import reprlib
 import shlex
 import string
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, in_words
 from demorec.datasets.lerobot.files import read_json
@@ -19,6 +29,9 @@ from demorec.datasets.lerobot.language import TYPES, language_feature
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
 
 CODEBASE_VERSION = "v3.0"
+"""Of what is written."""
+OLD_VERSIONS = ("v2.0", "v2.1")
+"""Also read: a file of rows and of each camera for each episode, and tables as lines of JSON."""
 MEBIBYTE = 2**20
 
 _CHUNK = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -27,6 +40,7 @@ EPISODES_PATH = f"meta/episodes/{_CHUNK}.parquet"
 VIDEO_PATH = "videos/{video_key}/" + f"{_CHUNK}.mp4"
 TASKS_PATH = "meta/tasks.parquet"
 STATS_PATH = "meta/stats.json"
+OLD_EPISODES_PATH, OLD_TASKS_PATH = "meta/episodes.jsonl", "meta/tasks.jsonl"
 
 SIDECAR_EPISODES_PATH = f"{SIDECAR_DIR}/episodes/{_CHUNK}.parquet"
 SIDECAR_ATTEMPTS_PATH = f"{SIDECAR_DIR}/attempts/{_CHUNK}.parquet"
@@ -138,9 +152,24 @@ class FilePosition:
         return template.format(chunk_index=self.chunk, file_index=self.file, video_key=video_key)
 
 
+def next_position(folder: Path, chunks_size: int) -> FilePosition:
+    """The first number that no file of a folder (chunk-CCC/file-FFF.*) has, counting from the last one."""
+    last: FilePosition | None = None
+    for path in folder.glob("chunk-*/file-*"):
+        chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
+        if chunk.isdigit() and file.isdigit():
+            position = FilePosition(chunk=int(chunk), file=int(file))
+            if last is None or (position.chunk, position.file) > (last.chunk, last.file):
+                last = position
+    return FilePosition() if last is None else last.next(chunks_size)
+
+
 @dataclass(frozen=True, kw_only=True)
 class DatasetInfo:
-    """What meta/info.json says."""
+    """What meta/info.json says.
+
+    Templates of paths are those of v3.0: in an older dataset `file_index` is the number of the episode.
+    """
 
     fps: int
     features: dict[str, DatasetFeature]
@@ -154,6 +183,12 @@ class DatasetInfo:
     data_path: str = DATA_PATH
     video_path: str | None = VIDEO_PATH
     other: dict[str, Any] = field(default_factory=dict)
+    version: str = CODEBASE_VERSION
+
+    @property
+    def is_old(self) -> bool:
+        """Whether it is of a format before v3.0."""
+        return self.version in OLD_VERSIONS
 
     @property
     def video_keys(self) -> tuple[str, ...]:
@@ -191,12 +226,17 @@ class DatasetInfo:
         try:
             data = read_json(path)
             version = data.pop("codebase_version")
-            if version != CODEBASE_VERSION:
-                raise ExportError(_other_version(version, root))
+            if version not in (CODEBASE_VERSION, *OLD_VERSIONS):
+                found = f"The dataset has format {reprlib.repr(version).strip("'")}"
+                raise ExportError(
+                    f"{found}, those that are read are {', '.join(OLD_VERSIONS)} and {CODEBASE_VERSION}: {root}"
+                )
             data.pop("splits", None)
             features = {name: DatasetFeature.from_json(entry) for name, entry in data.pop("features").items()}
             known = {name: data.pop(name) for name in list(data) if name in _INFO_FIELDS}
-            info = cls(features=features, other=data, **known)
+            if version in OLD_VERSIONS:
+                known |= {name: _as_new(known[name]) for name in ("data_path", "video_path") if known.get(name)}
+            info = cls(features=features, other=data, version=version, **known)
             info._check()
         except OSError as error:
             raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
@@ -228,22 +268,24 @@ class DatasetInfo:
                 _check_template(template)
 
 
-def _other_version(version: object, root: Path) -> str:
-    """What to do with a dataset of another version of the format, in a sentence; the command is LeRobot 0.6.1's."""
-    found = f"The dataset has format {reprlib.repr(version).strip("'")}, expected {CODEBASE_VERSION}"
-    if version == "v2.1":
-        root = root.resolve()
-        arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
-        # The converter deletes what has these names, or puts it in the dataset's place.
-        taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
-        return (
-            f"{found}; {f'move {" and ".join(taken)} away first, then ' if taken else ''}LeRobot converts it in its "
-            f"place and leaves the old one beside it, as {root.name}_old: python -m "
-            f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
-        )
-    if str(version).startswith(("v1.", "v2.")):
-        found += "; LeRobot 0.6 converts from v2.1 on, so bring it to v2.1 with the LeRobot that wrote it"
-    return f"{found}: {root}"
+def _as_new(template: object) -> object:
+    """A template of paths with the placeholders of v3.0."""
+    if not isinstance(template, str):
+        return template
+    return template.replace("{episode_chunk", "{chunk_index").replace("{episode_index", "{file_index")
+
+
+def how_to_convert(root: Path) -> str:
+    """The command of LeRobot 0.6.1 that converts a dataset of v2.1, for a sentence."""
+    root = root.resolve()
+    arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
+    # The converter deletes what has these names, or puts it in the dataset's place.
+    taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
+    first = f"move {' and '.join(taken)} away first, then " if taken else ""
+    return (
+        f"{first}LeRobot converts it in its place and leaves the old one beside it, as {root.name}_old: python -m "
+        f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
+    )
 
 
 def _is_count(value: object, low: int, high: int) -> bool:
@@ -310,3 +352,35 @@ def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
             fields.append(pa.field(name, pa.list_(pa.field("element", arrow_type), length)))
             described[name] = {"feature": value, "length": length, "_type": "List"}
     return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": described}})})
+
+
+_POSITIONS = frozenset(("index", "episode_index", "task_index"))
+
+
+def episode_digest(task: str, columns: Mapping[str, NDArray[Any]], videos: Mapping[str, str]) -> str:
+    """SHA-256 (hex) of one episode.
+
+    Args:
+        task: Instruction.
+        columns: Feature -> (T,) or (T, D); the positions may be among them.
+        videos: Camera feature -> SHA-256 (hex) of its images' bytes one after the other.
+    """
+    result = hashlib.sha256(json.dumps(task).encode())
+    for name in sorted(columns):
+        if name not in _POSITIONS:
+            values = np.ascontiguousarray(columns[name])
+            flat = values.reshape(len(values), -1)
+            result.update(f"{name} {values.dtype.str} {flat.shape}".encode())
+            result.update(flat.tobytes())
+    for name in sorted(videos):
+        result.update(f"{name} {videos[name]}".encode())
+    return result.hexdigest()
+
+
+def combined_digest(info: DatasetInfo, episodes: Iterable[str]) -> str:
+    """SHA-256 (hex) of a dataset, from the digests of its episodes in order."""
+    features = {name: [item.dtype, list(item.shape), item.names] for name, item in sorted(info.features.items())}
+    result = hashlib.sha256(json.dumps([info.fps, info.robot_type, features]).encode())
+    for episode in episodes:
+        result.update(episode.encode())
+    return result.hexdigest()

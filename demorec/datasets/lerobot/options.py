@@ -9,8 +9,7 @@ from typing import Literal
 from demorec.annotate.kinds import KINDS, LanguageKind
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, OptionError
-from demorec.datasets.exporter import Exporter
-from demorec.datasets.options import CommonOptions
+from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 
 
@@ -55,13 +54,13 @@ class ExportOptions(CommonOptions):
     files_per_chunk: int = 1000
     """How many files a chunk folder holds."""
     transcode_codec: Literal["h264", "av1"] = "h264"
-    """Codec of pictures that cannot be taken as they are (jpeg, or --fps between keyframes)."""
+    """Codec of images that cannot be taken as they are (jpeg, or --fps between keyframes)."""
     transcode_crf: int | None = 18
-    """Constant rate factor of such pictures, smaller is better; auto is that of a recording."""
+    """Constant rate factor of such images, smaller is better; auto is that of a recording."""
 
     @property
     def transcode(self) -> VideoConfig:
-        """How pictures are coded that cannot be taken as they are."""
+        """How images are encoded that cannot be taken as they are."""
         return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
 
     @property

@@ -1,44 +1,33 @@
-"""One recording to one episode of a dataset: features, coded pictures, statistics of the pixels, sidecar row."""
+"""One recording to one episode of a dataset: features, encoded images, statistics of the pixels, sidecar row."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
+from itertools import islice
 from typing import Any
+
+import numpy as np
 
 from demorec.annotate.masks import seen_objects
 from demorec.annotate.narration import Statement, narrate
 from demorec.annotate.progress import dense_runs
 from demorec.annotate.tries import story_of
-from demorec.core.errors import ConfigError
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import EpisodeBoxes
 from demorec.datasets.lerobot.depth import depth_info, depth_video
-from demorec.datasets.lerobot.facts import episode_facts
+from demorec.datasets.lerobot.facts import EpisodeProgress, episode_facts
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, DatasetFeature
+from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.progress import EpisodeProgress
-from demorec.datasets.lerobot.sidecar import EpisodeRecord
 from demorec.datasets.lerobot.stats import PixelHistogram, colour_levels
-from demorec.datasets.lerobot.transcode import coded_videos, dataset_settings, reason_to_transcode, video_info
 from demorec.datasets.lerobot.writer import EpisodeData
 from demorec.episode.features import ACTION, IMAGE_PREFIX
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PreparedEpisode:
-    """What came of one recording: for the dataset, and for what stands beside it.
-
-    Attributes:
-        data: For the dataset.
-        record: For the sidecar.
-        boxes: Camera feature -> what it sees, if that was asked for.
-    """
-
-    data: EpisodeData
-    record: EpisodeRecord
-    boxes: Mapping[str, EpisodeBoxes] = field(default_factory=dict)
+from demorec.mcap import AnyRecording, VideoSettings
+from demorec.mcap.video import make_encoder
 
 
 def dataset_features(episode: ExportEpisode, options: ExportOptions) -> dict[str, DatasetFeature]:
@@ -68,19 +57,19 @@ def _camera_feature(episode: ExportEpisode, camera: ExportCamera, options: Expor
 
 
 def reasons_to_transcode(episode: ExportEpisode) -> dict[ExportCamera, str]:
-    """Colour camera -> why its images have to be coded anew, "" where they pass through."""
+    """Colour camera -> why its images have to be encoded anew, "" where they pass through."""
     return {camera: reason_to_transcode(episode, camera) for camera in episode.cameras if not camera.is_depth}
 
 
 def prepare_episode(
-    episode: ExportEpisode, options: ExportOptions, *, code_depth: bool = True, about: Collection[int] | None = None
-) -> PreparedEpisode:
+    episode: ExportEpisode, options: ExportOptions, *, encode_depth: bool = True, about: Collection[int] | None = None
+) -> EpisodeData:
     """Read an episode into memory, as the dataset wants it.
 
     Args:
         episode: Of an open recording.
         options: How.
-        code_depth: Whether depth videos, which must be coded, are made.
+        encode_depth: Whether depth videos, which must be encoded, are made.
         about: The rows whose images are spoken of, if language is asked for; None for all.
 
     Raises:
@@ -89,19 +78,19 @@ def prepare_episode(
         RecordingError: It is damaged.
     """
     wanted = dataset_features(episode, options)
-    videos = coded_videos(episode, reasons_to_transcode(episode), options.transcode)
+    videos = encoded_videos(episode, reasons_to_transcode(episode), options.transcode)
     pixels = {}
     for camera in episode.cameras:
         if not camera.is_depth:
             statistics = episode.recording.pixel_statistics(camera.name)
             pixels[camera.feature] = PixelHistogram(
-                counts=statistics.counts, level_values=colour_levels(), num_pictures=statistics.num_images
+                counts=statistics.counts, level_values=colour_levels(), num_images=statistics.num_images
             )
-        elif code_depth:
+        elif encode_depth:
             videos[camera.feature], pixels[camera.feature] = depth_video(episode.images(camera), fps=episode.fps)
         else:
             episode.numbers(camera)  # says what is missing
-    data = EpisodeData(
+    return EpisodeData(
         task=episode.recording.info.instruction,
         columns=episode.singles,
         videos=videos,
@@ -109,11 +98,6 @@ def prepare_episode(
         pixels=pixels,
         language=_language(episode, options, about),
         facts=_facts(episode, options),
-    )
-    return PreparedEpisode(
-        data=data,
-        record=EpisodeRecord.of(episode),
-        boxes=_boxes(episode) if options.boxes else {},
     )
 
 
@@ -147,7 +131,7 @@ def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
     return facts
 
 
-def _boxes(episode: ExportEpisode) -> dict[str, EpisodeBoxes]:
+def episode_boxes(episode: ExportEpisode) -> dict[str, EpisodeBoxes]:
     """Camera feature -> what it sees, of the cameras that have segmentation.
 
     Raises:
@@ -168,3 +152,111 @@ def _boxes(episode: ExportEpisode) -> dict[str, EpisodeBoxes]:
             f"{episode.recording.path}"
         )
     return boxes
+
+
+def reason_to_transcode(episode: ExportEpisode, camera: ExportCamera) -> str:
+    """Why the images of a camera cannot pass through as they are, in words; "" if they can.
+
+    With frames left out, the others stay decodable only if they are all keyframes.
+    """
+    settings = episode.recording.video_settings(camera.name)
+    if settings.codec == "jpeg":
+        return "jpeg images are no video"
+    numbers = episode.numbers(camera)
+    stride = _stride(episode)
+    if (np.diff(numbers) != stride).any():
+        return "frames show images again, or leave some out"
+    if stride > 1 and (settings.gop == 0 or stride % settings.gop):
+        return f"every {_ordinal(stride)} frame is taken and every {_ordinal(settings.gop)} is a keyframe"
+    if stride == 1 and len(numbers) and _lead(episode.recording, camera.name, int(numbers[0])) > len(numbers):
+        return "the keyframe that the first frame needs is further away than the episode is long"
+    return ""
+
+
+def _stride(episode: ExportEpisode) -> int:
+    return episode.recording.info.fps // episode.fps
+
+
+def _ordinal(number: int) -> str:
+    return {1: "1st", 2: "2nd", 3: "3rd"}.get(number, f"{number}th")
+
+
+def _lead(recording: AnyRecording, camera: str, number: int) -> int:
+    """How many images from the last keyframe on come before one: recordings of video begin with a keyframe."""
+    if number == 0:
+        return 0
+    packets = islice(recording.packets(camera), number + 1)
+    return number - max((packet.frame_index for packet in packets if packet.is_keyframe), default=0)
+
+
+def dataset_settings(episode: ExportEpisode, camera: ExportCamera, video: VideoConfig, reason: str) -> VideoSettings:
+    """How a camera's images are encoded in the dataset: as recorded, or, for a `reason`, as they will be transcoded."""
+    settings = episode.recording.video_settings(camera.name)
+    if reason:
+        return make_encoder(video=video, width=settings.width, height=settings.height, fps=episode.fps).settings
+    return replace(settings, fps=episode.fps, gop=settings.gop if _stride(episode) == 1 else 1)
+
+
+def encoded_videos(
+    episode: ExportEpisode, reasons: Mapping[ExportCamera, str], video: VideoConfig
+) -> dict[str, EncodedVideo]:
+    """Camera feature -> its images, one a frame: the recorded packets wherever there is no reason to transcode."""
+    recording = episode.recording
+    recorded = recording.coded_pictures([camera.name for camera, reason in reasons.items() if not reason])
+    videos = {}
+    for camera, reason in reasons.items():
+        settings = dataset_settings(episode, camera, video, reason)
+        codec, size = mp4_codec(settings), (settings.width, settings.height)
+        if reason:
+            encoder = make_encoder(video=video, width=size[0], height=size[1], fps=episode.fps)
+            units = [unit for image in episode.images(camera) for unit in encoder.encode(image)]
+            units += encoder.finish()
+            lengths = [len(unit) for unit in units]
+            videos[camera.feature] = EncodedVideo.of_access_units(codec, *size, b"".join(units), lengths)
+            continue
+        numbers = episode.numbers(camera)
+        is_whole = _stride(episode) == 1
+        lead = _lead(recording, camera.name, int(numbers[0])) if is_whole else 0
+        block = recorded.pop(camera.name)
+        if lead or len(block) != len(numbers):
+            taken = np.arange(numbers[0] - lead, numbers[-1] + 1) if is_whole else numbers
+            block = block.select(taken.astype(np.intp))
+        coded = EncodedVideo.of_access_units(codec, *size, block.joined(), block.lengths, lead)
+        if not is_whole and not coded.is_keyframe.all():
+            gop = recording.video_settings(camera.name).gop
+            raise ExportError(
+                f"The recording says that every {_ordinal(gop)} image of camera {camera.name} is a keyframe, "
+                f"but it is not so: {recording.path}"
+            )
+        videos[camera.feature] = coded
+    return videos
+
+
+def mp4_codec(settings: VideoSettings) -> str:
+    """The name that mp4 files and LeRobot have for the codec."""
+    return "hevc" if settings.codec == "h265" else settings.codec
+
+
+def video_info(settings: VideoSettings) -> dict[str, Any]:
+    """The `info` of a camera feature: what LeRobot reads from a file, and how it was encoded, null where unknown.
+
+    LeRobot codes anew with these settings when it takes episodes out of a dataset, and takes its own for those that are
+    null; a GOP of 0 it refuses.
+    """
+    preset = int(settings.preset) if settings.preset.isdigit() else settings.preset or None
+    return {
+        "video.height": settings.height,
+        "video.width": settings.width,
+        "video.codec": mp4_codec(settings),
+        "video.pix_fmt": settings.pix_fmt,
+        "video.fps": settings.fps,
+        "video.channels": 3,
+        "has_audio": False,
+        "video.g": settings.gop or None,
+        "video.crf": settings.crf,
+        "video.preset": preset,
+        "video.fast_decode": 0,
+        "video.video_backend": "pyav",
+        "video.extra_options": dict(settings.options),
+        "is_depth_map": False,
+    }

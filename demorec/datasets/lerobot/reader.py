@@ -1,24 +1,22 @@
-"""Reads a LeRobot dataset without LeRobot: episodes in order, their numbers and their coded pictures."""
+"""Reads the tables of a LeRobot dataset without LeRobot: where its episodes lie, their tasks and their rows."""
 
 from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words
-from demorec.datasets.lerobot.data_stats import column_numbers
-from demorec.datasets.lerobot.files import check_video, read_table, table_batches
+from demorec.core.errors import ExportError
+from demorec.datasets.lerobot.files import column_numbers, read_json_lines, read_table, table_batches
 from demorec.datasets.lerobot.language import column_digests
-from demorec.datasets.lerobot.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
+from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, OLD_TASKS_PATH, TASKS_PATH, DatasetInfo, FilePosition
 
 _MOST = 1 << 40
 """Above all rows, frames and seconds of any dataset."""
@@ -31,41 +29,67 @@ class EpisodePlace:
     Attributes:
         episode_index, length, tasks: As the episodes' table has them.
         data: File of its rows.
+        first_row: Of its rows in that file.
         from_index: Of its first row over the whole dataset.
-        videos: Camera feature -> (file, first picture in it).
+        videos: Camera feature -> (file, first image in it).
     """
 
     episode_index: int
     length: int
     tasks: tuple[str, ...]
     data: FilePosition
+    first_row: int
     from_index: int
     videos: dict[str, tuple[FilePosition, int]]
 
 
 def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     """Every episode in order; ExportError when a table cannot be read."""
-    keys = info.video_keys
     columns = ["episode_index", "length", "tasks", "data/chunk_index", "data/file_index", "dataset_from_index"]
-    for key in keys:
+    for key in info.video_keys:
         columns += [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
-    for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        for row in read_table(path, columns).to_pylist():
-            _check_place(row, path)
-            yield EpisodePlace(
-                episode_index=row["episode_index"],
-                length=row["length"],
-                tasks=tuple(row["tasks"]),
-                data=FilePosition(chunk=row["data/chunk_index"], file=row["data/file_index"]),
-                from_index=row["dataset_from_index"],
-                videos={
-                    key: (
-                        FilePosition(chunk=row[f"videos/{key}/chunk_index"], file=row[f"videos/{key}/file_index"]),
-                        round(row[f"videos/{key}/from_timestamp"] * info.fps),
-                    )
-                    for key in keys
-                },
-            )
+    if info.is_old:
+        rows = _old_rows(root, info)
+    else:
+        files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+        rows = ((path, row) for path in files for row in read_table(path, columns).to_pylist())
+    ends: dict[FilePosition, int] = {}
+    for path, row in rows:
+        _check_place(row, path)
+        data = FilePosition(chunk=row["data/chunk_index"], file=row["data/file_index"])
+        first = ends.get(data, 0)
+        ends[data] = first + row["length"]
+        yield EpisodePlace(
+            episode_index=row["episode_index"],
+            length=row["length"],
+            tasks=tuple(row["tasks"]),
+            data=data,
+            first_row=first,
+            from_index=row["dataset_from_index"],
+            videos={
+                key: (
+                    FilePosition(chunk=row[f"videos/{key}/chunk_index"], file=row[f"videos/{key}/file_index"]),
+                    round(row[f"videos/{key}/from_timestamp"] * info.fps),
+                )
+                for key in info.video_keys
+            },
+        )
+
+
+def _old_rows(root: Path, info: DatasetInfo) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The lines of a table before v3.0 with the columns of today's: each episode has files of its own."""
+    path, begin = root / OLD_EPISODES_PATH, 0
+    for line in read_json_lines(path):
+        row: dict[str, Any] = {name: line.get(name) for name in ("episode_index", "length", "tasks")}
+        _check_place(row, path)
+        number = row["episode_index"]
+        row |= {"data/chunk_index": number // int(info.chunks_size), "data/file_index": number}
+        row["dataset_from_index"] = begin
+        for key in info.video_keys:
+            row |= {f"videos/{key}/{name}_index": row[f"data/{name}_index"] for name in ("chunk", "file")}
+            row[f"videos/{key}/from_timestamp"] = 0
+        begin += row["length"]
+        yield path, row
 
 
 def _check_place(row: dict[str, Any], path: Path) -> None:
@@ -84,6 +108,12 @@ def _check_place(row: dict[str, Any], path: Path) -> None:
 def read_tasks(root: Path) -> list[str]:
     """Instructions in the order of their indices; ExportError when the table cannot be read."""
     path = root / TASKS_PATH
+    if not path.exists() and (root / OLD_TASKS_PATH).exists():
+        path = root / OLD_TASKS_PATH
+        lines = [(line.get("task_index"), str(line.get("task"))) for line in read_json_lines(path)]
+        if not all(isinstance(index, int) for index, _ in lines):
+            raise ExportError(f"The tasks' table has no task_index: {path}")
+        return [task for _, task in sorted(lines)]
     table = read_table(path)
     # pandas names an index column that nobody named.
     column = next((name for name in ("task", "__index_level_0__") if name in table.column_names), None)
@@ -100,39 +130,70 @@ def read_tasks(root: Path) -> list[str]:
 _NUMBERS = ("float32", "float64", "int64", "bool")
 
 
+class RowStream:
+    """Some columns of the data files, episode after episode; one batch of a file is in memory.
+
+    Episodes that are asked for in their order are read in one pass.
+
+    Args:
+        root: The dataset's folder.
+        info: Of it.
+        names: Of the columns.
+        rows: At once, at most.
+    """
+
+    def __init__(self, root: Path, info: DatasetInfo, names: Sequence[str], *, rows: int) -> None:
+        self._root, self._info, self._names, self._rows = root, info, list(names), rows
+        self._position: FilePosition | None = None
+        self._batches: Iterator[pa.RecordBatch] = iter(())
+        self._held: pa.RecordBatch | None = None
+        self._next = 0
+
+    def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
+        """The rows of an episode; ExportError when they cannot be read."""
+        if place.data != self._position or place.first_row < self._next:
+            path = self._root / place.data.path(self._info.data_path)
+            self._position, self._next, self._held = place.data, 0, None
+            self._batches = table_batches(path, self._names, rows=self._rows)
+        end = place.first_row + place.length
+        while self._next < end:
+            batch = next(self._batches, None) if self._held is None else self._held
+            if batch is None:
+                raise ExportError(
+                    f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {self._root}"
+                )
+            skipped = min(len(batch), max(0, place.first_row - self._next))
+            taken = min(len(batch), end - self._next) - skipped
+            rest = batch.slice(skipped + taken)
+            self._held = rest if len(rest) else None
+            self._next += skipped + taken
+            if taken:
+                yield batch.slice(skipped, taken)
+
+
 class RowReader:
-    """Rows of the data files, episode after episode; keeps one file's row group in memory."""
+    """Rows of the data files as numbers, those of language as digests.
+
+    Attributes:
+        names: Of the features.
+    """
 
     def __init__(self, root: Path, info: DatasetInfo) -> None:
         self._root = root
         self._info = info
         self.names = [name for name, feature in info.features.items() if not feature.is_video]
-        self._position: FilePosition | None = None
-        self._batches: Iterator[Any] = iter(())
-        self._held: dict[str, NDArray[Any]] = {}
+        has_strings = any(feature.dtype in ("string", "language") for feature in info.features.values())
+        self._stream = RowStream(root, info, self.names, rows=64 if has_strings else 4096)
 
     def read(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
-        """Feature -> (T, D) of an episode, of language columns digests; episodes must be asked for in order."""
-        if place.data != self._position:
-            self._position = place.data
-            path = self._root / place.data.path(self._info.data_path)
-            has_strings = any(feature.dtype in ("string", "language") for feature in self._info.features.values())
-            self._batches = table_batches(path, self.names, rows=64 if has_strings else 4096)
-            self._held = {}
-        while self._num_held() < place.length:
-            batch = next(self._batches, None)
-            if batch is None:
-                raise ExportError(
-                    f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {self._root}"
-                )
-            new = {name: self._column(name, batch.column(name)) for name in self.names}
-            self._held = {
-                name: np.concatenate([self._held[name], values]) if self._held else values
-                for name, values in new.items()
-            }
-        rows = {name: values[: place.length] for name, values in self._held.items()}
-        self._held = {name: values[place.length :] for name, values in self._held.items()}
-        return rows
+        """Feature -> (T, D) of an episode, of language columns digests."""
+        parts = [
+            [self._column(name, batch.column(name)) for name in self.names] for batch in self._stream.batches(place)
+        ]
+        if not parts:
+            return {name: np.zeros((0, 1)) for name in self.names}
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return dict(zip(self.names, columns, strict=True))
 
     def _column(self, name: str, column: Any) -> NDArray[Any]:
         """(N, D) of a feature, (N, 1) digests of language; ExportError unless it is as info.json says."""
@@ -147,63 +208,8 @@ class RowReader:
             )
         return values
 
-    def _num_held(self) -> int:
-        return len(next(iter(self._held.values()))) if self._held else 0
-
 
 def _column(column: Any) -> NDArray[Any]:
     if str(column.type) in ("string", "large_string"):
         return np.array(column.to_pylist(), dtype=np.str_).reshape(-1, 1)
     return column_numbers(column)
-
-
-class PacketReader:
-    """Coded pictures of one camera feature, in order over all its files.
-
-    Attributes:
-        keyframe: Number, in its file, of the keyframe from which on the picture read last can be decoded; -1 for none.
-    """
-
-    def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
-        self._root = root
-        self._template = info.video_path or VIDEO_PATH
-        self._key = key
-        self._position: FilePosition | None = None
-        self._container: Any = None
-        self._packets: Iterator[av.Packet] = iter(())
-        self._next = 0
-        self.keyframe = -1
-
-    def close(self) -> None:
-        """Close the open file; harmless when called twice."""
-        if self._container is not None:
-            self._container.close()
-            self._container = None
-
-    def read(self, place: EpisodePlace) -> Iterator[bytes]:
-        """The samples of an episode as they lie in the mp4 file; episodes must be asked for in order."""
-        position, first = place.videos[self._key]
-        path = self._root / position.path(self._template, self._key)
-        if position != self._position:
-            self.close()
-            check_video(path)
-            try:
-                self._container = av.open(str(path), format="mp4")
-            except (OSError, av.FFmpegError) as error:
-                raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
-            self._packets = (packet for packet in self._container.demux(video=0) if packet.size)
-            self._position, self._next, self.keyframe = position, 0, -1
-        if first < self._next:
-            raise ExportError(f"Episode {place.episode_index} overlaps the one before it: {path}")
-        begin, self._next = self._next, first + place.length
-        for number in range(begin, self._next):  # those before the first belong to no episode
-            packet = next(self._packets, None)
-            if packet is None:
-                raise ExportError(
-                    f"Episode {place.episode_index} has {place.length} frames, but {max(0, number - first)} pictures: "
-                    f"{path}"
-                )
-            if packet.is_keyframe:
-                self.keyframe = number
-            if number >= first:
-                yield bytes(packet)

@@ -1,4 +1,4 @@
-"""The ten numbers that LeRobot keeps of every feature, exact: of vectors from the values, of pictures from histograms.
+"""The ten numbers that LeRobot keeps of every feature, exact: of vectors from the values, of images from histograms.
 
 LeRobot estimates quantiles with histograms of 5,000 bins; here each is what `numpy.quantile` gives.
 """
@@ -6,14 +6,19 @@ LeRobot estimates quantiles with histograms of 5,000 bins; here each is what `nu
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
+from demorec.datasets.lerobot.files import column_numbers, table_batches
+from demorec.datasets.lerobot.layout import DatasetFeature
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
@@ -26,7 +31,7 @@ class Statistics:
     Attributes:
         values: Every name of `NAMES` but "count" -> (D,) float64.
         count: Frames.
-        is_camera: Pictures have the shape (channels, 1, 1) in LeRobot's files.
+        is_camera: Images have the shape (channels, 1, 1) in LeRobot's files.
     """
 
     values: Mapping[str, Array]
@@ -61,25 +66,25 @@ class PixelHistogram:
     Attributes:
         counts: (channels, levels) int64.
         level_values: (levels,) what a level stands for: 0..1 for colour, metres for depth.
-        num_pictures: Of how many pictures.
+        num_images: Of how many images.
     """
 
     counts: NDArray[np.int64]
     level_values: Array
-    num_pictures: int
+    num_images: int
 
     def __add__(self, other: PixelHistogram) -> PixelHistogram:
         return PixelHistogram(
             counts=self.counts + other.counts,
             level_values=self.level_values,
-            num_pictures=self.num_pictures + other.num_pictures,
+            num_images=self.num_images + other.num_images,
         )
 
     def statistics(self) -> Statistics:
         """Exact, over all counted pixels."""
         channels = [_of_levels(counts, self.level_values) for counts in self.counts]
         values = {name: np.array([channel[name] for channel in channels]) for name in NAMES if name != "count"}
-        return Statistics(values=values, count=self.num_pictures, is_camera=True)
+        return Statistics(values=values, count=self.num_images, is_camera=True)
 
 
 def _of_levels(counts: NDArray[np.int64], levels: Array) -> dict[str, float]:
@@ -140,3 +145,120 @@ def quantile_ranks(q: float, count: int) -> tuple[int, int, float]:
 
 def _two_dimensional(column: NDArray[Any]) -> NDArray[Any]:
     return column.reshape(len(column), -1)
+
+
+def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
+    """Of several sets of images together: exact but for the quantiles, which are averaged as LeRobot does."""
+    if len(parts) == 1:
+        return parts[0]
+    counts = np.array([part.count for part in parts], dtype=np.float64)
+    weights = counts / counts.sum()
+
+    def weighted(name: str) -> NDArray[np.float64]:
+        return np.asarray(sum(w * part.values[name] for w, part in zip(weights, parts, strict=True)))
+
+    mean = weighted("mean")
+    variance = sum(
+        w * (part.values["std"] ** 2 + (part.values["mean"] - mean) ** 2)
+        for w, part in zip(weights, parts, strict=True)
+    )
+    values = {name: weighted(name) for name in NAMES if name.startswith("q")}
+    values["min"] = np.min([part.values["min"] for part in parts], axis=0)
+    values["max"] = np.max([part.values["max"] for part in parts], axis=0)
+    values["mean"], values["std"] = mean, np.sqrt(np.asarray(variance))
+    return Statistics(values=values, count=int(counts.sum()), is_camera=parts[0].is_camera)
+
+
+_BATCH_ROWS = 2048
+
+
+def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature]) -> dict[str, Statistics]:
+    """Feature -> statistics over all rows.
+
+    Args:
+        files: Parquet files with the columns of `features`.
+        features: All features; what is no numbers is left out.
+
+    Raises:
+        ExportError: A column holds what is no number, or no rows at all.
+    """
+    paths = list(files)
+    names = [name for name, feature in features.items() if feature.is_numeric]
+    moments = _Moments()
+    for arrays in _batches(paths, names):
+        if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of several lengths
+            raise ExportError("A column of the dataset holds values that are no numbers, so it has no statistics.")
+        moments.add(np.concatenate(arrays, axis=1, dtype=np.float64))
+    if not moments.count:
+        raise ExportError("The dataset has no rows, so it has no statistics.")
+    values = moments.values()
+    result = {}
+    start = 0
+    for name in names:
+        width = features[name].shape[0]
+        part = {key: value[start : start + width] for key, value in values.items()}
+        part |= _quantiles(paths, name, (width, moments.count))
+        result[name] = Statistics(values=part, count=moments.count)
+        start += width
+    return result
+
+
+def _quantiles(paths: Sequence[Path], name: str, shape: tuple[int, int]) -> dict[str, Array]:
+    """Quantile -> (D,) of one feature of `shape` (D, T)."""
+    ranks = {key: quantile_ranks(q, shape[1]) for key, q in QUANTILES.items()}
+    wanted = sorted({rank for low, high, _ in ranks.values() for rank in (low, high)})
+    found = np.empty((shape[0], len(wanted)))
+    # One component after another, in a file beside the data: /tmp may be memory.
+    with tempfile.TemporaryFile(dir=paths[0].parent, buffering=0) as file:
+        start = 0
+        for (array,) in _batches(paths, [name]):
+            for index, part in enumerate(array.T):
+                file.seek((index * shape[1] + start) * array.itemsize)
+                file.write(part.tobytes())
+            start += len(array)
+        file.seek(0)
+        for values in found:
+            values[:] = np.partition(np.fromfile(file, array.dtype, shape[1]), wanted)[wanted]
+    place = {rank: found[:, index] for index, rank in enumerate(wanted)}
+    return {key: place[low] + (place[high] - place[low]) * weight for key, (low, high, weight) in ranks.items()}
+
+
+def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[Any]]]:
+    for path in paths:
+        for batch in table_batches(path, names, rows=_BATCH_ROWS):
+            yield [column_numbers(batch.column(name)) for name in names]
+
+
+class _Moments:
+    """Minimum, maximum, mean and standard deviation, batch by batch (Chan, Golub and LeVeque 1979)."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._mean: Array = np.zeros(0)
+        self._squares: Array = np.zeros(0)
+        self._min: Array = np.zeros(0)
+        self._max: Array = np.zeros(0)
+
+    def add(self, values: Array) -> None:
+        rows = len(values)
+        mean = values.mean(axis=0)
+        squares = ((values - mean) ** 2).sum(axis=0)
+        if self.count == 0:
+            self._mean, self._squares = mean, squares
+            self._min, self._max = values.min(axis=0), values.max(axis=0)
+        else:
+            delta = mean - self._mean
+            total = self.count + rows
+            self._squares = self._squares + squares + delta * delta * (self.count * rows / total)
+            self._mean = self._mean + delta * (rows / total)
+            self._min = np.minimum(self._min, values.min(axis=0))
+            self._max = np.maximum(self._max, values.max(axis=0))
+        self.count += rows
+
+    def values(self) -> dict[str, Array]:
+        return {
+            "min": self._min,
+            "max": self._max,
+            "mean": self._mean,
+            "std": np.sqrt(self._squares / self.count),
+        }

@@ -18,8 +18,6 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.data_stats import data_statistics
-from demorec.datasets.lerobot.digest import episode_digest
 from demorec.datasets.lerobot.facts import fact_type
 from demorec.datasets.lerobot.language import REPEATING, EpisodeLanguage, language_arrays, language_digests
 from demorec.datasets.lerobot.layout import (
@@ -31,14 +29,22 @@ from demorec.datasets.lerobot.layout import (
     TASKS_PATH,
     VIDEO_PATH,
     DatasetInfo,
-    FilePosition,
     data_schema,
+    episode_digest,
     merged_video_info,
+    next_position,
 )
-from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, vector_statistics
+from demorec.datasets.lerobot.stats import (
+    NAMES,
+    PixelHistogram,
+    Statistics,
+    data_statistics,
+    merge_statistics,
+    vector_statistics,
+)
 from demorec.datasets.staging import sync_file
 
 _EPISODES_PER_TABLE = 100
@@ -54,8 +60,8 @@ class EpisodeData:
     Attributes:
         task: Instruction.
         columns: Feature -> (T,) or (T, D), without cameras and the automatic features.
-        videos: Camera feature -> coded pictures, T of them.
-        video_info: Camera feature -> how they were coded, the `info` of the feature.
+        videos: Camera feature -> encoded images, T of them.
+        video_info: Camera feature -> how they were encoded, the `info` of the feature.
         pixels: Camera feature -> histogram, for the statistics.
         language: What is said about it; written where the dataset has the columns for it.
         facts: Column of the table of episodes -> value; written where the dataset has the column.
@@ -63,7 +69,7 @@ class EpisodeData:
 
     task: str
     columns: Mapping[str, NDArray[Any]]
-    videos: Mapping[str, CodedVideo] = field(default_factory=dict)
+    videos: Mapping[str, EncodedVideo] = field(default_factory=dict)
     video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     pixels: Mapping[str, PixelHistogram] = field(default_factory=dict)
     language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
@@ -82,17 +88,12 @@ class WriterStart:
     Attributes:
         num_episodes, num_frames: That are there.
         tasks: In the order of their indices.
-        data, episodes: The next unused file numbers.
-        videos: Camera feature -> the next unused file number.
         statistics: Of the camera features over what is there.
     """
 
     num_episodes: int = 0
     num_frames: int = 0
     tasks: tuple[str, ...] = ()
-    data: FilePosition = field(default_factory=FilePosition)
-    episodes: FilePosition = field(default_factory=FilePosition)
-    videos: Mapping[str, FilePosition] = field(default_factory=dict)
     statistics: Mapping[str, Statistics] = field(default_factory=dict)
 
 
@@ -132,17 +133,14 @@ class DatasetWriter:
             root,
             DATA_PATH,
             self._schema,
-            start=self._start.data,
             repeating=["episode_index", "task_index", *strings, *(REPEATING if self._language else ())],
             **_sizes(info),
         )
-        self._episodes = RollingParquet(
-            root, EPISODES_PATH, self._episode_schema(), start=self._start.episodes, **_sizes(info)
-        )
+        self._episodes = RollingParquet(root, EPISODES_PATH, self._episode_schema(), **_sizes(info))
         self._rows: list[dict[str, Any]] = []
         self._row_statistics: list[dict[str, Statistics]] = []
         self._videos: dict[str, Mp4Writer] = {}
-        self._video_positions = {key: self._start.videos.get(key, FilePosition()) for key in info.video_keys}
+        self._video_positions = {key: next_position(root / "videos" / key, info.chunks_size) for key in info.video_keys}
         self._video_info = {key: info.features[key].info for key in info.video_keys}
         self._pixels: dict[str, PixelHistogram] = {}
 
@@ -210,14 +208,14 @@ class DatasetWriter:
             episode_index=self.num_episodes - 1, digest=episode_digest(episode.task, columns, digests)
         )
 
-    def _add_video(self, key: str, video: CodedVideo, frames: int) -> dict[str, int | float]:
+    def _add_video(self, key: str, video: EncodedVideo, frames: int) -> dict[str, int | float]:
         if video.num_frames != frames:
-            raise ExportError(f"{key} has {video.num_frames} pictures for {frames} frames.")
+            raise ExportError(f"{key} has {video.num_frames} images for {frames} frames.")
         file = self._videos.get(key)
         fps = self._info.fps
         if file is not None and (
             file.num_bytes + video.num_bytes >= self._info.video_files_size_in_mb * MEBIBYTE
-            or (file.num_pictures + len(video.sizes)) / fps > _MAX_SECONDS_PER_VIDEO
+            or (file.num_images + len(video.sizes)) / fps > _MAX_SECONDS_PER_VIDEO
             or file.parameter_sets != video.parameter_sets()
         ):
             file.close()
@@ -227,7 +225,7 @@ class DatasetWriter:
         if file is None:
             path = self._root / position.path(VIDEO_PATH, key)
             file = self._videos[key] = Mp4Writer(path, video, fps=fps)
-        start = file.num_pictures + video.lead
+        start = file.num_images + video.lead
         file.add(video)
         return {
             f"videos/{key}/chunk_index": position.chunk,
@@ -308,28 +306,6 @@ class DatasetWriter:
 
 def _sizes(info: DatasetInfo) -> dict[str, Any]:
     return {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
-
-
-def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """Of several sets of pictures together: exact but for the quantiles, which are averaged as LeRobot does."""
-    if len(parts) == 1:
-        return parts[0]
-    counts = np.array([part.count for part in parts], dtype=np.float64)
-    weights = counts / counts.sum()
-
-    def weighted(name: str) -> NDArray[np.float64]:
-        return np.asarray(sum(w * part.values[name] for w, part in zip(weights, parts, strict=True)))
-
-    mean = weighted("mean")
-    variance = sum(
-        w * (part.values["std"] ** 2 + (part.values["mean"] - mean) ** 2)
-        for w, part in zip(weights, parts, strict=True)
-    )
-    values = {name: weighted(name) for name in NAMES if name.startswith("q")}
-    values["min"] = np.min([part.values["min"] for part in parts], axis=0)
-    values["max"] = np.max([part.values["max"] for part in parts], axis=0)
-    values["mean"], values["std"] = mean, np.sqrt(np.asarray(variance))
-    return Statistics(values=values, count=int(counts.sum()), is_camera=parts[0].is_camera)
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
