@@ -151,6 +151,14 @@ def report_lines(report: BagReport) -> list[str]:
     return lines
 
 
+def dropped_lines(report: BagReport) -> list[str]:
+    """What of a bag became no episode, and how often something was odd in it."""
+    lines = [line.strip() for row in report.episodes if row.episode_index is None for line in _episode_lines(row)]
+    if kinds := sorted({finding.kind for finding in report.odd}):
+        lines.append(f"findings in the bag ({', '.join(kinds)}), which demorec check lists")
+    return lines
+
+
 def _row(stream: StreamReport) -> tuple[str, ...]:
     def number(value: float | None) -> str:
         return "-" if value is None else f"{value:.1f}"
