@@ -9,9 +9,8 @@ import numpy as np
 from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, without_path
-from demorec.datasets.lerobot.facts import facts_of
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, STAGE_COLUMNS, facts_of, progress_table, read_progress
 from demorec.datasets.lerobot.files import open_table, read_table
-from demorec.datasets.lerobot.progress import PROGRESS_PATH, STAGE_COLUMNS, progress_table, read_progress
 from demorec.datasets.lerobot.robots import read_robot
 
 

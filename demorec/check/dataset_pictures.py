@@ -94,6 +94,8 @@ def dataset_frozen(dataset: Dataset) -> Iterator[Found]:
 )
 def dataset_picture_statistics(dataset: Dataset) -> Iterator[Found]:
     """The mean colours of each camera, over all episodes and in each of them, are those of all its pictures."""
+    if dataset.info.is_old:
+        return
     stats = read_statistics(dataset)
     for key in dataset.colour_keys:
         pictures = dataset.pictures(key)

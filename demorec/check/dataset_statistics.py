@@ -43,7 +43,7 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     A quantile may also be the mean of the episodes' ones, as LeRobot has it. Its merge takes means of the datasets' own
     instead, and drops the sidecar: without one, a quantile that lies between the episodes' own is warned of, no more.
     """
-    if not dataset.rows:
+    if not dataset.rows or dataset.info.is_old:
         return
     stats = read_statistics(dataset)
     for name in _numeric(dataset):

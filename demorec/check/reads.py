@@ -14,9 +14,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from demorec.core.geometry import Pose
 from demorec.core.tables import CHECKS, load_robot
+from demorec.datasets.lerobot.facts import PROGRESS_PATH
 from demorec.datasets.lerobot.language import COLUMNS
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
-from demorec.datasets.lerobot.progress import PROGRESS_PATH
 from demorec.episode import features
 from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.episode.scene import Body, RobotPlacement, Scene, SceneCamera, Shape

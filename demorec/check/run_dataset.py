@@ -20,7 +20,7 @@ from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import SIDECAR_DIR, is_dataset
 from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transcode
-from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH
+from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
 from demorec.datasets.lerobot.videos import PacketReader
 from demorec.mcap import SimulatedRecording
 
@@ -131,7 +131,8 @@ def episode_differences(
     try:
         with SimulatedRecording(recording_file) as recording:
             exporting = exported(recording, options)
-            prepared = prepare_episode(exporting, options, code_depth=False)
+            expected = prepare_episode(exporting, options, code_depth=False)
+            record = EpisodeRecord.of(exporting)
             # Encoded anew, images have the bytes of the version and machine that encoded them.
             transcoded = {camera.feature for camera, reason in reasons_to_transcode(exporting).items() if reason}
     except RecordingError as error:
@@ -142,7 +143,6 @@ def episode_differences(
             raise lack from error
         yield f"its recording gives no such episode ({in_words(error)})", ()
         return
-    expected = prepared.data
     if episode.tasks != (expected.task,):
         yield "instruction", ()
     for name, values in expected.columns.items():
@@ -154,6 +154,6 @@ def episode_differences(
     for key, video in expected.videos.items():
         if key not in transcoded and episode.videos.get(key) != video.digest:
             yield key, ()
-    for name, value in prepared.record.row.items():
+    for name, value in record.row.items():
         if name not in _OF_THE_PLACE and episode.told.get(name) != value:
             yield f"sidecar's {name}", ()

@@ -16,7 +16,7 @@ from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA
-from demorec.datasets.lerobot.videos import images_at
+from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import ACTION, IMAGE_PREFIX, STATE
 from demorec.episode.validity import read_episode_info
@@ -127,7 +127,7 @@ def _strip(root: Path, info: DatasetInfo, key: str, place: EpisodePlace) -> tupl
         strip = filmstrip(
             key.removeprefix(IMAGE_PREFIX),
             place.length,
-            lambda frames: images_at(root, info, key, place, frames),
+            EpisodeVideo(root, info, key, place).images_at,
             max_bytes=strip_budget(info.total_episodes),
         )
     except ExportError as error:

@@ -163,15 +163,13 @@ def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
     step, last = 30, len(frames) - 1
     with SimulatedRecording(path) as recording:
         options = ExportOptions(language=())
-        told = prepare_episode(
-            exported(recording, options), options, code_depth=False, about=[2 * step, last]
-        ).data.language
+        told = prepare_episode(exported(recording, options), options, code_depth=False, about=[2 * step, last]).language
     there = {row: events for row, (_, events) in enumerate(frames) if events}
     assert len(there) > 3
-    assert {row: [entry.to_json() for entry in entries] for row, entries in told.events.items()} == {
+    assert {row: list(entries) for row, entries in told.events.items()} == {
         row: there[row] for row in (2 * step, last) if row in there
     }
-    assert [entry.to_json() for entry in told.persistent] == frames[0][0]
+    assert list(told.persistent) == frames[0][0]
 
 
 def test_traces_are_where_the_tcp_will_be(dataset: Path, truth: Truth) -> None:

@@ -14,13 +14,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
-from support.export import data_table, export, info, make_run
+from support.export import data_table, export, make_run
 from support.training import CAMERA, DEPTH, write_by_lerobot
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
 from demorec.core.errors import ConfigError, DemorecError
-from demorec.datasets.lerobot import dataset_digest
 from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources.dataset_import import import_lerobot
@@ -161,20 +160,6 @@ def test_the_same_command_again_goes_on(imported: tuple[str, Path, Path], tmp_pa
     assert [path.read_bytes() for path in recordings(tmp_path / "run")] == before
 
 
-def test_our_own_dataset_comes_back_to_the_bit(tmp_path: Path) -> None:
-    from support.external import TOP, make_external, write_external
-
-    (tmp_path / "run" / "episodes").mkdir(parents=True)
-    for index, length in enumerate((20, 33)):
-        given = make_external(cameras=(TOP,), num_frames=length, episode_index=index, success=None)
-        write_external(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
-    export(tmp_path / "run", tmp_path / "a")
-    result = import_lerobot(tmp_path / "a", tmp_path / "again")
-    assert (result.num_episodes, result.cameras) == (2, {"top": "h264 kept as it is"})
-    export(tmp_path / "again", tmp_path / "b")
-    assert dataset_digest(tmp_path / "b") == dataset_digest(tmp_path / "a")
-
-
 def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
     """All depth pictures of a camera in order, by av."""
     codes: list[NDArray[np.uint16]] = []
@@ -204,22 +189,6 @@ def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
         expected = np.squeeze(dequantize_depth(code, output_unit="m", output_tensor=False))
         expected = np.where(np.squeeze(code) == 0, 0, expected)  # nothing was measured, or noise was encoded badly
         np.testing.assert_allclose(metres, expected, atol=1e-5, err_msg=str(number))
-
-
-def test_what_an_export_says_of_distances_comes_back(tmp_path: Path) -> None:
-    """Every code of the generator's depth, that of holes among them, and then the whole dataset."""
-    export(make_run(tmp_path / "simulated", (4, 6), depth=True), tmp_path / "a", depth=True)
-    import_lerobot(tmp_path / "a", tmp_path / "run")
-    export(tmp_path / "run", tmp_path / "b", depth=True)
-    keys = [name for name, feature in info(tmp_path / "a")["features"].items() if feature["shape"][-1] == 1][:2]
-    assert [key for key in keys if key.endswith("_depth")] == keys
-    for key in keys:
-        before, after = codes_of(tmp_path / "a", key), codes_of(tmp_path / "b", key)
-        assert any(code.min() == 0 for code in before)
-        assert [code.tolist() for code in after] == [code.tolist() for code in before]
-    import_lerobot(tmp_path / "b", tmp_path / "again")
-    export(tmp_path / "again", tmp_path / "c", depth=True)
-    assert dataset_digest(tmp_path / "c") == dataset_digest(tmp_path / "b")
 
 
 def test_depth_of_another_scale_is_read_by_it_and_without_one_left_out(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A LeRobot v2.1 dataset, written by PyArrow and av as that format was, is refused with a command that converts it."""
+"""A LeRobot v2.1 dataset, written by PyArrow and av as that format was, is read; only appending needs a conversion."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ from numpy.typing import NDArray
 from support.commands import exit_code
 
 from demorec.mcap import Recording
+from demorec.view.episode import PlayedExternal
+from demorec.view.from_dataset import open_dataset_episode
+
+SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
 
 CAMERA = "observation.images.top"
 LENGTHS = (6, 5)
@@ -101,47 +105,77 @@ def write_v21(root: Path) -> Path:
     return root
 
 
-def refusal(root: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    assert exit_code("import", "lerobot", root, "--out", root.with_name("run")) == 1
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    return err.strip()
+def assert_imported(root: Path, run: Path) -> None:
+    """Numbers, instruction and images of every episode are those that were written."""
+    assert exit_code("import", "lerobot", root, "--out", run) == 0
+    found = sorted((run / "episodes").glob("*.mcap"))
+    assert len(found) == len(LENGTHS)
+    for episode, path in enumerate(found):
+        with Recording(path) as recording:
+            np.testing.assert_array_equal(recording.columns().features["observation.state"], state(episode))
+            assert (recording.info.instruction, recording.info.robot) == ("push it", "so100")
+            assert recording.info.cameras[0].kept == "h264"
+            levels = [int(image.mean().round()) for image in recording.images("top")]
+            np.testing.assert_allclose(levels, 20 * np.arange(LENGTHS[episode]) + 10, atol=2)
+
+
+@pytest.mark.parametrize("version", ["v2.0", "v2.1"])
+def test_every_tool_reads_it(version: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = write_v21(tmp_path / "cups")
+    path = root / "meta" / "info.json"
+    path.write_text(path.read_text().replace("v2.1", version))
+    assert_imported(root, tmp_path / "run")
+    assert exit_code("info", root) == 0
+    assert "2 episodes" in capsys.readouterr().out
+    assert exit_code("view", root, "--save", tmp_path / "cups.rrd", "--episodes", "1") == 0
+    assert exit_code("report", root, "--out", tmp_path / "cups.html", "--no-checks") == 0
+    with open_dataset_episode(root, 1) as episode:
+        assert isinstance(episode, PlayedExternal)
+        np.testing.assert_array_equal(episode.curves["observation.state"].values, state(1))
+        assert len(list(episode.videos["top"].packets())) == LENGTHS[1]
 
 
 @pytest.mark.slow
-def test_the_command_in_the_refusal_converts_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_export_that_would_append_names_the_command_that_converts_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = write_v21(tmp_path / "my cups")
-    told = refusal(root, capsys)
-    assert "The dataset has format v2.1, expected v3.0" in told
-    assert f"beside it, as {root.name}_old" in told
+    export = ("export", "lerobot", SAMPLE, "--out", root, "--append", "--no-verify")
+    (tmp_path / "my cups_old").mkdir()
+    assert exit_code(*export) == 1
+    # The converter takes what is called so for what a former conversion left, and deletes it.
+    assert "move my cups_old away first" in capsys.readouterr().err
+    (tmp_path / "my cups_old").rmdir()
+    assert exit_code(*export) == 1
+    told = capsys.readouterr().err.strip()
+    assert "\n" not in told
+    assert "format v2.1, and only v3.0 is appended to" in told
     program, *arguments = shlex.split(told[told.index("python -m ") :])
     assert program == "python"
     environment = os.environ | {"HF_HOME": str(tmp_path / "hf"), "HF_HUB_OFFLINE": "1"}
     subprocess.run([sys.executable, *arguments], check=True, env=environment, capture_output=True, timeout=300)
     assert (tmp_path / "my cups_old" / "meta" / "episodes.jsonl").exists()
-    assert exit_code("import", "lerobot", root, "--out", tmp_path / "run") == 0
-    for episode, path in enumerate(sorted((tmp_path / "run/episodes").glob("*.mcap"))):
-        with Recording(path) as recording:
-            np.testing.assert_array_equal(recording.columns().features["observation.state"], state(episode))
-            levels = [int(picture.mean().round()) for picture in recording.images("top")]
-            np.testing.assert_allclose(levels, 20 * np.arange(LENGTHS[episode]) + 10, atol=2)
+    assert_imported(root, tmp_path / "run")
 
 
-def test_what_the_converter_would_delete_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It takes what is called ..._old for what a former conversion left, and puts it in the dataset's place."""
-    root = write_v21(tmp_path / "cups")
-    assert "python -m lerobot.scripts.convert_dataset_v21_to_v30" in refusal(root, capsys)
-    (tmp_path / "cups_old").mkdir()
-    assert "move cups_old away first" in refusal(root, capsys)
-
-
-@pytest.mark.parametrize(("version", "advice"), [("v2.0", "bring it to v2.1 with"), ("v9.0", "expected v3.0: ")])
-def test_other_versions_have_no_command(
-    version: str, advice: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("info.json", '"v2.1"|"v9.0"', "format v9.0, those that are read are v2.0, v2.1 and v3.0"),
+        ("episodes.jsonl", '"length": 5|"length": -5', "has -5 as length"),
+        ("episodes.jsonl", '"length": 5|"length": 9', "has 9 frames, its data file ends before"),
+        ("episodes.jsonl", '{"episode_index": 1|[{"episode_index": 1', "The table cannot be read"),
+        ("tasks.jsonl", '"task_index": 0|"task_index": null', "no task_index"),
+        ("tasks.jsonl", '"task_index": 0|"task_index": 0}{', "The table cannot be read"),
+    ],
+)
+def test_a_damaged_one_is_refused_in_a_sentence(
+    name: str, text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = write_v21(tmp_path / "cups")
-    path = root / "meta" / "info.json"
-    path.write_text(path.read_text().replace("v2.1", version))
-    told = refusal(root, capsys)
-    assert advice in told
-    assert "python -m" not in told
+    path, (old, new) = root / "meta" / name, text.split("|")
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    assert exit_code("import", "lerobot", root, "--out", tmp_path / "run") == 1
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert words in told

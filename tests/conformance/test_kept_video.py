@@ -22,9 +22,6 @@ from support.export import episode_rows, export
 
 from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.episodes import LeRobotDataset
-from demorec.datasets.lerobot.layout import DatasetInfo
-from demorec.datasets.lerobot.reader import episode_places
-from demorec.datasets.lerobot.videos import images_at
 from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
 from demorec.sources.import_run import import_bags
@@ -109,10 +106,10 @@ def test_whole_episodes_between_keyframes(expected: list[Pictures], dataset: Pat
 
 
 def test_single_pictures(expected: list[Pictures], dataset: Path) -> None:
-    info = DatasetInfo.load(dataset)
-    for place, pictures in zip(episode_places(dataset, info), expected, strict=True):
-        frames = [0, 1, GOP, place.length - 1]
-        for frame, found in zip(frames, images_at(dataset, info, KEY, place, frames), strict=True):
+    found_in = LeRobotDataset(dataset)
+    for number, pictures in enumerate(expected):
+        frames = [0, 1, GOP, len(pictures) - 1]
+        for frame, found in zip(frames, found_in.recording(number).images_at("high", frames), strict=True):
             assert np.array_equal(found, pictures[frame])
 
 
@@ -155,7 +152,7 @@ def test_appended_they_stay(expected: list[Pictures], run: Path, tmp_path: Path)
 
 def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path, tmp_path: Path) -> None:
     result = import_lerobot(dataset, tmp_path / "run")
-    assert result.cameras["high"] == "h264 kept as it is"
+    assert result.cameras["high"] == "h264, passed through as it is"
     for path in sorted((run / "episodes").glob("*.mcap")):
         with Recording(path) as given, Recording(tmp_path / "run/episodes" / path.name) as found:
             ours, theirs = (list(recording.packets("high")) for recording in (found, given))

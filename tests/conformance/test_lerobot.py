@@ -20,7 +20,6 @@ from support.recording import make_episode
 import demorec.datasets.lerobot.writer
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot, verify
 from demorec.datasets.lerobot.depth import code_values, quantised
-from demorec.datasets.lerobot.verify import VerifiedEpisode
 from demorec.mcap import SimulatedRecording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)
@@ -190,7 +189,7 @@ def test_depth_without_its_colour_is_verified(tmp_path: Path) -> None:
     )
     export_lerobot([run], tmp_path / "d", options)
     episodes = sorted((run / "episodes").iterdir())
-    samples = tuple(VerifiedEpisode(episode_index=index, recording=path) for index, path in enumerate(episodes))
+    samples = tuple(enumerate(episodes))
     assert verify._verify(tmp_path / "d", samples, options) == 4  # in this process, which has loaded LeRobot already
     assert open_dataset(tmp_path / "d").meta.camera_keys == ["observation.images.front_depth"]
 

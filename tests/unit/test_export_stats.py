@@ -17,9 +17,9 @@ from demorec.datasets.lerobot.stats import (
     Statistics,
     colour_levels,
     data_statistics,
+    merge_statistics,
     vector_statistics,
 )
-from demorec.datasets.lerobot.writer import merge_statistics
 
 
 def check(found: Statistics, column: NDArray[np.generic]) -> None:

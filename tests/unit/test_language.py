@@ -17,7 +17,7 @@ from demorec.annotate.situation import Surroundings, situation
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot import files
-from demorec.datasets.lerobot.language import EpisodeLanguage, LanguageRow, language_arrays
+from demorec.datasets.lerobot.language import EpisodeLanguage, language_arrays
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, RobotPlacement, Scene, Shape
 from demorec.mcap import SimulatedRecording, SimulatedWriter
@@ -167,7 +167,8 @@ def test_words_that_stand_in_every_row_are_no_bomb(
 ) -> None:
     """Tables of words unpack to hundreds of times their size; above all bounds are only more than any episode has."""
     monkeypatch.setattr(files, "_FLOOR_BYTES", 1 << 20)
-    said = LanguageRow(role="assistant", content="grasp the red cube", style="subtask", timestamp=0.0)
+    said = {"role": "assistant", "content": "grasp the red cube", "style": "subtask", "timestamp": 0.0}
+    said |= {"camera": None, "tool_calls": None}
     arrays = language_arrays(EpisodeLanguage(persistent=(said,) * statements), 600)
     path = tmp_path / "words.parquet"
     pq.write_table(pa.table({"index": np.arange(600), **arrays}), path)

@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
@@ -31,7 +29,7 @@ from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
 from demorec.datasets.lerobot.robots import ROBOTS_DIR
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
-from demorec.datasets.lerobot.videos import images_at
+from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import write_text
 from demorec.datasets.staging import sync_file
 from demorec.episode.features import (
@@ -178,7 +176,7 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
         yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_meaning(key, item, about)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
     yield from (_SIMULATED_ROWS if about.is_simulated else _EXTERNAL_ROWS, "")
-    yield from _success_section(_read_attempts(root))
+    yield from _success_section(root)
     yield from ("## What stands beside", "", _BESIDE_SIMULATED if about.is_simulated else _BESIDE_EXTERNAL)
     yield from _robot_section(root)
     yield ""
@@ -236,61 +234,35 @@ def _origin_section(root: Path, about: CardFacts) -> Iterable[str]:
 # ------------------------------------------------------------------------------------------------------ success rates
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Attempts:
-    success: NDArray[np.bool_]  # (N,)
-    reasons: list[str]
-    num_unknown: int
-    positions: Mapping[str, NDArray[np.float64]]  # what -> (N, 2), nan where unknown
-
-
-def _read_attempts(root: Path) -> _Attempts:
+def _success_section(root: Path) -> Iterable[str]:
     columns = ["success", "failure_phase", "failure_reason", "object_x", "object_y", "goal_x", "goal_y"]
     files = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
-    table = pa.concat_tables([read_table(file, columns, schema=ATTEMPT_SCHEMA) for file in files])
-    is_known = pc.is_valid(table.column("success"))
-    num_unknown = len(table) - int(pc.sum(is_known).as_py() or 0)
-    table = table.filter(is_known)
-    coordinates = {name: table.column(name).to_numpy().astype(np.float64) for name in columns[3:]}
-    reasons = [
-        f"{reason} in phase {phase}" if phase else reason
-        for phase, reason in zip(
-            table.column("failure_phase").to_pylist(), table.column("failure_reason").to_pylist(), strict=True
-        )
-    ]
-    return _Attempts(
-        success=table.column("success").to_numpy().astype(np.bool_),
-        reasons=reasons,
-        num_unknown=num_unknown,
-        positions={
-            "object": np.stack([coordinates["object_x"], coordinates["object_y"]], axis=1),
-            "goal": np.stack([coordinates["goal_x"], coordinates["goal_y"]], axis=1),
-        },
-    )
-
-
-def _success_section(attempts: _Attempts) -> Iterable[str]:
-    total, good = len(attempts.success), int(attempts.success.sum())
+    rows = [row for file in files for row in read_table(file, columns, schema=ATTEMPT_SCHEMA).to_pylist()]
+    known = [row for row in rows if row["success"] is not None]
+    success = np.array([row["success"] for row in known], dtype=np.bool_)
+    total, good = len(success), int(success.sum())
     yield "## Success"
     yield ""
-    if attempts.num_unknown:
-        yield f"Of {attempts.num_unknown} episodes nobody said whether they succeeded."
+    if num_unknown := len(rows) - total:
+        yield f"Of {num_unknown} episodes nobody said whether they succeeded."
         yield ""
     if not total:
         return
     yield f"{good} of {total} attempts that were made for this dataset succeeded ({100 * good / total:.1f} %)."
     counts: dict[str, int] = {}
-    for reason, success in zip(attempts.reasons, attempts.success, strict=True):
-        if not success:
-            counts[reason] = counts.get(reason, 0) + 1
+    for row in (row for row in known if not row["success"]):
+        phase, reason = row["failure_phase"], str(row["failure_reason"])
+        reason = f"{reason} in phase {phase}" if phase else reason
+        counts[reason] = counts.get(reason, 0) + 1
     for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
         yield f"- {count} failed: {markdown(reason) or 'no reason recorded'}"
     yield ""
-    for what, positions in attempts.positions.items():
+    for what in ("object", "goal"):
+        positions = np.array([[row[f"{what}_x"], row[f"{what}_y"]] for row in known], dtype=np.float64)
         if total >= 2 and np.isfinite(positions).all():
             yield f"By the start position of the {what} (successes / attempts, world frame):"
             yield ""
-            yield from success_table(positions, attempts.success)
+            yield from success_table(positions, success)
             yield ""
 
 
@@ -332,7 +304,7 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
         label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
         draw.text((4, top + 1), printable(label), fill="black", font=font)
         moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
-        for column, picture in enumerate(images_at(root, info, key, place, moments)):
+        for column, picture in enumerate(EpisodeVideo(root, info, key, place).images_at(moments)):
             corner = column * (size[0] + _GAP), top + _LABEL
             sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
             time = f"{moments[column] / info.fps:.1f} s"

@@ -12,7 +12,7 @@ where it is there. Memory is that of an episode's numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -42,7 +42,7 @@ from demorec.episode.features import DEPTH_SUFFIX, IMAGE_PREFIX, STATE
 from demorec.mcap.external.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
-_SUCCESS = "next.success"
+_SUCCESS, _EPISODE = "next.success", "episode_index"
 _TIME_TOLERANCE_S = 1e-4
 """By which LeRobot lets a row's time be off the grid."""
 _UNNAMED_ROBOT = "unknown"
@@ -145,7 +145,7 @@ class LeRobotDataset:
     def rows(self) -> RowReader:
         """Of the features, of times, tasks and outcomes."""
         names = [*(feature.name for feature in self.features), "timestamp", "task_index"]
-        names += [_SUCCESS] if _SUCCESS in self.info.features else []
+        names += [name for name in (_SUCCESS, _EPISODE) if name in self.info.features]
         return RowReader(self.root, replace(self.info, features={name: self.info.features[name] for name in names}))
 
     @cached_property
@@ -296,6 +296,10 @@ class DatasetRecording:
     @cached_property
     def _rows(self) -> Mapping[str, NDArray[Any]]:
         rows, info, number = self.dataset.rows.read(self.place), self.dataset.info, self.place.episode_index
+        if _EPISODE in rows and (rows[_EPISODE] != number).any():
+            raise ExportError(
+                f"The rows of episode {number} are those of others, by its place in the table: {self.path}"
+            )
         off = np.abs(rows["timestamp"][:, 0].astype(np.float64) - np.arange(self.num_frames) / int(info.fps))
         if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
             raise ExportError(
@@ -360,12 +364,12 @@ class DatasetRecording:
             return self.dataset.video(key, self.place).images(-self._lead(camera))
         return self.dataset.stored_images(key, self.place)
 
-    def picture(self, camera: str, number: int) -> Rgb:
-        """One decoded image of a camera, (H, W, 3) uint8 RGB, by its own number."""
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
+        """What some frames, in rising order, show of a camera, (H, W, 3) uint8 RGB."""
         key = self.dataset.keys[camera]
         if self.dataset.info.features[key].is_video:
-            return next(self.dataset.video(key, self.place).images(number - self._lead(camera)))
-        return list(self.images(camera))[number]
+            return self.dataset.video(key, self.place).images_at(frames)
+        return (image for frame, image in enumerate(self.images(camera)) if frame in frames)
 
     def distances(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """The images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""

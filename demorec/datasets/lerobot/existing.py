@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, ExportError, in_words
-from demorec.datasets.lerobot.facts import facts_of
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, facts_of
 from demorec.datasets.lerobot.files import open_table, read_json, read_table
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -22,13 +22,11 @@ from demorec.datasets.lerobot.layout import (
     TASKS_PATH,
     DatasetFeature,
     DatasetInfo,
-    FilePosition,
     how_to_convert,
 )
-from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.progress import PROGRESS_PATH, PROPORTIONS_PATH
+from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import read_tasks
-from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, SidecarStart
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import Statistics
 from demorec.datasets.lerobot.writer import WriterStart
 
@@ -52,14 +50,15 @@ class Existing:
     Attributes:
         root: Its folder.
         info: What meta/info.json says.
-        writer, sidecar: Where to go on.
+        writer: Where to go on.
+        configs: Of the sidecar: config digest -> configuration.
         facts: Which columns of facts its table of episodes has.
     """
 
     root: Path
     info: DatasetInfo
     writer: WriterStart
-    sidecar: SidecarStart
+    configs: Mapping[str, Any]
     facts: tuple[str, ...] = ()
 
 
@@ -100,19 +99,9 @@ def open_existing(root: Path) -> Existing:
         num_episodes=episodes,
         num_frames=frames,
         tasks=tasks,
-        data=_after(root / "data", ".parquet", info.chunks_size),
-        episodes=_after(root / "meta" / "episodes", ".parquet", info.chunks_size),
-        videos={key: _after(root / "videos" / key, ".mp4", info.chunks_size) for key in info.video_keys},
         statistics=statistics,
     )
-    side = root / SIDECAR_DIR
-    sidecar = SidecarStart(
-        episodes=_after(side / "episodes", ".parquet", info.chunks_size),
-        attempts=_after(side / "attempts", ".parquet", info.chunks_size),
-        camera_poses=_after(side / "camera_poses", ".parquet", info.chunks_size),
-        configs=configs,
-    )
-    return Existing(root=root, info=info, writer=writer, sidecar=sidecar, facts=facts)
+    return Existing(root=root, info=info, writer=writer, configs=configs, facts=facts)
 
 
 def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
@@ -124,18 +113,6 @@ def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistic
         raise ValueError(f"the statistics of {key} are none of its pictures")
     # LeRobot's streaming writer counts pixels; as a weight beside ours a frame must count as one.
     return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
-
-
-def _after(folder: Path, suffix: str, chunks_size: int) -> FilePosition:
-    """The first number that no file of a folder (chunk-CCC/file-FFF) has, counting from the last one."""
-    last: FilePosition | None = None
-    for path in folder.glob(f"chunk-*/file-*{suffix}"):
-        chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
-        if chunk.isdigit() and file.isdigit():
-            position = FilePosition(chunk=int(chunk), file=int(file))
-            if last is None or (position.chunk, position.file) > (last.chunk, last.file):
-                last = position
-    return FilePosition() if last is None else last.next(chunks_size)
 
 
 def features_to_append(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,18 +18,18 @@ from demorec.core.errors import ConfigError, ExportError, MissingDependencyError
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
 from demorec.datasets.exported import exported
-from demorec.datasets.lerobot.boxes import BoxWriter
+from demorec.datasets.lerobot.boxes import BoxWriter, EpisodeBoxes
 from demorec.datasets.lerobot.card import CardFacts, has_own_card, write_card
 from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
+from demorec.datasets.lerobot.facts import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetFeature, DatasetInfo, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
-from demorec.datasets.lerobot.prepare import PreparedEpisode, dataset_features, prepare_episode, reasons_to_transcode
-from demorec.datasets.lerobot.progress import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
-from demorec.datasets.lerobot.sidecar import AttemptRecord, SidecarStart, SidecarWriter
-from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, VerifiedEpisode, Verifier, lerobot_is_installed
-from demorec.datasets.lerobot.writer import DatasetWriter, WriterStart
+from demorec.datasets.lerobot.prepare import dataset_features, episode_boxes, prepare_episode, reasons_to_transcode
+from demorec.datasets.lerobot.sidecar import EpisodeRecord, SidecarWriter, attempt_row
+from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
+from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData, WriterStart
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import ExportSource, Intake, Profile, find_recordings, goes_in, is_wanted, places_of
 from demorec.datasets.staging import CODED, staged_folder
@@ -106,24 +106,23 @@ class _Export:
         begun: list[Reading] = []  # up to the first episode, which decides what features there are
         for reading in found:
             begun.append(reading)
-            if reading.prepared is not None:
+            if reading.data is not None:
                 break
         self._intake.check()
         info = self._dataset_info(begun[-1])
         self._is_simulated = begun[-1].is_simulated
         start = self._existing.writer if self._existing else WriterStart()
-        sidecar_start = self._existing.sidecar if self._existing else SidecarStart()
+        configs = self._existing.configs if self._existing else {}
         limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
         with (
             DatasetWriter(self._folder, info, start, self._facts(begun[-1])) as writer,
-            SidecarWriter(self._folder, sidecar_start, **limits) as sidecar,
+            SidecarWriter(self._folder, configs, **limits) as sidecar,
             BoxWriter(self._folder, fps=info.fps) as boxes,
         ):
             for reading in chain(begun, found):
                 self._add(writer, sidecar, reading)
-                if reading.prepared is not None and self._options.boxes:
-                    data = reading.prepared.data
-                    boxes.add(writer.num_episodes - 1, reading.prepared.boxes, data.num_frames)
+                if reading.data is not None and self._options.boxes:
+                    boxes.add(writer.num_episodes - 1, reading.boxes, reading.data.num_frames)
             self._refuse_duplicates()
             self._refuse_silence()
             finished = writer.finish()
@@ -154,12 +153,12 @@ class _Export:
             digest=combined_digest(finished, [*self._before, *self._digests]),
         )
 
-    def samples(self) -> list[VerifiedEpisode]:
+    def samples(self) -> list[tuple[int, Path]]:
         """What shall be verified: the new episodes, or some of them, spread evenly, if there are very many."""
         first = self._existing.writer.num_episodes if self._existing else 0
         count = len(self._recordings)
         chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_EPISODES)).round().astype(int)).tolist()
-        return [VerifiedEpisode(episode_index=first + index, recording=self._recordings[index]) for index in chosen]
+        return [(first + index, self._recordings[index]) for index in chosen]
 
     def _dataset_info(self, first: Reading) -> DatasetInfo:
         if self._existing is not None:
@@ -177,7 +176,7 @@ class _Export:
     def _facts(self, first: Reading) -> tuple[str, ...]:
         """Which columns of facts the table of episodes has, or gets from the first episode."""
         if self._existing is None:
-            return () if first.prepared is None else tuple(first.prepared.data.facts)
+            return () if first.data is None else tuple(first.data.facts)
         has_progress = set(STAGE_COLUMNS) <= set(self._existing.facts)
         if has_progress != self._options.progress:
             raise ConfigError(
@@ -192,20 +191,20 @@ class _Export:
     def _noted(self, found: Iterable[Reading]) -> Iterator[Reading]:
         """The same, each counted and held against the others before it is written."""
         for reading in found:
-            if reading.prepared is None:
+            if reading.data is None:
                 self._intake.leave_out(reading.outcome)
             else:
                 self._intake.take(reading.path, reading.profile)
             yield reading
 
     def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, reading: Reading) -> None:
-        if reading.prepared is None:
+        if reading.data is None or reading.record is None:
             sidecar.add_attempt(reading.attempt, in_dataset=False)
             return
-        written = writer.add(reading.prepared.data)
-        sidecar.add(written, reading.prepared.record)
+        written = writer.add(reading.data)
+        sidecar.add(written, reading.record)
         if self._options.progress:
-            facts = reading.prepared.data.facts
+            facts = reading.data.facts
             self._progress.append(EpisodeProgress.from_row(facts, facts["num_goals"]))
         self._digests.append(written.digest)
         self._recordings.append(reading.path)
@@ -306,8 +305,10 @@ class Reading:
         path: The recording.
         attempt: For the success rates.
         outcome: As recorded; None where the recording ends before it.
-        prepared: The episode; None for a failed attempt that is left out, of which nothing that follows is read, so
+        data: The episode; None for a failed attempt that is left out, of which nothing that follows is read, so
             that an export does not fail for what it leaves out.
+        record: Of it, for the sidecar.
+        boxes: Camera feature -> what it sees, if that was asked for.
         profile: What must agree with all the others.
         features, fps, robot: Of a dataset made from it.
         transcoded: Cameras whose images had to be encoded anew, with the reason.
@@ -315,9 +316,11 @@ class Reading:
     """
 
     path: Path
-    attempt: AttemptRecord
+    attempt: Mapping[str, Any]
     outcome: Outcome | ExternalOutcome | None
-    prepared: PreparedEpisode | None = None
+    data: EpisodeData | None = None
+    record: EpisodeRecord | None = None
+    boxes: Mapping[str, EpisodeBoxes] = field(default_factory=dict)
     profile: Profile = field(default_factory=Profile)
     features: dict[str, DatasetFeature] = field(default_factory=dict)
     fps: int = 0
@@ -336,7 +339,7 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
     with open_recording(source.path) as recording:
         if not is_wanted(recording, options):
             return None
-        attempt = AttemptRecord.of(recording)
+        attempt = attempt_row(recording)
         if not goes_in(source, recording, options):
             return Reading(path=source.path, attempt=attempt, outcome=recording.outcome)
         episode = exported(recording, options)
@@ -351,7 +354,9 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
             robot=recording.info.robot_name,
             transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
             is_simulated=episode.simulated is not None,
-            prepared=prepare_episode(episode, options),
+            data=prepare_episode(episode, options),
+            record=EpisodeRecord.of(episode),
+            boxes=episode_boxes(episode) if options.boxes else {},
         )
 
 
@@ -377,8 +382,7 @@ def _workers_that_pay(sources: Sequence[ExportSource], options: ExportOptions) -
 def _read_aside(source: ExportSource, options: ExportOptions, folder: Path) -> Reading | None:
     """`read`, with the pictures in files: through a pipe they cost as much as all the rest."""
     reading = read(source, options)
-    if reading is None or reading.prepared is None:
+    if reading is None or reading.data is None:
         return reading
-    data = reading.prepared.data
-    data = replace(data, videos={key: video.put_aside(folder) for key, video in data.videos.items()})
-    return replace(reading, prepared=replace(reading.prepared, data=data))
+    videos = {key: video.put_aside(folder) for key, video in reading.data.videos.items()}
+    return replace(reading, data=replace(reading.data, videos=videos))

@@ -49,70 +49,36 @@ _AT_ONCE = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class LanguageRow:
-    """One entry of a language column.
-
-    Attributes:
-        role: "user" or "assistant".
-        content: What is said; None for what a tool says.
-        style: LeRobot's word for its kind, None for what a tool says.
-        timestamp: From when on it holds, seconds; None for an event.
-        camera: Feature that the words are about, None for all but those that are about one picture.
-        spoken: What the tool `say` is told to say to the user, "" for nothing.
-    """
-
-    role: str
-    content: str | None
-    style: str | None
-    timestamp: float | None = None
-    camera: str | None = None
-    spoken: str = ""
-
-    def to_json(self) -> dict[str, Any]:
-        """The entry as the column has it; calls of tools are JSON there."""
-        row: dict[str, Any] = {"role": self.role, "content": self.content, "style": self.style}
-        if self.timestamp is not None:
-            row["timestamp"] = self.timestamp
-        row |= {"camera": self.camera, "tool_calls": None}
-        if self.spoken:
-            call = {"type": "function", "function": {"name": "say", "arguments": {"text": self.spoken}}}
-            row["tool_calls"] = [json.dumps(call)]
-        return row
-
-
-@dataclass(frozen=True, kw_only=True)
 class EpisodeLanguage:
-    """The language columns of one episode.
+    """The language columns of one episode; entries as the columns have them, calls of tools as JSON.
 
     Attributes:
         persistent: What stands in every row.
         events: Row -> what stands in it alone.
     """
 
-    persistent: tuple[LanguageRow, ...] = ()
-    events: Mapping[int, tuple[LanguageRow, ...]] = field(default_factory=dict)
+    persistent: Sequence[dict[str, Any]] = ()
+    events: Mapping[int, Sequence[dict[str, Any]]] = field(default_factory=dict)
 
 
 def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLanguage:
-    """The statements in LeRobot's form; times are those of the `timestamp` column to the bit."""
-    persistent: list[LanguageRow] = []
-    events: dict[int, list[LanguageRow]] = {}
+    """The statements in LeRobot's form; times are bit-exact those of the `timestamp` column."""
+    persistent: list[dict[str, Any]] = []
+    events: dict[int, list[dict[str, Any]]] = {}
     for statement in statements:
         is_state = statement.kind in STATES
         is_answer = statement.kind == "interjection" and statement.role == "assistant"  # a call of a tool, in LeRobot
-        said = LanguageRow(
-            role=statement.role,
-            content=None if is_answer else statement.text,
-            style=None if is_answer else statement.kind,
-            timestamp=float(np.float32(statement.row / fps)) if is_state else None,
-            camera=None if statement.camera is None else IMAGE_PREFIX + statement.camera,
-            spoken=statement.text if is_answer else "",
-        )
-        if is_state:
-            persistent.append(said)
-        else:
-            events.setdefault(statement.row, []).append(said)
-    return EpisodeLanguage(persistent=tuple(persistent), events={row: tuple(told) for row, told in events.items()})
+        call = {"type": "function", "function": {"name": "say", "arguments": {"text": statement.text}}}
+        entry = {
+            "role": statement.role,
+            "content": None if is_answer else statement.text,
+            "style": None if is_answer else statement.kind,
+            **({"timestamp": float(np.float32(statement.row / fps))} if is_state else {}),
+            "camera": None if statement.camera is None else IMAGE_PREFIX + statement.camera,
+            "tool_calls": [json.dumps(call)] if is_answer else None,
+        }
+        (persistent if is_state else events.setdefault(statement.row, [])).append(entry)
+    return EpisodeLanguage(persistent=persistent, events=events)
 
 
 def language_feature(name: str) -> dict[str, Any]:
@@ -142,8 +108,7 @@ def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Arra
     }
 
 
-def _structs(rows: Sequence[LanguageRow], kind: pa.StructType) -> pa.StructArray:
-    found = [row.to_json() for row in rows]
+def _structs(found: Sequence[dict[str, Any]], kind: pa.StructType) -> pa.StructArray:
     arrays = []
     for part in kind:
         values = [row[part.name] for row in found]
@@ -158,10 +123,10 @@ def _structs(rows: Sequence[LanguageRow], kind: pa.StructType) -> pa.StructArray
 
 def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArray[np.str_]]:
     """Column -> (T, 1) SHA-256 (hex) of what stands in each row; equal to `column_digests` of the column read back."""
-    state = _digest([row.to_json() for row in language.persistent])
+    state = _digest(language.persistent)
     events = np.full((frames, 1), _digest([]))
     for row, told in language.events.items():
-        events[row] = _digest([entry.to_json() for entry in told])
+        events[row] = _digest(told)
     return {PERSISTENT: np.full((frames, 1), state), EVENTS: events}
 
 

@@ -159,6 +159,18 @@ class FilePosition:
         return template.format(chunk_index=self.chunk, file_index=self.file, video_key=video_key)
 
 
+def next_position(folder: Path, chunks_size: int) -> FilePosition:
+    """The first number that no file of a folder (chunk-CCC/file-FFF.*) has, counting from the last one."""
+    last: FilePosition | None = None
+    for path in folder.glob("chunk-*/file-*"):
+        chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
+        if chunk.isdigit() and file.isdigit():
+            position = FilePosition(chunk=int(chunk), file=int(file))
+            if last is None or (position.chunk, position.file) > (last.chunk, last.file):
+                last = position
+    return FilePosition() if last is None else last.next(chunks_size)
+
+
 @dataclass(frozen=True, kw_only=True)
 class DatasetInfo:
     """What meta/info.json says.

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition
+from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition, next_position
 from demorec.datasets.staging import sync_file
 
 _ROWS_PER_GROUP = 4096
@@ -39,11 +39,10 @@ class RollingParquet:
         *,
         limit_mb: float,
         chunks_size: int,
-        start: FilePosition,
         compression: str = "snappy",
         repeating: Sequence[str] | None = None,
     ) -> None:
-        self.position = start
+        self.position = next_position(root / template.partition("/chunk-")[0], chunks_size)
         self.num_bytes = 0
         self._root = root
         self._template = template

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
@@ -18,33 +18,16 @@ from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import EpisodeBoxes
 from demorec.datasets.lerobot.depth import depth_info, depth_video
-from demorec.datasets.lerobot.facts import episode_facts
+from demorec.datasets.lerobot.facts import EpisodeProgress, episode_facts
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, DatasetFeature
 from demorec.datasets.lerobot.mp4 import CodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.progress import EpisodeProgress
-from demorec.datasets.lerobot.sidecar import EpisodeRecord
 from demorec.datasets.lerobot.stats import PixelHistogram, colour_levels
 from demorec.datasets.lerobot.writer import EpisodeData
 from demorec.episode.features import ACTION, IMAGE_PREFIX
 from demorec.mcap import AnyRecording, VideoSettings
 from demorec.mcap.video import make_encoder
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PreparedEpisode:
-    """What came of one recording: for the dataset, and for what stands beside it.
-
-    Attributes:
-        data: For the dataset.
-        record: For the sidecar.
-        boxes: Camera feature -> what it sees, if that was asked for.
-    """
-
-    data: EpisodeData
-    record: EpisodeRecord
-    boxes: Mapping[str, EpisodeBoxes] = field(default_factory=dict)
 
 
 def dataset_features(episode: ExportEpisode, options: ExportOptions) -> dict[str, DatasetFeature]:
@@ -80,7 +63,7 @@ def reasons_to_transcode(episode: ExportEpisode) -> dict[ExportCamera, str]:
 
 def prepare_episode(
     episode: ExportEpisode, options: ExportOptions, *, code_depth: bool = True, about: Collection[int] | None = None
-) -> PreparedEpisode:
+) -> EpisodeData:
     """Read an episode into memory, as the dataset wants it.
 
     Args:
@@ -107,7 +90,7 @@ def prepare_episode(
             videos[camera.feature], pixels[camera.feature] = depth_video(episode.images(camera), fps=episode.fps)
         else:
             episode.numbers(camera)  # says what is missing
-    data = EpisodeData(
+    return EpisodeData(
         task=episode.recording.info.instruction,
         columns=episode.singles,
         videos=videos,
@@ -115,11 +98,6 @@ def prepare_episode(
         pixels=pixels,
         language=_language(episode, options, about),
         facts=_facts(episode, options),
-    )
-    return PreparedEpisode(
-        data=data,
-        record=EpisodeRecord.of(episode),
-        boxes=_boxes(episode) if options.boxes else {},
     )
 
 
@@ -153,7 +131,7 @@ def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
     return facts
 
 
-def _boxes(episode: ExportEpisode) -> dict[str, EpisodeBoxes]:
+def episode_boxes(episode: ExportEpisode) -> dict[str, EpisodeBoxes]:
     """Camera feature -> what it sees, of the cameras that have segmentation.
 
     Raises:

@@ -87,13 +87,19 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     Raises:
         RecordingError: The recording is damaged.
     """
-    simulated, urdf = episode.simulated, episode.urdf
-    spec = None if simulated is None else simulated.recording.info.robot
-    if not urdf:
+    spec = None if episode.simulated is None else episode.simulated.recording.info.robot
+    if not (text := episode.urdf):
         return None
-    return _robot(
-        episode.recording.info.robot_name, urdf, tuple(episode.joints.items()), tuple(episode.units.items()), spec
+    urdf = portable_urdf(text) if spec is None else text
+    record = RobotRecord(
+        name=episode.recording.info.robot_name,
+        urdf_sha256=_sha256(urdf),
+        joints=dict(episode.joints),
+        units=dict(episode.units),
+        spec=spec,
+        meshes={} if spec is None else _mesh_names(spec.urdf),
     )
+    return DatasetRobot(record=record, urdf=urdf)
 
 
 @functools.cache
@@ -113,25 +119,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     return None
 
 
-_ByFeature = tuple[tuple[str, tuple[str, ...]], ...]
-
-
 @functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run
-def _robot(name: str, text: str, joints: _ByFeature, units: _ByFeature, spec: RobotSpec | None) -> DatasetRobot:
-    urdf = portable_urdf(text) if spec is None else text
-    return DatasetRobot(
-        record=RobotRecord(
-            name=name,
-            urdf_sha256=_sha256(urdf),
-            joints=dict(joints),
-            units=dict(units),
-            spec=spec,
-            meshes={} if spec is None else _mesh_names(spec.urdf),
-        ),
-        urdf=urdf,
-    )
-
-
 def portable_urdf(text: str) -> str:
     """The links, joints and materials of a URDF, without a path of the machine that it comes from.
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array
 from demorec.core.plain import to_json, to_plain
 from demorec.datasets.episode import ExportEpisode, Simulated
+from demorec.datasets.lerobot.facts import first_goal
 from demorec.datasets.lerobot.layout import (
     SIDECAR_ATTEMPTS_PATH,
     SIDECAR_CAMERAS_PATH,
     SIDECAR_EPISODES_PATH,
-    FilePosition,
 )
 from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
@@ -107,14 +107,14 @@ class EpisodeRecord:
 
     Attributes:
         row: Of the episodes' table, less the index.
-        attempt: Of the attempts' table.
+        attempt: Of the attempts' table, less `in_dataset`.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
         config_digest, config: Of its run.
         robot: What draws and moves its arm; None where that is not known.
     """
 
     row: Mapping[str, Any]
-    attempt: AttemptRecord
+    attempt: Mapping[str, Any]
     moving_cameras: Mapping[str, Array]
     config_digest: str
     config: Mapping[str, Any]
@@ -123,15 +123,11 @@ class EpisodeRecord:
     @classmethod
     def of(cls, episode: ExportEpisode) -> EpisodeRecord:
         """Of an episode; frame numbers are those of the dataset."""
-        recording, rows, attempt = episode.recording, episode.rows, AttemptRecord.of(episode.recording)
+        recording, rows, attempt = episode.recording, episode.rows, attempt_row(episode.recording)
         row = {
-            "source": attempt.source,
-            "run_episode_index": attempt.run_episode_index,
-            "attempt": attempt.attempt,
+            **{name: attempt[name] for name in ("source", "run_episode_index", "attempt", "success", "failure_reason")},
             "origin": episode.origin,
             "frame_stride": recording.info.fps // episode.fps if len(rows) > 1 else 1,
-            "success": attempt.success,
-            "failure_reason": attempt.failure_reason,
             "cameras": episode.described_cameras(),
         }
         moving: dict[str, Array] = {}
@@ -200,38 +196,30 @@ def _things(scene: Scene, columns: SimulatedColumns) -> dict[str, list[dict[str,
     }
 
 
-@dataclass(frozen=True, kw_only=True)
-class SidecarStart:
-    """The next unused file numbers in a dataset that has a sidecar already, and its configs."""
-
-    episodes: FilePosition = field(default_factory=FilePosition)
-    attempts: FilePosition = field(default_factory=FilePosition)
-    camera_poses: FilePosition = field(default_factory=FilePosition)
-    configs: Mapping[str, Any] | None = None
-
-
 class SidecarWriter:
-    """Writes the sidecar's tables as the episodes come; `finish` completes them."""
+    """Writes the sidecar's tables as the episodes come; `finish` completes them.
 
-    def __init__(self, root: Path, start: SidecarStart, *, limit_mb: float, chunks_size: int) -> None:
+    Args:
+        root: Folder of the dataset; what it holds of a sidecar already is gone on with.
+        configs: Config digest -> configuration, of the episodes that are there.
+        limit_mb, chunks_size: Of the tables' files.
+    """
+
+    def __init__(self, root: Path, configs: Mapping[str, Any], *, limit_mb: float, chunks_size: int) -> None:
         self._root = root
-        self._start = start
         self._limit_mb, self._chunks_size = limit_mb, chunks_size
-        self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA, start.episodes)
-        self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA, start.attempts)
+        self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA)
+        self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA)
         self._camera_poses: RollingParquet | None = None
         self._episode_rows: list[dict[str, Any]] = []
         self._attempt_rows: list[dict[str, Any]] = []
-        self._configs: dict[str, Any] = dict(start.configs or {})
+        self._configs: dict[str, Any] = dict(configs)
 
-    def _table(
-        self, template: str, schema: pa.Schema, start: FilePosition, repeating: Sequence[str] | None = None
-    ) -> RollingParquet:
+    def _table(self, template: str, schema: pa.Schema, repeating: Sequence[str] | None = None) -> RollingParquet:
         return RollingParquet(
             self._root,
             template,
             schema,
-            start=start,
             limit_mb=self._limit_mb,
             chunks_size=self._chunks_size,
             compression="zstd",
@@ -262,10 +250,9 @@ class SidecarWriter:
         if len(self._episode_rows) >= _ROWS_PER_TABLE:
             self._flush_episodes()
 
-    def add_attempt(self, attempt: AttemptRecord, *, in_dataset: bool) -> None:
+    def add_attempt(self, attempt: Mapping[str, Any], *, in_dataset: bool) -> None:
         """An attempt that was seen, whether or not it is in the dataset."""
-        row = {item.name: getattr(attempt, item.name) for item in fields(attempt)}
-        self._attempt_rows.append({**row, "in_dataset": in_dataset})
+        self._attempt_rows.append({**attempt, "in_dataset": in_dataset})
         if len(self._attempt_rows) >= _ROWS_PER_TABLE:
             self._flush_attempts()
 
@@ -274,9 +261,7 @@ class SidecarWriter:
             schema = pa.schema(
                 [("episode_index", pa.int64()), ("frame_index", pa.int64()), *((name, _POSE) for name in poses)]
             )
-            self._camera_poses = self._table(
-                SIDECAR_CAMERAS_PATH, schema, self._start.camera_poses, repeating=["episode_index"]
-            )
+            self._camera_poses = self._table(SIDECAR_CAMERAS_PATH, schema, repeating=["episode_index"])
         frames = len(next(iter(poses.values())))
         arrays = [pa.array(np.full(frames, episode_index)), pa.array(np.arange(frames))]
         arrays += [vector_array(poses[name], _POSE) for name in self._camera_poses.schema.names[2:]]
@@ -325,50 +310,18 @@ ATTEMPT_SCHEMA = pa.schema(
 )
 
 
-CUT_OFF = "cut off by a crash"
-"""Reason of a failure that nobody was there to state."""
+def attempt_row(recording: AnyRecording) -> dict[str, Any]:
+    """One attempt, as far as success rates need it, from the recording's metadata alone, less `in_dataset`.
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AttemptRecord:
-    """One attempt, as far as success rates need it; positions in the world frame, metres, at the start.
-
-    `success` is None where nobody said.
+    Positions are in the world frame, metres, at the start; `success` is None where nobody said.
     """
-
-    source: str
-    run_episode_index: int
-    attempt: int
-    success: bool | None
-    failure_phase: str
-    failure_reason: str
-    object: str
-    object_x: float | None
-    object_y: float | None
-    goal_x: float | None
-    goal_y: float | None
-
-    @classmethod
-    def of(cls, recording: AnyRecording) -> AttemptRecord:
-        """From the recording's metadata alone."""
-        info, outcome, scene = recording.info, recording.outcome, recording.info.scene
-        name = ""
-        place: list[float | None] = [None] * 4
-        if scene is not None and scene.goals:
-            name = scene.goals[0].object
-            poses = (scene.body(name).world_from_body, scene.world_from_goal(scene.goals[0]))
-            place = [value for pose in poses for value in pose.position[:2].tolist()]
-        object_x, object_y, goal_x, goal_y = place
-        return cls(
-            source=recording.path.name,
-            run_episode_index=info.episode_index,
-            attempt=info.attempt,
-            success=recording.success,
-            failure_phase="" if outcome is None else outcome.failure_phase,
-            failure_reason=CUT_OFF if outcome is None else outcome.failure_reason,
-            object=name,
-            object_x=object_x,
-            object_y=object_y,
-            goal_x=goal_x,
-            goal_y=goal_y,
-        )
+    info, outcome = recording.info, recording.outcome
+    return {
+        "source": recording.path.name,
+        "run_episode_index": info.episode_index,
+        "attempt": info.attempt,
+        "success": recording.success,
+        "failure_phase": "" if outcome is None else outcome.failure_phase,
+        "failure_reason": "cut off by a crash" if outcome is None else outcome.failure_reason,
+        **first_goal(info.scene),
+    }

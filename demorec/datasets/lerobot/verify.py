@@ -14,7 +14,6 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -54,14 +53,6 @@ def lerobot_is_installed() -> bool:
     return importlib.util.find_spec("lerobot") is not None
 
 
-@dataclass(frozen=True, kw_only=True)
-class VerifiedEpisode:
-    """An episode of the dataset and the recording that it comes from."""
-
-    episode_index: int
-    recording: Path
-
-
 class Verifier:
     """Context manager over the process that verifies; it starts loading LeRobot at once, while the export runs.
 
@@ -87,8 +78,8 @@ class Verifier:
         self._process.join()
         self._cache.cleanup()
 
-    def verify(self, root: Path, samples: Sequence[VerifiedEpisode], options: ExportOptions) -> int:
-        """Compare; return how many frames were compared.
+    def verify(self, root: Path, samples: Sequence[tuple[int, Path]], options: ExportOptions) -> int:
+        """Compare episodes with the recordings that they come from; return how many frames were compared.
 
         Raises:
             ExportError: LeRobot cannot open the dataset, or shows something else than the recordings.
@@ -130,7 +121,7 @@ def _serve(pipe: Connection[Any, Any], cache: str) -> None:
         pipe.send(answer)
 
 
-def _verify(root: Path, samples: tuple[VerifiedEpisode, ...], options: ExportOptions) -> int:
+def _verify(root: Path, samples: Sequence[tuple[int, Path]], options: ExportOptions) -> int:
     from lerobot.datasets import LeRobotDataset
 
     try:
@@ -140,27 +131,27 @@ def _verify(root: Path, samples: tuple[VerifiedEpisode, ...], options: ExportOpt
             f"The new dataset was dropped, LeRobot cannot open it ({in_words(error)})."
         ) from error
     frames = 0
-    for number, sample in enumerate(samples):
-        with open_recording(sample.recording) as recording:
-            frames += _compare_episode(dataset, sample, recording, options, number)
+    for number, (episode_index, path) in enumerate(samples):
+        with open_recording(path) as recording:
+            frames += _compare_episode(dataset, episode_index, recording, options, number)
     return frames
 
 
 def _compare_episode(
-    dataset: Any, sample: VerifiedEpisode, recording: AnyRecording, options: ExportOptions, number: int
+    dataset: Any, episode_index: int, recording: AnyRecording, options: ExportOptions, number: int
 ) -> int:
-    first = int(dataset.meta.episodes[sample.episode_index]["dataset_from_index"])
+    first = int(dataset.meta.episodes[episode_index]["dataset_from_index"])
     episode = exported(recording, options)
     length = len(episode.rows)
     # The last frame, where offsets add up, and one more that differs from episode to episode.
     moments = sorted({(number * 37) % length, length - 1})
-    expected = prepare_episode(episode, options, code_depth=False, about=moments).data
+    expected = prepare_episode(episode, options, code_depth=False, about=moments)
     for moment in moments:
         try:
             item = dataset[first + moment]
         except Exception as error:
             raise ExportError(
-                f"The new dataset was dropped, LeRobot cannot read frame {moment} of episode {sample.episode_index} "
+                f"The new dataset was dropped, LeRobot cannot read frame {moment} of episode {episode_index} "
                 f"({in_words(error)})."
             ) from error
         wrong = [
@@ -179,7 +170,7 @@ def _compare_episode(
         if wrong:
             raise ExportError(
                 f"The new dataset was dropped: read through LeRobot, {', '.join(wrong)} of frame {moment} of episode "
-                f"{sample.episode_index} differ from the recording: {sample.recording}"
+                f"{episode_index} differ from the recording: {recording.path}"
             )
     return len(moments)
 
@@ -191,7 +182,7 @@ def _equal(tensor: Any, values: Any) -> bool:
 
 def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[str]:
     rows = {PERSISTENT: expected.persistent, EVENTS: expected.events.get(moment, ())}
-    return [name for name, told in rows.items() if name in item and item[name] != [row.to_json() for row in told]]
+    return [name for name, told in rows.items() if name in item and item[name] != list(told)]
 
 
 def _is_wrong_image(tensor: Any, episode: ExportEpisode, camera: ExportCamera, moment: int) -> bool:

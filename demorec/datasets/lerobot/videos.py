@@ -276,11 +276,6 @@ def why_transcoded(videos: Sequence[EpisodeVideo]) -> tuple[PacketCodec, tuple[i
     return codec, size, reason
 
 
-def images_at(root: Path, info: DatasetInfo, key: str, place: EpisodePlace, frames: Sequence[int]) -> Iterator[Rgb]:
-    """As `EpisodeVideo.images_at` of a camera feature."""
-    return EpisodeVideo(root, info, key, place).images_at(frames)
-
-
 _LARGE_BYTES, _IMAGE_RATIO = 24 << 20, 200
 """An image of more pixels than that, in RGB (8 million), takes at least so small a part of them as a file."""
 _PIXEL_BYTES, _FILE_RATIO = 512 << 20, 1000

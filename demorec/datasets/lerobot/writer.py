@@ -29,10 +29,10 @@ from demorec.datasets.lerobot.layout import (
     TASKS_PATH,
     VIDEO_PATH,
     DatasetInfo,
-    FilePosition,
     data_schema,
     episode_digest,
     merged_video_info,
+    next_position,
 )
 from demorec.datasets.lerobot.mp4 import CodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, vector_array
@@ -88,17 +88,12 @@ class WriterStart:
     Attributes:
         num_episodes, num_frames: That are there.
         tasks: In the order of their indices.
-        data, episodes: The next unused file numbers.
-        videos: Camera feature -> the next unused file number.
         statistics: Of the camera features over what is there.
     """
 
     num_episodes: int = 0
     num_frames: int = 0
     tasks: tuple[str, ...] = ()
-    data: FilePosition = field(default_factory=FilePosition)
-    episodes: FilePosition = field(default_factory=FilePosition)
-    videos: Mapping[str, FilePosition] = field(default_factory=dict)
     statistics: Mapping[str, Statistics] = field(default_factory=dict)
 
 
@@ -138,17 +133,14 @@ class DatasetWriter:
             root,
             DATA_PATH,
             self._schema,
-            start=self._start.data,
             repeating=["episode_index", "task_index", *strings, *(REPEATING if self._language else ())],
             **_sizes(info),
         )
-        self._episodes = RollingParquet(
-            root, EPISODES_PATH, self._episode_schema(), start=self._start.episodes, **_sizes(info)
-        )
+        self._episodes = RollingParquet(root, EPISODES_PATH, self._episode_schema(), **_sizes(info))
         self._rows: list[dict[str, Any]] = []
         self._row_statistics: list[dict[str, Statistics]] = []
         self._videos: dict[str, Mp4Writer] = {}
-        self._video_positions = {key: self._start.videos.get(key, FilePosition()) for key in info.video_keys}
+        self._video_positions = {key: next_position(root / "videos" / key, info.chunks_size) for key in info.video_keys}
         self._video_info = {key: info.features[key].info for key in info.video_keys}
         self._pixels: dict[str, PixelHistogram] = {}
 
