@@ -15,7 +15,6 @@ from pathlib import Path
 
 from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
-from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.runs.find import PathKind, find
 from demorec.sources.bag import bags_in
 from demorec.sources.channel import BagError
@@ -64,8 +63,7 @@ def opened(
         paths: Recordings, runs, folders of recordings, datasets, HDF5 files, bags and folders of bags.
         mapping: Of the bags and HDF5 files; None where the one that `demorec import --suggest` writes leaves nothing to
             decide.
-        imports_datasets: Whether datasets are opened as recordings; else only those of old formats are, which have
-            other files than v3.0.
+        imports_datasets: Whether datasets are opened as recordings.
         tell: Called with what was left out, and by which mapping, a line each.
         progress: Called with each path that is read.
 
@@ -99,7 +97,7 @@ def _import_kind(path: Path, imports_datasets: bool) -> PathKind | None:
     """What a path is to be imported as; None for what is read as it is, and for what no command reads."""
     kind = find(path).kind
     if kind == "dataset":
-        return kind if imports_datasets or DatasetInfo.load(path).is_old else None
+        return kind if imports_datasets else None
     return kind if kind in _NEEDS_MAPPING else None
 
 
@@ -128,7 +126,7 @@ def _suggested(path: Path, kind: PathKind, target: Path, tell: Callable[[str], N
     try:
         if doubts:
             raise ConfigError(doubts[0])
-        used = read_mapping_file(target, Hdf5Mapping if is_hdf5 else BagMapping)
+        used = read_mapping_file(target, Hdf5Mapping) if is_hdf5 else read_mapping_file(target, BagMapping)
     except ConfigError as error:
         reason = str(error).removesuffix(f": {target}")
         raise ConfigError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import tempfile
 from collections import namedtuple
 from pathlib import Path
@@ -86,7 +87,7 @@ def test_a_command_reads_it(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if command == "report" and kind != "lerobot v3.0":
+    if command == "report" and not kind.startswith("lerobot"):
         pytest.xfail("demorec report does not read external episodes yet")
     words: list[str] = []
     for word in COMMANDS[command].split():
@@ -140,7 +141,9 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     assert exit_code("check", bag, "--mapping", mapping, "--verbose") == 0
     printed = capsys.readouterr().out
     assert f"warn  run {bag}: " in printed
-    assert "1 gaps, the first at 0.40 s" in printed
+    (judged,) = [line for line in printed.splitlines() if "  import_times 1" in line]
+    assert judged.lstrip().startswith("warn")
+    assert "gap" in judged
     assert f"recording {bag}: episode 0: " in printed
 
 
@@ -200,6 +203,6 @@ def test_a_disk_that_is_too_small_is_said_before_anything_is_read(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(opening.shutil, "disk_usage", lambda _: usage(10, 10, 0))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 10, 0))
     assert exit_code("info", *places["mcap"]) == 2
     assert f"in {scratch}, where 0 MB are free: set TMPDIR to a folder on a larger disk" in capsys.readouterr().err

@@ -30,8 +30,8 @@ def reading(
         ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
         DemorecError: A path cannot be read.
     """
-    kinds = [find(path).kind for path in paths]
-    if mapping is None and not {"hdf5", "rosbag", "dataset"} & {*kinds}:
+    imported = {"hdf5", "rosbag", *(["dataset"] if imports_datasets else [])}
+    if mapping is None and not imported & {find(path).kind for path in paths}:
         yield tuple(paths)  # without loading what reads bags
         return
     from demorec.sources.opening import opened
