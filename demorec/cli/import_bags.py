@@ -105,8 +105,8 @@ class Import:
         return (self._import_hdf5 if is_hdf5 else self._import_bags)(files, self.mapping, self.out)
 
     def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
+        from demorec.sources.import_file import report_lines
         from demorec.sources.import_run import import_bags
-        from demorec.sources.report import report_lines
 
         with ProgressBar("importing", unit="bag") as bar:
             result = import_bags(

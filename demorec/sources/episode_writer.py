@@ -1,12 +1,11 @@
-"""An episode on its way into its recording, while its bag is read a second time for the pictures.
+"""An episode on its way into its recording, while its bag is read a second time for the images.
 
-Pictures that are coded already stay as they are, byte for byte; pixels are coded once. A frame is written as soon as
-its pictures are, so that of a bag of any size only what is under way is in memory.
-"""
+Images that are encoded already stay as they are, byte for byte; pixels are encoded once. A frame is written as soon as
+its images are, so that of a bag of any size only what is under way is in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, cast
@@ -14,14 +13,28 @@ from typing import Any, Self, cast
 import numpy as np
 
 from demorec.core.config import VideoConfig
-from demorec.episode.external import DEPTH_UNITS, EpisodeInfo, ExternalOutcome, Kept, Sample, SampledFrame
+from demorec.core.errors import ConfigError
+from demorec.core.files import read_text_limited
+from demorec.episode.external import (
+    DEPTH_UNITS,
+    Camera,
+    EpisodeInfo,
+    ExternalOutcome,
+    Feature,
+    Kept,
+    Sample,
+    SampledFrame,
+)
 from demorec.mcap import EpisodeWriter
-from demorec.sources.channel import BagError
+from demorec.sources.bag import Bag
+from demorec.sources.bag_files import BagError
 from demorec.sources.clock import Int, Timeline
 from demorec.sources.fields import picture_bytes
+from demorec.sources.mapping_file import STATE, recorded_unit
 from demorec.sources.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
 from demorec.sources.ros_types import Values
-from demorec.sources.rows import CameraRows, EpisodeRows
+from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines
+from demorec.sources.streams import BagStreams
 
 _MAX_WAITING = 1 << 29
 """Bytes of pictures that wait for earlier ones, which come later in the bag."""
@@ -213,3 +226,72 @@ class ImportedEpisodeWriter:
             raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
         self._writer.finish(ExternalOutcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True
+
+
+_MAX_URDF_BYTES = 4 << 20
+
+
+def urdf_text(name: str, mapping_path: Path) -> str:
+    """The URDF that a mapping names a file for; "" when it names none. ConfigError when it cannot be read."""
+    if not name:
+        return ""
+    path = mapping_path.parent / name
+    try:
+        return read_text_limited(path, _MAX_URDF_BYTES)
+    except (OSError, ValueError) as error:  # no text, or NUL in the name
+        raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
+
+
+def urdf_in_bag(bag: Bag, streams: BagStreams, topic: str) -> str:
+    """The URDF that a topic of the bag holds; BagError when it holds none."""
+    text = streams.texts[topic][0].value if streams.texts[topic] else ""
+    if not isinstance(text, str) or not text.strip():
+        raise BagError(f"{topic} holds no robot description: {bag.path}")
+    return text
+
+
+def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints: Container[str]) -> Feature:
+    """A feature as recordings know it, given the joints of the robot's model."""
+    units = tuple(map(recorded_unit, feature.units))
+    sources = lines.mapping.features[name]
+    told = []
+    for index, source in enumerate(sources):
+        if source.next:
+            told.append(f"{source.next} of the next frame")
+            continue
+        clock = "header" if lines.lines[name, index].is_header else "log"
+        told.append(f"{source.topic} {source.field}, {lines.rule((name, index))[0]} by {clock} time")
+    moves = [element if element in joints and name == STATE else "" for element in feature.names]
+    return Feature(
+        name=name,
+        dtype="float32" if feature.values.dtype == np.float32 else "float64",
+        names=feature.names,
+        units=units if any(units) else (),
+        joints=tuple(moves) if any(moves) else (),
+        source="; ".join(told),
+    )
+
+
+def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Camera:
+    """A camera as recordings know it."""
+    clock = "header" if lines.lines[name].is_header else "log"
+    info = lines.streams.infos.get(name, {})
+    matrix, distortion = _first(info, "k", "K"), _first(info, "d", "D")
+    size = (plan.head.width, plan.head.height)
+    fits = (info.get("width") or size[0], info.get("height") or size[1]) == size
+    known = fits and len(matrix) == 9 and matrix[0] > 0 and bool(np.isfinite(matrix).all())
+    return Camera(
+        name=name,
+        width=plan.head.width,
+        height=plan.head.height,
+        kept=plan.kept,
+        intrinsics=tuple(matrix) if known else None,
+        distortion=tuple(distortion) if known and len(distortion) == 5 and np.isfinite(distortion).all() else (),
+        source=f"{plan.topic}, {lines.rule(name)[0]} by {clock} time",
+    )
+
+
+def _first(values: Mapping[str, Any], *keys: str) -> list[float]:
+    """The numbers of the first of these fields that is there."""
+    found = next((values[key] for key in keys if key in values), None)
+    return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) and found.size <= 64 else []

@@ -8,7 +8,7 @@ import numpy as np
 
 from demorec.core.plain import listed
 from demorec.sources.bag import Bag
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.clock import NS, Int, Timeline
 from demorec.sources.fields import FieldError
 from demorec.sources.mapping import BagMapping, Episodes

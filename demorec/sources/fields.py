@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.registry import nearest_match
-from demorec.sources.channel import MAX_TIME_NS
+from demorec.sources.bag_files import MAX_TIME_NS
 from demorec.sources.mapping import Source
 from demorec.sources.mapping_file import MAX_ELEMENTS, Part, conversion_factor
 from demorec.sources.ros_types import Values

@@ -15,9 +15,9 @@ from demorec.core.errors import without_path
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.episode.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.runs.find import expect
-from demorec.sources.hdf5_episodes import episode_places, found_attribute, told_rate
-from demorec.sources.hdf5_mapping import Hdf5Episodes
-from demorec.sources.hdf5_pictures import is_camera
+from demorec.sources.hdf5_arrays import is_camera
+from demorec.sources.hdf5_import import episode_places, found_attribute, told_rate
+from demorec.sources.mapping import Hdf5Episodes
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
 _ROBOMIMIC, _OBSERVATIONS = "data", "obs"

@@ -31,18 +31,23 @@ from demorec.runs.external import (
     open_external_run,
 )
 from demorec.sources.bag import Bag, bags_in
-from demorec.sources.batch import Batch, ImportResult, Job, PlannedBag, files_of
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
+from demorec.sources.batch import Batch, ImportResult, Job, PlannedBag, files_of, processes
 from demorec.sources.clock import NS, Int
-from demorec.sources.description import described_camera, described_feature, urdf_in_bag, urdf_text
-from demorec.sources.episode_writer import ImportedEpisodeWriter, PlannedEpisode, picture_plan
+from demorec.sources.episode_writer import (
+    ImportedEpisodeWriter,
+    PlannedEpisode,
+    described_camera,
+    described_feature,
+    picture_plan,
+    urdf_in_bag,
+    urdf_text,
+)
 from demorec.sources.episodes import Window, subtask_rows, task_text, windows
 from demorec.sources.fields import FieldError
 from demorec.sources.findings import LOST, NOTE, Finding, all_findings, of_stream
-from demorec.sources.import_file import ImportFile, load_import_file
+from demorec.sources.import_file import BagReport, EpisodeReport, ImportFile, load_import_file, stream_reports
 from demorec.sources.mapping import BagMapping, read_mapping
-from demorec.sources.pipeline import processes
-from demorec.sources.report import BagReport, EpisodeReport, stream_reports
 from demorec.sources.rows import RATE, EpisodeRows, NoRowsError, Timelines
 from demorec.sources.streams import BagDecoder, read_streams
 

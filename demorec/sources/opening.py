@@ -17,16 +17,15 @@ from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
 from demorec.runs.find import PathKind, find
 from demorec.sources.bag import bags_in
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.dataset_import import import_lerobot
 from demorec.sources.frames_writer import FramesImport
 from demorec.sources.hdf5_import import import_hdf5
-from demorec.sources.hdf5_mapping import DatasetPart, Hdf5Mapping
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
+from demorec.sources.import_file import dropped_lines
 from demorec.sources.import_run import import_bags
-from demorec.sources.mapping import BagMapping, Source
+from demorec.sources.mapping import BagMapping, DatasetPart, Hdf5Mapping, Source
 from demorec.sources.mapping_file import Part, read_mapping_file
-from demorec.sources.report import dropped_lines
 from demorec.sources.suggest import suggested_mapping
 
 _MB = 1e6

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.episode.external import DEPTH_UNITS
 from demorec.mcap.limits import VARIABLE, Limits
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline
 from demorec.sources.episodes import Window
 from demorec.sources.mapping import ROWS, BagMapping, CameraSource, Sampling, Source

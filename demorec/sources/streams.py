@@ -20,7 +20,7 @@ from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
 from demorec.mcap.limits import SpentError
 from demorec.sources.bag import Bag
-from demorec.sources.channel import BagChannel, BagError, BagMessage
+from demorec.sources.bag_files import BagChannel, BagError, BagMessage
 from demorec.sources.decoding import Decoder, UnknownEncodingError, decoder_of
 from demorec.sources.fields import (
     FieldError,

@@ -20,8 +20,8 @@ import numpy as np
 from demorec.episode.external import DEPTH_UNITS
 from demorec.mcap.limits import SpentError
 from demorec.sources.bag import Bag, open_bag
+from demorec.sources.bag_files import BagError, BagMessage
 from demorec.sources.candidates import Vector, transforms_of, vectors_of
-from demorec.sources.channel import BagError, BagMessage
 from demorec.sources.choice import Choice, choose_features
 from demorec.sources.clock import NS, SKEW_S
 from demorec.sources.decoding import UnknownEncodingError

@@ -27,10 +27,10 @@ from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources import import_run
 from demorec.sources.bag import Bag
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
+from demorec.sources.import_file import BagReport
 from demorec.sources.import_run import import_bags
 from demorec.sources.mapping import BagMapping
-from demorec.sources.report import BagReport
 from demorec.sources.streams import BagStreams, read_streams
 
 FRONT = "/follower/cam_front/image_raw/compressed"

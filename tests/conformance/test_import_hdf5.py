@@ -32,12 +32,10 @@ from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.mcap import Recording, SimulatedRecording
 from demorec.runs.external import load_external_run
 from demorec.sources.frames_writer import FramesImport, Picture
-from demorec.sources.hdf5_episodes import episode_places
-from demorec.sources.hdf5_features import Hdf5FitError, StoredFeature
-from demorec.sources.hdf5_import import import_hdf5
-from demorec.sources.hdf5_mapping import DatasetPart, Hdf5Episodes
-from demorec.sources.hdf5_pictures import StoredCamera
+from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature
+from demorec.sources.hdf5_import import episode_places, import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
+from demorec.sources.mapping import DatasetPart, Hdf5Episodes
 
 DEMOS = ("demo_0", "demo_1", "demo_10")
 Vectors = dict[str, NDArray[np.generic]]

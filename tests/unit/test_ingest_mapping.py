@@ -10,7 +10,7 @@ from support import bag_mappings, bags
 
 from demorec.core.errors import ConfigError
 from demorec.sources.bag import open_bag
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.fields import (
     FieldError,
     OtherPublisherError,
