@@ -30,7 +30,7 @@ from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import Int, Timeline
 from demorec.sources.fields import picture_bytes
-from demorec.sources.mapping_file import STATE, recorded_unit
+from demorec.sources.mapping import STATE, recorded_unit
 from demorec.sources.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
 from demorec.sources.ros_types import Values
 from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines

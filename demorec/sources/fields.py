@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from demorec.core.registry import nearest_match
 from demorec.sources.bag_files import MAX_TIME_NS
-from demorec.sources.mapping import Source
-from demorec.sources.mapping_file import MAX_ELEMENTS, Part, conversion_factor
+from demorec.sources.mapping import MAX_ELEMENTS, Source, conversion_factor
 from demorec.sources.ros_types import Values
 
 _STEP = re.compile(r"(?P<name>[^.\[\]]+)|\[(?P<key>[^=\]]+)=(?P<value>[^\]]*)\]|\[(?P<index>\d+)\]")
@@ -337,7 +336,7 @@ def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
     return np.concatenate([array.astype(np.float32 if single else np.float64) for array in arrays])
 
 
-def converted(part: Part, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+def converted(part: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
     """(N, D) in the unit of the feature; the very same array where that is the source's."""
     factor = conversion_factor(part.unit, part.to)
     if factor is None:

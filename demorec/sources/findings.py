@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from demorec.episode.external import DEPTH_UNITS
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.fields import frame_id_of
-from demorec.sources.mapping import BagMapping
-from demorec.sources.mapping_file import ACTION, STATE
+from demorec.sources.mapping import ACTION, STATE, SourceMapping
 from demorec.sources.rows import Timelines
 from demorec.sources.streams import NO_STAMP, BagStreams, Stream
 
@@ -407,7 +406,7 @@ def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
             yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
 
 
-def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
+def _unit_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
     for (name, index), stream in streams.sources.items():
         source = mapping.features[name][index]
         if stream.values is None or source.next or (source.to or source.unit) != "rad":
@@ -417,7 +416,7 @@ def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding
             yield of_stream(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
 
 
-def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
+def _action_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
     """State and action that do not speak of the same thing."""
     if any(source.next for source in mapping.features[ACTION]):
         return

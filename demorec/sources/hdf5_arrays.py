@@ -15,8 +15,7 @@ from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
 from demorec.episode.external import Camera, Feature, Kept, Vector
 from demorec.sources.fields import FieldError, converted
 from demorec.sources.frames_writer import Picture
-from demorec.sources.mapping import CameraDataset, DatasetPart
-from demorec.sources.mapping_file import MAX_ELEMENTS, STATE, conversion_factor, recorded_unit
+from demorec.sources.mapping import MAX_ELEMENTS, STATE, CameraSource, Source, conversion_factor, recorded_unit
 from demorec.sources.picture_messages import PictureHead, decode_picture, picture_head
 from demorec.sources.ros_types import Values
 
@@ -33,7 +32,7 @@ class Hdf5FitError(ValueError):
 class _Column:
     """One part of a feature, and where its numbers are."""
 
-    part: DatasetPart
+    part: Source
     array: StoredArray
     names: tuple[str, ...]
 
@@ -68,7 +67,7 @@ class StoredFeature:
         Hdf5FitError: They are no vectors.
     """
 
-    def __init__(self, name: str, parts: Sequence[DatasetPart], arrays: Sequence[StoredArray], *, shift: int) -> None:
+    def __init__(self, name: str, parts: Sequence[Source], arrays: Sequence[StoredArray], *, shift: int) -> None:
         self.name, self.shift = name, shift
         pairs = zip(parts, arrays, strict=True)
         self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
@@ -116,7 +115,7 @@ class StoredFeature:
             yield from np.concatenate(parts, axis=1).astype(self.dtype)
 
 
-def _names(part: DatasetPart, array: StoredArray) -> tuple[str, ...]:
+def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
     """Of the elements that are taken."""
     if len(array.shape) > 2:
         shape = "x".join(map(str, array.shape))
@@ -174,7 +173,7 @@ class StoredCamera:
     """
 
     def __init__(
-        self, name: str, camera: CameraDataset, array: StoredArray, lengths: NDArray[np.generic] | None
+        self, name: str, camera: CameraSource, array: StoredArray, lengths: NDArray[np.generic] | None
     ) -> None:
         self.name = name
         self._camera, self._array, self._lengths = camera, array, lengths

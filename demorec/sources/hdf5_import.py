@@ -32,8 +32,8 @@ from demorec.runs.run_file import sha256_of
 from demorec.sources.episode_writer import urdf_text
 from demorec.sources.frames_writer import FramesImport, write_frames
 from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, is_camera, picture_lengths
-from demorec.sources.mapping import Hdf5Episodes, Hdf5Mapping
-from demorec.sources.mapping_file import MAX_FPS, read_mapping_file
+from demorec.sources.mapping import MAX_FPS, Episodes, SourceMapping
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.words import in_natural_order, quoted, task_in_name
 
 _LENGTHS = "compress_len"
@@ -56,7 +56,7 @@ def import_hdf5(
         Hdf5Error: A file cannot be read, or does not fit the mapping.
         RecordingError: The disk is full or gone.
     """
-    mapping = read_mapping_file(mapping_path, Hdf5Mapping)
+    mapping = read_mapping(mapping_path, "hdf5")
     urdf = urdf_text(mapping.robot.urdf, mapping_path)
     for path in paths:
         expect(path, "hdf5")
@@ -86,7 +86,7 @@ def import_hdf5(
 class _Stored:
     """An episode in an opened file; Hdf5FitError when its datasets do not fit the mapping."""
 
-    def __init__(self, file: ForeignFile, place: str, mapping: Hdf5Mapping) -> None:
+    def __init__(self, file: ForeignFile, place: str, mapping: SourceMapping) -> None:
         def array(name: str, *, may_be_ragged: bool = False) -> StoredArray:
             return file.array("/".join(filter(None, (place, name.strip("/")))), may_be_ragged=may_be_ragged)
 
@@ -144,7 +144,7 @@ def _num_rows(observed: Sequence[StoredArray], others: Sequence[StoredArray]) ->
     return num_rows
 
 
-def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: VideoConfig) -> int:
+def _write(plans: Sequence[_Plan], mapping: SourceMapping, out: Path, video: VideoConfig) -> int:
     """Record what is not there; how many episodes that were."""
     with open_external_run(out, recovers=False) as folder:
         missing = [plan for plan in plans if not folder.has(plan.info)]
@@ -161,7 +161,7 @@ class _Plan:
     """What an episode shall be; every number is looked at."""
 
     def __init__(
-        self, file: ForeignFile, place: str, mapping: Hdf5Mapping, urdf: str, source: SourceFile, episode_index: int
+        self, file: ForeignFile, place: str, mapping: SourceMapping, urdf: str, source: SourceFile, episode_index: int
     ) -> None:
         self.path, self.place = file.path, place
         with _named(file.path):
@@ -200,7 +200,7 @@ def _make_alike(plan: _Plan, first: _Plan) -> None:
     plan.info = replace(plan.info, urdf=first.info.urdf)
 
 
-def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> dict[str, str]:
+def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str, str]:
     """Datasets that the mapping does not name; groups of which it names none, as one.
 
     Raises:
@@ -240,7 +240,7 @@ _RATES = ("fps", "env_args.env_kwargs.fps", "env_args.env_kwargs.control_freq")
 """Attributes that say how many rows a second has: our own, and robosuite's."""
 
 
-def episode_places(file: ForeignFile, episodes: Hdf5Episodes) -> list[str]:
+def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
     """The groups of the episodes, demo_2 before demo_10.
 
     Raises:
@@ -303,9 +303,9 @@ def _parsed(text: str) -> Any:
         return None
 
 
-def rate_of(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> int:
+def rate_of(file: ForeignFile, place: str, mapping: SourceMapping) -> int:
     """Rows a second; Hdf5Error when neither the mapping nor the file says it, or no whole number."""
-    if mapping.clock.fps is not None:
+    if mapping.clock.fps:
         return mapping.clock.fps
     found = told_rate(file, place)
     if found is None:
@@ -329,7 +329,7 @@ def told_rate(file: ForeignFile, place: str) -> float | None:
     return None
 
 
-def task_of(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> str:
+def task_of(file: ForeignFile, place: str, mapping: SourceMapping) -> str:
     """What the robot was asked to do; Hdf5Error when the file does not say."""
     task = mapping.task
     if task.text:
@@ -344,7 +344,7 @@ def task_of(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> str:
     return " ".join(found.split())
 
 
-def success_of(file: ForeignFile, place: str, mapping: Hdf5Mapping, num_rows: int) -> bool | None:
+def success_of(file: ForeignFile, place: str, mapping: SourceMapping, num_rows: int) -> bool | None:
     """How an episode ended; None where the mapping does not ask, or other episodes of the file alone say it.
 
     Raises:

@@ -17,7 +17,7 @@ from demorec.episode.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.runs.find import expect
 from demorec.sources.hdf5_arrays import is_camera
 from demorec.sources.hdf5_import import episode_places, found_attribute, told_rate
-from demorec.sources.mapping import Hdf5Episodes
+from demorec.sources.mapping import Episodes
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
 _ROBOMIMIC, _OBSERVATIONS = "data", "obs"
@@ -80,7 +80,7 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
                 "This is neither robomimic's layout (data/demo_0/actions) nor ALOHA's (action, observations/qpos), it "
                 f"holds {held}: write the mapping by hand (docs/import.md): {path}"
             )
-        episodes = Hdf5Episodes(group="" if is_aloha else _ROBOMIMIC)
+        episodes = Episodes(group="" if is_aloha else _ROBOMIMIC)
         places = episode_places(file, episodes)
         contents = _Contents(file, places[0])
         lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]

@@ -15,7 +15,7 @@ from demorec.runs.run_file import IMPORT_NAME
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import NS
 from demorec.sources.findings import NOTE, Finding, lost_in
-from demorec.sources.mapping import BagMapping
+from demorec.sources.mapping import SourceMapping
 from demorec.sources.rows import EpisodeRows, Timelines
 
 
@@ -227,7 +227,7 @@ class ImportFile:
     """
 
     format: int = FORMAT
-    mapping: BagMapping
+    mapping: SourceMapping
     mapping_digest: str
     bags: tuple[BagReport, ...] = ()
     skipped: tuple[SkippedBag, ...] = ()

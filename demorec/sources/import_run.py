@@ -47,7 +47,8 @@ from demorec.sources.episodes import Window, subtask_rows, task_text, windows
 from demorec.sources.fields import FieldError
 from demorec.sources.findings import LOST, NOTE, Finding, all_findings, of_stream
 from demorec.sources.import_file import BagReport, EpisodeReport, ImportFile, load_import_file, stream_reports
-from demorec.sources.mapping import BagMapping, read_mapping
+from demorec.sources.mapping import SourceMapping
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.rows import RATE, EpisodeRows, NoRowsError, Timelines
 from demorec.sources.streams import BagDecoder, read_streams
 
@@ -105,7 +106,7 @@ def import_bags(
 class _Recipe:
     """What all bags have in common."""
 
-    mapping: BagMapping
+    mapping: SourceMapping
     urdf: str
     video: VideoConfig
 
@@ -129,7 +130,7 @@ class _Import:
 
     bag: Bag
     files: dict[str, str]
-    mapping: BagMapping
+    mapping: SourceMapping
     urdf: str
     video: VideoConfig
 

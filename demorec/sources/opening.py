@@ -24,8 +24,8 @@ from demorec.sources.hdf5_import import import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 from demorec.sources.import_file import dropped_lines
 from demorec.sources.import_run import import_bags
-from demorec.sources.mapping import BagMapping, DatasetPart, Hdf5Mapping, Source
-from demorec.sources.mapping_file import Part, read_mapping_file
+from demorec.sources.mapping import SourceMapping
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.suggest import suggested_mapping
 
 _MB = 1e6
@@ -125,7 +125,7 @@ def _suggested(path: Path, kind: PathKind, target: Path, tell: Callable[[str], N
     try:
         if doubts:
             raise ConfigError(doubts[0])
-        used = read_mapping_file(target, Hdf5Mapping) if is_hdf5 else read_mapping_file(target, BagMapping)
+        used = read_mapping(target, "hdf5" if is_hdf5 else "bag")
     except ConfigError as error:
         reason = str(error).removesuffix(f": {target}")
         raise ConfigError(
@@ -136,22 +136,13 @@ def _suggested(path: Path, kind: PathKind, target: Path, tell: Callable[[str], N
     return target
 
 
-def _taken(mapping: BagMapping | Hdf5Mapping) -> str:
+def _taken(mapping: SourceMapping) -> str:
     """What a mapping takes, in a line."""
-    parts = [f"{name} from {' and '.join(dict.fromkeys(map(_place, of)))}" for name, of in mapping.features.items()]
+    parts = [
+        f"{name} from {' and '.join(dict.fromkeys(source.place for source in of))}"
+        for name, of in mapping.features.items()
+    ]
     return listed([*parts, *(f"camera {name}" for name in mapping.cameras)], _MOST_SHOWN, ", ")
-
-
-def _place(part: Part) -> str:
-    if part.next:
-        return f"the next {part.next}"
-    return (
-        f"{part.topic} {part.field}"
-        if isinstance(part, Source)
-        else part.dataset
-        if isinstance(part, DatasetPart)
-        else ""
-    )
 
 
 def _import(path: Path, kind: PathKind, mapping: Path, run: Path, tell: Callable[[str], None]) -> None:

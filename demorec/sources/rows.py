@@ -14,7 +14,7 @@ from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline
 from demorec.sources.episodes import Window
-from demorec.sources.mapping import ROWS, BagMapping, CameraSource, Sampling, Source
+from demorec.sources.mapping import ROWS, CameraSource, Sampling, Source, SourceMapping
 from demorec.sources.streams import BagStreams, Stream
 
 RATE = 0.05
@@ -98,7 +98,7 @@ class Timelines:
         lines: Stream -> timeline.
     """
 
-    def __init__(self, streams: BagStreams, mapping: BagMapping) -> None:
+    def __init__(self, streams: BagStreams, mapping: SourceMapping) -> None:
         self.streams, self.mapping = streams, mapping
         pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
         self.lines = {

@@ -35,7 +35,7 @@ from demorec.sources.fields import (
     picture_bytes,
     stamp_of,
 )
-from demorec.sources.mapping import BagMapping, Source
+from demorec.sources.mapping import Source, SourceMapping
 from demorec.sources.picture_messages import PictureHeads, picture_head
 from demorec.sources.ros_types import Budgets, Values
 from demorec.sources.service_calls import CallReader, ServiceCall
@@ -287,7 +287,7 @@ def _unnamed_joints(stream: _Growing, others: Sequence[str]) -> str:
     )
 
 
-def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
+def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:
     """Read a bag from its front to its end.
 
     Raises:
@@ -305,7 +305,7 @@ def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
 
 
 class _Reading:
-    def __init__(self, mapping: BagMapping, num_bytes: int) -> None:
+    def __init__(self, mapping: SourceMapping, num_bytes: int) -> None:
         self._mapping, self._num_bytes = mapping, num_bytes
         self._decoder = BagDecoder(num_bytes)
         budgets = self._decoder.budgets

@@ -35,7 +35,7 @@ from demorec.sources.frames_writer import FramesImport, Picture
 from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature
 from demorec.sources.hdf5_import import episode_places, import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
-from demorec.sources.mapping import DatasetPart, Hdf5Episodes
+from demorec.sources.mapping import Episodes, Source
 
 DEMOS = ("demo_0", "demo_1", "demo_10")
 Vectors = dict[str, NDArray[np.generic]]
@@ -601,7 +601,7 @@ def test_episodes_are_in_the_order_of_their_numbers_however_long_these_are(tmp_p
         for name in names:
             file[f"data/{name}/actions"] = np.zeros((2, 1))
     with ForeignFile(tmp_path / "many.hdf5") as opened:
-        places = episode_places(opened, Hdf5Episodes(group="data"))
+        places = episode_places(opened, Episodes(group="data"))
     assert [place.removeprefix("data/") for place in places] == ["demo_2", "demo_9", "demo_010", names[2]]
 
 
@@ -623,10 +623,10 @@ def test_whole_numbers_are_exact(edge: int, tmp_path: Path) -> None:
         file["other"] = np.array([[edge + (1 if edge > 0 else -1)]])
         file["unsigned"] = np.array([[2**64 - 1]], np.uint64)
     with ForeignFile(tmp_path / "a.hdf5") as opened:
-        held = StoredFeature("a", [DatasetPart(dataset="held")], [array("held")], shift=0)
+        held = StoredFeature("a", [Source(dataset="held")], [array("held")], shift=0)
         assert [vector.tolist() for vector in held.vectors(1)] == [[edge]]
         for name in ("other", "unsigned"):
-            feature = StoredFeature("a", [DatasetPart(dataset=name)], [array(name)], shift=0)
+            feature = StoredFeature("a", [Source(dataset=name)], [array(name)], shift=0)
             with pytest.raises(Hdf5FitError, match="whole numbers that float64 cannot hold"):
                 list(feature.vectors(1))
 

@@ -20,7 +20,8 @@ from demorec.sources.fields import (
     layout_of,
     parse_path,
 )
-from demorec.sources.mapping import Source, read_mapping
+from demorec.sources.mapping import Source
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.streams import read_streams
 
 WRONG = [
