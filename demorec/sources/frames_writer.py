@@ -35,6 +35,12 @@ class FramesImport:
     cameras: Mapping[str, str]
     left_out: Mapping[str, str]
 
+    def left_out_lines(self) -> Iterator[str]:
+        """What the run does not have, for people."""
+        yield from (f"{name} is left out: {reason}." for name, reason in self.left_out.items() if reason)
+        if unnamed := [name for name, reason in self.left_out.items() if not reason]:
+            yield f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}."
+
 
 def write_frames(
     folder: ExternalFolder,

@@ -19,7 +19,6 @@ from demorec.runs.find import PathKind, find
 from demorec.sources.bag import bags_in
 from demorec.sources.bag_files import BagError
 from demorec.sources.dataset_import import import_lerobot
-from demorec.sources.frames_writer import FramesImport
 from demorec.sources.hdf5_import import import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 from demorec.sources.import_file import dropped_lines
@@ -84,7 +83,8 @@ def opened(
             run = Path(folder) / str(number) / path.resolve().name
             run.parent.mkdir()
             if kind == "dataset":
-                tell_left_out(import_lerobot(path, run), tell)
+                for line in import_lerobot(path, run).left_out_lines():
+                    tell(line)
             else:
                 chosen = mapping or _suggested(path, kind, Path(folder) / f"{number}.toml", tell)
                 _import(path, kind, chosen, run, tell)
@@ -147,7 +147,8 @@ def _taken(mapping: SourceMapping) -> str:
 
 def _import(path: Path, kind: PathKind, mapping: Path, run: Path, tell: Callable[[str], None]) -> None:
     if kind == "hdf5":
-        tell_left_out(import_hdf5([path], mapping, run), tell)
+        for line in import_hdf5([path], mapping, run).left_out_lines():
+            tell(line)
         return
     result = import_bags([path], mapping, run)
     for report in result.reports:
@@ -155,12 +156,3 @@ def _import(path: Path, kind: PathKind, mapping: Path, run: Path, tell: Callable
             tell(f"{report.name}: {line}")
     if not any(row.episode_index is not None for report in result.reports for row in report.episodes):
         raise BagError(f"The mapping makes no episode of this, so there is nothing to read: {path}")
-
-
-def tell_left_out(result: FramesImport, tell: Callable[[str], None]) -> None:
-    """Say what of HDF5 files, or of a dataset, recordings do not have."""
-    for name, reason in result.left_out.items():
-        if reason:
-            tell(f"{name} is left out: {reason}.")
-    if unnamed := [name for name, reason in result.left_out.items() if not reason]:
-        tell(f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}.")
