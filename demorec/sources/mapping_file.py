@@ -20,6 +20,7 @@ from demorec.sources.mapping import KIND, SourceKind, SourceMapping
 _MAX_FILE_BYTES = 1 << 20
 _MAX_TABLES, _MAX_VALUES = 1000, 50_000
 _MAX_TEXT = 10_000
+_KINDS: dict[SourceKind, str] = {"bag": "bags", "hdf5": "HDF5 files"}
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{16}}")
 """What no mapping has: each part of a key makes a table, and takes as long as all before it."""
@@ -42,6 +43,9 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
         else list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_TOLD))
     )
     if problems:
+        other: SourceKind = "hdf5" if kind == "bag" else "bag"
+        if not _excess(data) and not any(_unknown_keys(data, SourceMapping, "", other)):
+            raise ConfigError(f"This is a mapping of {_KINDS[other]}, not of {_KINDS[kind]}: {path}")
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     try:
         if kind == "hdf5" and isinstance(data.get("episodes", {}), dict):

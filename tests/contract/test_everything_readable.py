@@ -6,7 +6,11 @@ import errno
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
+import time
 from collections import namedtuple
 from pathlib import Path
 from typing import Any
@@ -151,6 +155,7 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     ("kind", "words", "sentence"),
     [
         ("lerobot v3.0", ["--mapping", "x.toml"], "Only bags and HDF5 files are read by a mapping"),
+        ("robomimic", ["--mapping", "BAG.toml"], "This is a mapping of bags, not of HDF5 files"),
         ("mcap", ["--mapping", "x.toml"], "The mapping cannot be read (No such file or directory): x.toml"),
     ],
 )
@@ -162,6 +167,7 @@ def test_a_mapping_that_does_not_belong_there(
     scratch: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    words = [str(places["mcap with --mapping"][-1]) if word == "BAG.toml" else word for word in words]
     assert exit_code("info", *places[kind], *words) == 2
     assert sentence in capsys.readouterr().err
     assert not list(scratch.iterdir())
@@ -194,6 +200,23 @@ def test_nothing_stays_where_reading_is_cut_off(
     monkeypatch.setattr(opening, "import_bags", cut_off)
     assert exit_code("check", *places["mcap"]) == (130 if isinstance(error, KeyboardInterrupt) else 1)
     assert not [path for path in scratch.iterdir() if path.is_dir()]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_nothing_behind(number: int, tmp_path: Path) -> None:
+    bag = bags.write_mcap(bags.in_order(bags.so101(12.0)), tmp_path / "bag.mcap")
+    (tmp_path / "scratch").mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "demorec", "check", str(bag)],
+        env={**os.environ, "TMPDIR": str(tmp_path / "scratch")},
+        stderr=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+    )
+    while process.poll() is None and not list((tmp_path / "scratch").glob("demorec-reading-*/0/*/episodes")):
+        time.sleep(0.01)
+    process.send_signal(number)
+    assert process.wait(60) == (130 if number == signal.SIGINT else 128 + number)
+    assert not list((tmp_path / "scratch").iterdir())
 
 
 def test_a_disk_that_is_too_small_is_said_before_anything_is_read(
