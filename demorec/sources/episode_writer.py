@@ -37,17 +37,17 @@ from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines
 from demorec.sources.streams import BagStreams
 
 _MAX_WAITING = 1 << 29
-"""Bytes of pictures that wait for earlier ones, which come later in the bag."""
+"""Bytes of images that wait for earlier ones, which come later in the bag."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PicturePlan:
-    """The pictures that an episode takes of a camera.
+    """The images that an episode takes of a camera.
 
     Attributes:
         topic: Of them.
         head: Of the first.
-        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are coded
+        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are encoded
             once.
         numbers: (P,) which of the topic's messages are taken, in the order of their times.
         stamps_ns: (P,) their times.
@@ -63,7 +63,7 @@ class PicturePlan:
 
     @property
     def num_bytes(self) -> int:
-        """Of one in memory: of its pixels, or about those of what stays coded."""
+        """Of one in memory: of its pixels, or about those of what stays encoded."""
         pixels = self.head.width * self.head.height
         return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
 
@@ -71,12 +71,12 @@ class PicturePlan:
     def told(self) -> str:
         """What becomes of them, for people."""
         shown = len(np.unique(self.positions))
-        what = f"{len(self.numbers)} pictures {self.head.width}x{self.head.height}, "
+        what = f"{len(self.numbers)} images {self.head.width}x{self.head.height}, "
         kind = self.head.encoding if self.head.format == "raw" else self.head.format
-        what += f"{self.kept} kept as it is" if self.kept else f"{kind}, coded once"
+        what += f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
         repeated = len(self.positions) - shown
         rows = "row shows" if repeated == 1 else "rows show"
-        what += f", {repeated} {rows} the picture of the row before" if repeated else ""
+        what += f", {repeated} {rows} the image of the row before" if repeated else ""
         return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
 
 
@@ -103,7 +103,7 @@ def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:
 
 
 def _kept(head: PictureHead) -> Kept:
-    """What stays as it is of pictures like this one."""
+    """What stays as it is of images like this one."""
     if head.encoding in DEPTH_UNITS:
         return cast(Kept, head.encoding)
     return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
@@ -116,7 +116,7 @@ class PlannedEpisode:
     Attributes:
         info: What is known of it.
         rows: Its rows.
-        plans: Camera -> its pictures.
+        plans: Camera -> its images.
         subtasks: Row -> what is begun there, in words.
     """
 
@@ -149,7 +149,7 @@ class ImportedEpisodeWriter:
     Args:
         path: Of the recording.
         episode: The episode.
-        video: How pixels are coded.
+        video: How pixels are encoded.
     """
 
     def __init__(self, path: Path, episode: PlannedEpisode, *, video: VideoConfig) -> None:
@@ -178,7 +178,7 @@ class ImportedEpisodeWriter:
         """Take a message of a camera's topic, if the episode wants it.
 
         Raises:
-            FieldError: Its picture cannot be decoded.
+            FieldError: Its image cannot be decoded.
             RecordingError: It cannot be written.
         """
         for name, waiting in self._waiting.items():
@@ -199,9 +199,7 @@ class ImportedEpisodeWriter:
             self._writer.picture(name, int(waiting.plan.stamps_ns[waiting.num_written]), picture)
             waiting.num_written += 1
         if waiting.num_bytes > _MAX_WAITING:
-            raise BagError(
-                f"The pictures of {waiting.plan.topic} are too far out of order to be read in bounded memory."
-            )
+            raise BagError(f"The images of {waiting.plan.topic} are too far out of order to be read in bounded memory.")
 
     def _write_rows(self) -> None:
         while self._next_row < len(self._rows.times_ns) and all(
@@ -219,11 +217,11 @@ class ImportedEpisodeWriter:
             self._next_row += 1
 
     def finish(self) -> None:
-        """Write what is left and give the recording its name; BagError when pictures have not come."""
+        """Write what is left and give the recording its name; BagError when images have not come."""
         self._write_rows()
         if self._next_row < len(self._rows.times_ns):
             missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
-            raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
+            raise BagError(f"The bag has changed while it was read: images of {missing[0]} are missing.")
         self._writer.finish(ExternalOutcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True
 

@@ -139,18 +139,18 @@ def frame_id_of(values: Values) -> str:
 
 
 def picture_bytes(values: Mapping[str, Any]) -> bytes:
-    """The bytes of a picture; JSON has them in base64."""
+    """The bytes of an image; JSON has them in base64."""
     data = values["data"]
     if isinstance(data, str):
         try:
             return base64.b64decode(data, validate=True)
         except ValueError as error:  # binascii's, and of texts that are not ASCII
-            raise FieldError("its picture is no base64") from error
+            raise FieldError("its image is no base64") from error
     if isinstance(data, np.ndarray):
         return data.tobytes()
     if isinstance(data, bytes):
         return data
-    raise FieldError("it holds no picture")
+    raise FieldError("it holds no image")
 
 
 def numbers_in(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

@@ -147,7 +147,7 @@ def _labels(array: StoredArray, count: int) -> list[str]:
 
 
 _LEAST_SIDE = 16
-"""Pixels, below which arrays of floats are no pictures unless the mapping says so."""
+"""Pixels, below which arrays of floats are no images unless the mapping says so."""
 _JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 
 
@@ -156,9 +156,9 @@ class StoredCamera:
 
     Attributes:
         width, height: Pixels.
-        kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are coded
-            once.
-        told: What becomes of the pictures, in words.
+        kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are
+            encoded once.
+        told: What becomes of the images, in words.
 
     Args:
         name: Of the camera.
@@ -168,7 +168,7 @@ class StoredCamera:
             has none.
 
     Raises:
-        Hdf5FitError: They are no pictures.
+        Hdf5FitError: They are no images.
         Hdf5Error: They cannot be read.
     """
 
@@ -184,7 +184,7 @@ class StoredCamera:
         if form is None:
             found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
             raise Hdf5FitError(
-                f"{array.place} is {found}, pictures are uint8 or floats of rows, height, width and 3 colours, or of "
+                f"{array.place} is {found}, images are uint8 or floats of rows, height, width and 3 colours, or of "
                 "rows, 3 colours, height and width, or rows of JPEG, distances uint16 or float32 of rows, height, width"
             )
         self._form = form
@@ -192,14 +192,16 @@ class StoredCamera:
             head = self._head(array.read(0, 1)[0], 0)[1]
             self.width, self.height = head.width, head.height
             self.kept = "jpeg" if camera.colors == "rgb" else ""
-            self.told = "jpeg kept as it is" if self.kept else "jpeg with red and blue exchanged, coded once"
+            self.told = (
+                "jpeg passed through as it is" if self.kept else "jpeg with red and blue exchanged, encoded once"
+            )
         elif form == "depth":
             self.height, self.width = shape[1:3]
             self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
-            self.told = f"distances ({self.kept}) kept as they are"
+            self.told = f"distances ({self.kept}) passed through as they are"
         else:
             self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
-            self.told = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, coded once"
+            self.told = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
         if not 1 <= self.width * self.height <= MAX_PIXELS:
             raise Hdf5FitError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
         if form == "pixels" and array.dtype.kind == "f":
@@ -275,7 +277,7 @@ def _float_scale(array: StoredArray) -> float:
 
 
 def is_camera(array: StoredArray) -> bool:
-    """Whether a dataset holds pictures, JPEG files or, by its name or its last axis, distances.
+    """Whether a dataset holds images, JPEG files or, by its name or its last axis, distances.
 
     Raises:
         Hdf5Error: Its first row cannot be read.
@@ -291,7 +293,7 @@ def is_camera(array: StoredArray) -> bool:
 
 
 def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
-    """What the rows of a dataset can be as pictures; None for numbers that are none."""
+    """What the rows of a dataset can be as images; None for numbers that are none."""
     shape, kind = array.shape, array.dtype
     if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
         return "jpeg"

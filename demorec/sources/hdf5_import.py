@@ -49,7 +49,7 @@ def import_hdf5(
         paths: Of the files, in the order of their episodes.
         mapping_path: Of the mapping.
         out: The run's folder; one that the same files and mapping began is continued.
-        video: How pictures are coded that come as pixels.
+        video: How images are encoded that come as pixels.
 
     Raises:
         ConfigError: The mapping is impossible, the files differ, or the folder holds something else.

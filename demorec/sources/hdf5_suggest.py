@@ -232,4 +232,4 @@ def _cameras(contents: _Contents) -> Iterator[str]:
         taken.append(camera)
         yield from ("", f"[cameras.{camera}]", f"dataset = {quoted(name)}")
         if len(contents.arrays[name].shape) <= 2:
-            yield '# colors = "bgr"  # where red and blue are exchanged in the pictures, as recorders with OpenCV do'
+            yield '# colors = "bgr"  # where red and blue are exchanged in the images, as recorders with OpenCV do'

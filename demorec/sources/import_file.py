@@ -66,7 +66,7 @@ class EpisodeReport:
         num_frames: Rows.
         success: None where the bag does not say.
         trimmed_s: What of its window no row covers, at the beginning and the end.
-        pictures: Camera -> what became of its pictures, in words.
+        pictures: Camera -> what became of its images, in words.
         reason: Why it was dropped; "" for others.
         discarded: The marker that left it out, so that nothing is missing; "" for others.
         follows: Of whose messages each has a row; "" for rows of a grid.

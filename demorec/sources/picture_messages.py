@@ -74,7 +74,7 @@ def check_raw(values: Values) -> tuple[int, int]:
     data = values["data"]
     count = len(data) if isinstance(data, bytes | np.ndarray) else len(picture_bytes(values))
     if step < used or count < step * (height - 1) + used:
-        raise FieldError(f"its picture has {count:,} bytes, too few for {width}x{height} {encoding}")
+        raise FieldError(f"its image has {count:,} bytes, too few for {width}x{height} {encoding}")
     return step, used
 
 
@@ -133,21 +133,21 @@ KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
 _MAX_UNITS = 256
-"""Of a coded picture before its first slice, that are looked at."""
+"""Of an encoded image before its first slice, that are looked at."""
 _SEQUENCE_BYTES = 24
 """Of an AV1 keyframe, within which its sequence header ends."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
 
 
 _FREE_SETS, _FRAMES_OF_A_SET = 40, 20
-"""Decoding a picture takes up to a tenth of a second: cameras have one set of parameters, or a few."""
+"""Decoding an image takes up to a tenth of a second: cameras have one set of parameters, or a few."""
 _HEAD_BYTES = 12
 """ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class PictureHead(NamedTuple):
-    """What is known of a picture before it is decoded.
+    """What is known of an image before it is decoded.
 
     Attributes:
         format: raw, jpeg, png, compressedDepth or a codec of `VIDEO_FORMATS`.
@@ -164,7 +164,7 @@ class PictureHead(NamedTuple):
 
 
 class PictureHeads:
-    """The heads of a camera's pictures in order: a bag has a million of them, which are of a few kinds."""
+    """The heads of a camera's images in order: a bag has a million of them, which are of a few kinds."""
 
     def __init__(self) -> None:
         self._kinds: list[PictureHead] = []
@@ -186,7 +186,7 @@ class PictureHeads:
         return self._kinds[self._of[index]]
 
     def kinds(self, among: NDArray[np.int64] | None = None) -> list[PictureHead]:
-        """The different ones, of all or of the pictures of these numbers."""
+        """The different ones, of all or of the images of these numbers."""
         if among is None:
             return list(self._kinds)
         return [self._kinds[place] for place in np.unique(np.array(self._of)[among]).tolist()]
@@ -198,16 +198,16 @@ class PictureHeads:
 
 
 def picture_head(values: Values) -> PictureHead:
-    """Of a message; FieldError when it holds no picture, a damaged one, or one in a format that is not read."""
+    """Of a message; FieldError when it holds no image, a damaged one, or one in a format that is not read."""
     if "data" not in values:
-        raise FieldError("it holds no picture")
+        raise FieldError("it holds no image")
     if "encoding" in values and "width" in values and "height" in values:
         size = whole(values, "width"), whole(values, "height")
         head = _checked(PictureHead("raw", str(values["encoding"]), *size, True))
         check_raw(values)
         return head
     if "format" not in values:
-        raise FieldError("it holds no picture")
+        raise FieldError("it holds no image")
     data = picture_bytes(values)
     name = str(values["format"]).lower()
     if "compresseddepth" in name:
@@ -226,7 +226,7 @@ def picture_head(values: Values) -> PictureHead:
 
 def _checked(head: PictureHead) -> PictureHead:
     if head.width < 1 or head.height < 1 or head.width * head.height > MAX_PIXELS:
-        raise FieldError(f"its picture has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
+        raise FieldError(f"its image has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
     if head.format == "raw" and head.encoding not in RAW_ENCODINGS:
         raise FieldError(f"its encoding {head.encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
     return head
@@ -242,10 +242,10 @@ def file_head(data: bytes) -> PictureHead:
                 _check_mode(image)
                 image.verify()
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its picture is damaged ({in_words(error)})") from error
+        raise FieldError(f"its image is damaged ({in_words(error)})") from error
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
-    if end not in data[-64:]:  # some cameras pad their pictures
-        raise FieldError("its picture is cut off")
+    if end not in data[-64:]:  # some cameras pad their images
+        raise FieldError("its image is cut off")
     return _checked(PictureHead(kind, "", width, height, True))
 
 
@@ -255,7 +255,7 @@ def _check_mode(image: Image.Image) -> None:
 
 
 def decode_picture(values: Values) -> NDArray[Any]:
-    """(H, W, 3) RGB of a picture that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
+    """(H, W, 3) RGB of an image that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
     if "encoding" in values:
         return raw_picture(values)
     if "compresseddepth" in str(values["format"]).lower():
@@ -270,7 +270,7 @@ def decode_file(data: bytes) -> NDArray[np.uint8]:
             _check_mode(image)
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its picture cannot be decoded ({in_words(error)})") from error
+        raise FieldError(f"its image cannot be decoded ({in_words(error)})") from error
 
 
 def _starts_by_itself(codec: str, data: bytes) -> bool:
@@ -296,14 +296,14 @@ def _nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
 
 
 class _VideoSizes:
-    """Sizes of keyframes: their parameter sets say them, in bits, and one picture of each kind is decoded for it."""
+    """Sizes of keyframes: their parameter sets say them, in bits, and one image of each kind is decoded for it."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[str, bytes], tuple[int, int]] = {}
         self._num_seen = self._num_decoded = 0
 
     def of(self, codec: str, data: bytes) -> tuple[int, int]:
-        """Width and height of a keyframe; FieldError when it gives no picture."""
+        """Width and height of a keyframe; FieldError when it gives no image."""
         self._num_seen += 1
         key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
         size = self._known.get(key)
@@ -313,7 +313,7 @@ class _VideoSizes:
             self._num_decoded += 1
             frame = next(_frames(codec, [data]), None)
             if frame is None:
-                raise FieldError(f"its {codec} keyframe gives no picture")
+                raise FieldError(f"its {codec} keyframe gives no image")
             if len(self._known) > 1000:
                 self._known.clear()
             size = self._known[key] = (frame.width, frame.height)
@@ -324,7 +324,7 @@ _sizes = _VideoSizes()
 
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:
-    """Those in front of a keyframe's picture, without what may differ from picture to picture beside them."""
+    """Those in front of a keyframe's image, without what may differ from image to image beside them."""
     units = list(_nal_units(codec, data))
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
     places = [place for _, place in units[1:]] + [units[-1][1]]
@@ -332,7 +332,7 @@ def _parameter_sets(codec: str, data: bytes) -> bytes:
 
 
 def decode_video(codec: str, packets: Iterable[bytes]) -> Iterator[NDArray[np.uint8]]:
-    """The pictures of packets, from a keyframe on; FieldError when they cannot be decoded."""
+    """The images of packets, from a keyframe on; FieldError when they cannot be decoded."""
     for frame in _frames(codec, packets):
         try:
             yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
@@ -353,7 +353,7 @@ def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
 
 
 def compressed_depth_head(form: str, data: bytes) -> tuple[str, int, int]:
-    """Encoding, width and height of a picture; FieldError when it is none, or does not hold whole millimetres."""
+    """Encoding, width and height of an image; FieldError when it is none, or does not hold whole millimetres."""
     encoding = form.split(";")[0].strip()
     if encoding != "16UC1":
         raise FieldError(
@@ -391,5 +391,5 @@ def _size(data: bytes) -> tuple[int, int]:
         raise FieldError("its distances are cut off")
     width, height = (int.from_bytes(size[at : at + 4], order) for at in (0, 4))  # type: ignore[arg-type]
     if not 1 <= width * height <= MAX_PIXELS:
-        raise FieldError(f"its picture has {width}x{height} pixels, at most {MAX_PIXELS} are read")
+        raise FieldError(f"its image has {width}x{height} pixels, at most {MAX_PIXELS} are read")
     return width, height

@@ -67,7 +67,7 @@ class CameraRows:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeRows:
-    """An episode before its pictures are read.
+    """An episode before its images are read.
 
     Attributes:
         window: Where it is in the bag.
@@ -297,7 +297,7 @@ class Timelines:
         formats = sorted({head.format for head in heads})
         if len(sizes) > 1:
             return f"{self._label(key)} changes its size ({', '.join(f'{w}x{h}' for w, h in sizes)})"
-        return f"{self._label(key)} has pictures of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
+        return f"{self._label(key)} has images of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
 
     def _feature(self, name: str, sources: tuple[Source, ...], chosen: Mapping[Key, Chosen]) -> FeatureRows:
         parts, ages = [], []

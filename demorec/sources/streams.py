@@ -1,6 +1,6 @@
 """A bag's streams: when each message of the mapping's topics was, and the numbers of those that hold any.
 
-Numbers stay in memory, some hundred bytes a message; of pictures only what is needed to choose among them does. They
+Numbers stay in memory, some hundred bytes a message; of images only what is needed to choose among them does. They
 are read from the bag once more when their rows are written.
 """
 
@@ -68,9 +68,9 @@ class Stream:
         numbers: (N,) int64, which of the topic's messages it is, from 0; empty for others than cameras.
         values: (N, D) in the unit of the feature; None for cameras.
         layout: Of the values; None for cameras.
-        heads: (N,) what is known of each picture; empty for others.
+        heads: (N,) what is known of each image; empty for others.
         checksums: (N,) CRC-32 of each message's bytes.
-        picture_sums: (N,) CRC-32 of each picture's bytes; empty for others.
+        picture_sums: (N,) CRC-32 of each image's bytes; empty for others.
         frame_ids: Coordinate frames that messages name, in the order of their first occurrence.
         num_malformed: Messages that cannot be read or lack something.
         first_problem: What is wrong with the first of them.

@@ -343,7 +343,7 @@ def test_a_video_that_begins_between_keyframes(tmp_path: Path) -> None:
     bag, mapping = _video(tmp_path, gop=10, first=3)
     (report,) = import_bags([bag], mapping, tmp_path / "run").reports
     (finding,) = [finding for finding in report.findings if finding.kind == "keyframe"]
-    assert "first 7 pictures" in finding.text
+    assert "first 7 images" in finding.text
     with _open(tmp_path / "run") as recording:
         assert next(iter(recording.packets("high"))).is_keyframe
         assert len(list(recording.images("high"))) == len(recording.columns().picture_stamps["high"])

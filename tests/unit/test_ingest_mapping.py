@@ -66,7 +66,7 @@ MISFITS = [
     ('field = "position"', 'field = "position"\njoints = ["shoulder_pam"]', r"Did you mean 'shoulder_pan'\?"),
     ('field = "position"', 'field = "position"\nelements = [9]', r"no element 9 among the 6"),
     ('field = "position"', 'field = "position"\nnames = ["a"]', r"names has 1 names for the 6 elements"),
-    ("/follower/cam_front/image_raw/compressed", "/follower/joint_states", r"camera front .* it holds no picture"),
+    ("/follower/cam_front/image_raw/compressed", "/follower/joint_states", r"camera front .* it holds no image"),
 ]
 
 
