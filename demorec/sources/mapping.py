@@ -254,7 +254,10 @@ class SourceMapping:
     @cached_property
     def digest(self) -> str:
         """16 hex digits of all that it says of its kind of source."""
-        return digest({key: value for key, value in _said(self, self.kind).items() if key != "kind"})
+        said = _said(self, self.kind)
+        del said[KIND]
+        said["clock"]["fps"] = self.clock.fps or None  # as it was when runs were begun that may be continued
+        return digest(said)
 
     @property
     def topics(self) -> frozenset[str]:

@@ -174,3 +174,23 @@ def test_units(unit: str, to: str, given: list[float], expected: list[float]) ->
 def test_without_a_conversion_no_bit_changes() -> None:
     values = np.array([[0.1, np.nan]], dtype=np.float32)
     assert converted(Source(topic="/j", field="x", unit="rad"), values) is values
+
+
+def test_digests_are_those_of_the_runs_that_may_be_continued(tmp_path: Path) -> None:
+    """As demorec gave them when bags and HDF5 files had a language each."""
+    bag = read_mapping(bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "bag.toml"))
+    assert bag.digest == "0f572a2612d74310"
+    text = """
+[robot]
+name = "arm"
+[task]
+text = "lift"
+[episodes]
+group = "data"
+[[features."observation.state"]]
+dataset = "obs/q"
+[[features.action]]
+dataset = "actions"
+"""
+    stored = read_mapping(bag_mappings.write_mapping(text, tmp_path / "hdf5.toml"), "hdf5")
+    assert stored.digest == "32cc4285c9e4acc2"
