@@ -124,7 +124,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     from demorec.sources.bag import open_bag
     from demorec.sources.episodes import windows
     from demorec.sources.fields import picture_bytes
-    from demorec.sources.mapping import read_mapping
+    from demorec.sources.mapping_file import read_mapping
     from demorec.sources.picture_messages import decode_picture, decode_video
     from demorec.sources.rows import Timelines
     from demorec.sources.streams import BagDecoder, read_streams

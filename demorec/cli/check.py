@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths, places_read, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.replacing import PICTURE, check_replaceable
 
@@ -43,12 +44,16 @@ class Check:
       demorec check recordings/cubes
       demorec check recordings/cubes --no-pictures --strict
       demorec check datasets/cubes --json
+      demorec check monday.mcap --mapping robot.toml
       demorec check recordings/cubes --replay 5
       demorec check recordings/cubes/episodes/episode_000007.mcap --deep
     """
 
     paths: Positional[tuple[Path, ...]]
-    """Recordings, runs, datasets, or folders of recordings."""
+    """Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
+    mapping: Path | None = None
+    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
+    that leaves nothing to decide)."""
     pictures: bool = True
     """Decode all pictures; without, a recording is checked at about 50 times real time."""
     only: tuple[str, ...] = ()
@@ -84,6 +89,10 @@ class Check:
                 raise ConfigError(f"--coverage-picture writes a .png file, found the name {picture.name!r}.")
             check_replaceable(picture, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
             refuse_inside([picture])
+        with reading(self.paths, self.mapping) as paths:
+            return replace(self, paths=paths)._check()
+
+    def _check(self) -> int:
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
         from demorec.core.processes import available_cores
 
@@ -109,8 +118,8 @@ class Check:
                 if not self.json:
                     say(told(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
-        if picture is not None:
-            self._draw(picture, subjects)
+        if self.coverage_picture is not None:
+            self._draw(self.coverage_picture, subjects)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]

@@ -13,6 +13,7 @@ from tyro.constructors import MISSING_NONPROP
 from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.options import CommonOptions, ExportReport
@@ -37,9 +38,12 @@ class Export:
     format: Annotated[Positional[str], arg(metavar="FORMAT")]
     """Of the dataset: lerobot or hdf5."""
     sources: Positional[tuple[Path, ...]]
-    """Runs, recordings, or folders of recordings."""
+    """Runs, recordings, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
     out: Path
     """Folder (LeRobot) or file (HDF5) to make."""
+    mapping: Path | None = None
+    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
+    that leaves nothing to decide)."""
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
     """How."""
 
@@ -61,8 +65,11 @@ class Export:
                 f"No recordings are given: name a run, e.g. demorec export {self.format} recordings/cubes."
             )
         refuse_inside([self.out])
-        with ProgressBar("exporting") as bar:
-            report = exporter.export(self.sources, self.out, self.options, bar.set)
+        with (
+            reading(self.sources, self.mapping, imports_datasets=True) as sources,
+            ProgressBar("exporting") as bar,
+        ):
+            report = exporter.export(sources, self.out, self.options, bar.set)
         say(*_told(report))
         return 0
 

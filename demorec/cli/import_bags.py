@@ -29,14 +29,14 @@ class Import:
 
     A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
     holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
-    episode, as the mapping says. Coded pictures stay as they are. The same command again goes on. A folder without
+    episode, as the mapping says. Encoded images pass through. The same command again goes on. A folder without
     metadata.yaml stands for the bags in it.
 
-    A LeRobot dataset (v3.0, whoever wrote it) needs no mapping: its features keep their names, its numbers every bit,
-    and its video packets stay as they are where each episode begins with a keyframe.
+    A LeRobot dataset (v3.0, v2.1 or v2.0, whoever wrote it) needs no mapping: its features keep their names, its
+    numbers every bit, and its video packets pass through where each episode begins with a keyframe.
 
     HDF5 files in robomimic's or ALOHA's layout take a mapping as well: which datasets become which features. Their
-    numbers keep every bit, JPEG files stay as they are.
+    numbers keep every bit, JPEG files pass through.
 
     Examples:
       demorec import --suggest monday.mcap > robot.toml
@@ -62,7 +62,7 @@ class Import:
     suggest: bool = False
     """Write a mapping for the first bag or HDF5 file to standard output instead of importing."""
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
-    """How pictures are coded that come as pixels."""
+    """How images are encoded that come as pixels."""
 
     def run(self) -> int:
         """Import, or suggest a mapping, and say what was found; 1 when bags were skipped."""
@@ -105,8 +105,8 @@ class Import:
         return (self._import_hdf5 if is_hdf5 else self._import_bags)(files, self.mapping, self.out)
 
     def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
+        from demorec.sources.import_file import report_lines
         from demorec.sources.import_run import import_bags
-        from demorec.sources.report import report_lines
 
         with ProgressBar("importing", unit="bag") as bar:
             result = import_bags(
@@ -150,23 +150,18 @@ class Import:
         from demorec.sources.dataset_import import import_lerobot
 
         self.video.validate()
-        result = import_lerobot(self.bags[1], self.out, video=self.video)
-        _say_made(result, self.out, [f"{name} is left out: {reason}." for name, reason in result.left_out.items()])
+        _say_made(import_lerobot(self.bags[1], self.out, video=self.video), self.out)
         return 0
 
     def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> int:
         from demorec.sources.hdf5_import import import_hdf5
 
-        result = import_hdf5(files, mapping, out, video=self.video)
-        left_out = [f"{name} is left out: {reason}." for name, reason in result.left_out.items() if reason]
-        if unnamed := [name for name, reason in result.left_out.items() if not reason]:
-            left_out.append(f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}.")
-        _say_made(result, out, left_out)
+        _say_made(import_hdf5(files, mapping, out, video=self.video), out)
         return 0
 
 
-def _say_made(result: FramesImport, out: Path, left_out: Sequence[str]) -> None:
-    say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *left_out)
+def _say_made(result: FramesImport, out: Path) -> None:
+    say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *result.left_out_lines())
     if there := result.num_episodes - result.num_new:
         tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
     say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths
+from demorec.cli.shared.reading import reading
 from demorec.cli.shared.table import aligned, size_in_words
 from demorec.core.errors import ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -30,7 +31,7 @@ _SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 @dataclass(frozen=True, kw_only=True)
 class Info:
-    """Say what recordings, runs and datasets hold.
+    """Say what recordings, runs, datasets, HDF5 files and bags hold.
 
     Examples:
       demorec info recordings/cubes
@@ -39,21 +40,27 @@ class Info:
     """
 
     paths: Positional[tuple[Path, ...]]
-    """Recordings, runs, datasets, or folders of recordings."""
+    """Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
+    mapping: Path | None = None
+    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
+    that leaves nothing to decide)."""
     json: bool = False
     """Print JSON: one object, or a list for several paths."""
 
     def run(self) -> int:
         """Read and print; 1 when something among several paths cannot be read."""
         need_paths(self.paths, "info")
-        found = [_describe(path) for path in self.paths]
+        with reading(self.paths, self.mapping) as paths:
+            self._show([_describe(path) for path in paths])
+        return 0
+
+    def _show(self, found: Sequence[tuple[dict[str, Any], list[str]]]) -> None:
         if self.json:
             plain = [item for item, _ in found]
             say_json(plain[0] if len(plain) == 1 else plain)
         else:
             for number, (_, lines) in enumerate(found):
                 say(*([""] if number else []), *lines)
-        return 0
 
 
 def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:

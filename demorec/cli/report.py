@@ -11,6 +11,7 @@ from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import places_read, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import REPORT, check_replaceable
 from demorec.runs.find import EPISODE_FOLDERS, expect
@@ -31,7 +32,10 @@ class Report:
     """
 
     path: Positional[Path]
-    """A run, a recording, a folder of recordings, an evaluation or a LeRobot dataset."""
+    """A run, a recording, an evaluation, a LeRobot dataset, an HDF5 file, a bag, or a folder of recordings or bags."""
+    mapping: Path | None = None
+    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
+    that leaves nothing to decide)."""
     out: Path
     """The page (.html)."""
     camera: str = ""
@@ -54,7 +58,7 @@ class Report:
         check_option("workers", self.workers, 1, 1024)
         if self.pictures and not self.checks:
             raise ConfigError("--pictures chooses checks, and --no-checks runs none: leave one of them out.")
-        expect(self.path, "recording", "dataset", *EPISODE_FOLDERS)
+        expect(self.path, "recording", "dataset", "hdf5", "rosbag", *EPISODE_FOLDERS)
         if not self.out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
         check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
@@ -64,8 +68,11 @@ class Report:
         from demorec.report.page import write_page
 
         checks = CheckOptions(pictures=self.pictures, allowed=allowed_modules(self.allow)) if self.checks else None
-        with ProgressBar("reading", unit="item") as bar:
-            report = gather(self.path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
+        with (
+            reading([self.path], self.mapping) as (path,),
+            ProgressBar("reading", unit="item") as bar,
+        ):
+            report = gather(path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
         size = write_page(report, self.out)
         say(f"{counted(len(report.episodes), 'episode')}, {size / 1e6:.1f} MB: {self.out}")
         return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from tyro.conf import Positional
 from demorec.cli.shared.allow import Allow, allowed_modules
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import places_read, refuse_inside, tell_unfinished
+from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import PICTURE, RERUN_FILE, check_replaceable
 from demorec.robots.assets import allow_models
@@ -42,7 +43,10 @@ class View:
     """
 
     paths: Positional[tuple[Path, ...]]
-    """Recordings, runs, datasets, folders of recordings, or .rrd files."""
+    """Recordings, runs, LeRobot datasets, HDF5 files, bags, folders of recordings or of bags, or .rrd files."""
+    mapping: Path | None = None
+    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
+    that leaves nothing to decide)."""
     compare: bool = False
     """Lay two episodes over each other: the same streams in the same views, and the distance between them."""
     episodes: str = ""
@@ -72,6 +76,10 @@ class View:
         allow_models(allowed_modules(self.allow))
         if any(path.suffix == ".rrd" for path in self.paths):
             return self._show_rrd()
+        with reading(self.paths, self.mapping) as paths:
+            return replace(self, paths=paths)._view()
+
+    def _view(self) -> int:
         from demorec.view.glyphs import drawable_source
         from demorec.view.save import numbered, save, save_comparison, save_each
         from demorec.view.sources import find_episodes, select

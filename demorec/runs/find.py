@@ -6,13 +6,14 @@ words. Nothing is opened that could block: a FIFO, a socket or a device is told 
 
 from __future__ import annotations
 
+import os
 import shlex
 import stat
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 from demorec.core.errors import ConfigError, resource_error
 from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
@@ -45,13 +46,19 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
     "unfinished": ("an unfinished recording (.part)", "; demorec recover keeps what is whole in it"),
     "rrd": ("a Rerun file (.rrd)", "; demorec view shows it by a name that ends in .rrd"),
     "hdf5": ("an HDF5 file", "; name the run that it was made from, or make one of it (demorec import hdf5)"),
-    "rosbag": ("a rosbag", ""),
+    "rosbag": ("a bag of another program", "; demorec import makes a run of it"),
     "run": ("a run", "; name one of its recordings"),
     "evaluation": ("an evaluation", "; name one of its recordings"),
     "dataset": ("a LeRobot dataset", "; name the run that it was made from"),
     "recordings": ("a folder of recordings", "; name one of them"),
 }
 """What each kind is called, and what to do where it was not expected."""
+ROSBAG2 = "metadata.yaml"
+"""In a folder that is a bag of rosbag2."""
+_BAG_SUFFIXES = (".db3", ".mcap.zstd", ".db3.zstd")
+OUR_METADATA = b"demorec."
+"""How the names of our recordings' metadata begin."""
+_HEAD_BYTES = 1 << 16
 _MAGICS: tuple[tuple[bytes, PathKind], ...] = (
     (MCAP_MAGIC, "recording"),
     *((magic, "rrd") for magic in RERUN_MAGICS),
@@ -64,7 +71,7 @@ _MARKS: tuple[tuple[str, PathKind], ...] = (
     (RUN_NAME, "run"),
     (INFO_PATH, "dataset"),
     (EVALUATION_NAME, "evaluation"),
-    ("metadata.yaml", "rosbag"),
+    (ROSBAG2, "rosbag"),
 )
 """The file by whose presence a folder is known."""
 
@@ -159,13 +166,29 @@ def expect_recordings(found: Found, files: Sequence[Path]) -> None:
 def _file(path: Path) -> Found:
     with open_regular(path) as file:
         head = file.read(max(len(magic) for magic, _ in _MAGICS))
-    kind = _SUFFIXES.get(path.suffix)
-    if kind != "unfinished":
-        kind = next((kind for magic, kind in _MAGICS if head.startswith(magic)), kind)
+        kind: PathKind | None = "rosbag" if path.name.endswith(_BAG_SUFFIXES) else _SUFFIXES.get(path.suffix)
+        if kind != "unfinished":
+            kind = next((kind for magic, kind in _MAGICS if head.startswith(magic)), kind)
+        if kind == "recording" and _is_foreign(file):
+            kind = "rosbag"
     if kind is None:
         reason = "The file is no recording (.mcap)" if head else "The file is empty"
         return Found(path=path, kind="nothing", reason=reason)
     return Found(path=path, kind=kind, recordings=(path,) if kind == "recording" else ())
+
+
+def _is_foreign(file: BinaryIO) -> bool:
+    """Whether an MCAP file begins as others write them: with records, but without the metadata that all of ours have.
+
+    Ours have them in front and name them again at the end, so that one damaged place makes no bag of a recording.
+    """
+    file.seek(0)
+    head = file.read(_HEAD_BYTES)
+    file.seek(-min(_HEAD_BYTES, file.seek(0, os.SEEK_END)), os.SEEK_END)
+    place = len(MCAP_MAGIC)
+    if not head.startswith(MCAP_MAGIC) or head[place : place + 1] != b"\x01" or OUR_METADATA in head + file.read():
+        return False
+    return len(head) > place + 9 + int.from_bytes(head[place + 1 : place + 9], "little")
 
 
 def _folder(path: Path) -> Found:
@@ -174,6 +197,8 @@ def _folder(path: Path) -> Found:
     if kind in ("dataset", "rosbag"):
         return Found(path=path, kind=kind)
     here = _recordings_in(path) if kind is None else ()
+    if kind is None and _holds_bags(path, here):
+        return Found(path=path, kind="rosbag")
     recordings, failed = (*here, *_recordings_in(path / EPISODES)), _recordings_in(path / FAILED)
     made = {file.stem for file in (*recordings, *failed)}
     places = [path, path / EPISODES]
@@ -188,6 +213,15 @@ def _folder(path: Path) -> Found:
     if kind is None and not recordings and not failed:
         return replace(found, kind="nothing", reason=_nothing_in(found, entries))
     return found
+
+
+def _holds_bags(path: Path, recordings: Sequence[Path]) -> bool:
+    """Whether a folder holds bags: as files, or as folders of rosbag2."""
+    if recordings:
+        with suppress(OSError, ValueError), open_regular(recordings[0]) as file:
+            return _is_foreign(file)
+        return False
+    return any(entry.name.endswith(_BAG_SUFFIXES) or _is_there(entry / ROSBAG2) for entry in _entries(path))
 
 
 def _is_there(path: Path) -> bool:

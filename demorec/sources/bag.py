@@ -22,9 +22,7 @@ from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.runs.run_file import sha256_of
-from demorec.sources.channel import MAX_TIME_NS, BagError, BagMessage
-from demorec.sources.mcap_bag import read_mcap
-from demorec.sources.sqlite_bag import SQLITE_MAGIC, read_sqlite
+from demorec.sources.bag_files import MAX_TIME_NS, SQLITE_MAGIC, BagError, BagMessage, read_mcap, read_sqlite
 from demorec.sources.words import in_natural_order
 
 METADATA = "metadata.yaml"

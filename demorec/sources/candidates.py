@@ -22,8 +22,7 @@ from demorec.sources.fields import (
     numbers_in,
     parse_path,
 )
-from demorec.sources.mapping import Source
-from demorec.sources.mapping_file import MAX_ELEMENTS
+from demorec.sources.mapping import MAX_ELEMENTS, Source
 from demorec.sources.ros_types import Values
 from demorec.sources.words import first_numbers
 

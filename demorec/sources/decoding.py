@@ -11,7 +11,7 @@ import numpy as np
 from demorec.core.errors import in_words
 from demorec.core.plain import MAX_DEPTH, parse_json
 from demorec.mcap.limits import Budget
-from demorec.sources.channel import BagChannel
+from demorec.sources.bag_files import BagChannel
 from demorec.sources.ros_types import Budgets, Values, ros_decoder
 
 _BYTES_PER_STEP = 8

@@ -1,12 +1,11 @@
-"""An episode on its way into its recording, while its bag is read a second time for the pictures.
+"""An episode on its way into its recording, while its bag is read a second time for the images.
 
-Pictures that are coded already stay as they are, byte for byte; pixels are coded once. A frame is written as soon as
-its pictures are, so that of a bag of any size only what is under way is in memory.
-"""
+Images that are encoded already stay as they are, byte for byte; pixels are encoded once. A frame is written as soon as
+its images are, so that of a bag of any size only what is under way is in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, cast
@@ -14,28 +13,41 @@ from typing import Any, Self, cast
 import numpy as np
 
 from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.files import read_text_limited
 from demorec.episode.episode import Outcome
-from demorec.episode.external import DEPTH_UNITS, EpisodeInfo, Kept, Sample, SampledFrame
+from demorec.episode.external import (
+    DEPTH_UNITS,
+    Camera,
+    EpisodeInfo,
+    Feature,
+    Kept,
+    Sample,
+    SampledFrame,
+)
 from demorec.mcap import EpisodeWriter
-from demorec.sources.channel import BagError
+from demorec.sources.bag import Bag
+from demorec.sources.bag_files import BagError
 from demorec.sources.clock import Int, Timeline
 from demorec.sources.fields import picture_bytes
+from demorec.sources.mapping import STATE, recorded_unit
 from demorec.sources.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
 from demorec.sources.ros_types import Values
-from demorec.sources.rows import CameraRows, EpisodeRows
+from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines
+from demorec.sources.streams import BagStreams
 
 _MAX_WAITING = 1 << 29
-"""Bytes of pictures that wait for earlier ones, which come later in the bag."""
+"""Bytes of images that wait for earlier ones, which come later in the bag."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PicturePlan:
-    """The pictures that an episode takes of a camera.
+    """The images that an episode takes of a camera.
 
     Attributes:
         topic: Of them.
         head: Of the first.
-        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are coded
+        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are encoded
             once.
         numbers: (P,) which of the topic's messages are taken, in the order of their times.
         stamps_ns: (P,) their times.
@@ -51,7 +63,7 @@ class PicturePlan:
 
     @property
     def num_bytes(self) -> int:
-        """Of one in memory: of its pixels, or about those of what stays coded."""
+        """Of one in memory: of its pixels, or about those of what stays encoded."""
         pixels = self.head.width * self.head.height
         return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
 
@@ -59,12 +71,12 @@ class PicturePlan:
     def told(self) -> str:
         """What becomes of them, for people."""
         shown = len(np.unique(self.positions))
-        what = f"{len(self.numbers)} pictures {self.head.width}x{self.head.height}, "
+        what = f"{len(self.numbers)} images {self.head.width}x{self.head.height}, "
         kind = self.head.encoding if self.head.format == "raw" else self.head.format
-        what += f"{self.kept} kept as it is" if self.kept else f"{kind}, coded once"
+        what += f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
         repeated = len(self.positions) - shown
         rows = "row shows" if repeated == 1 else "rows show"
-        what += f", {repeated} {rows} the picture of the row before" if repeated else ""
+        what += f", {repeated} {rows} the image of the row before" if repeated else ""
         return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
 
 
@@ -91,7 +103,7 @@ def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:
 
 
 def _kept(head: PictureHead) -> Kept:
-    """What stays as it is of pictures like this one."""
+    """What stays as it is of images like this one."""
     if head.encoding in DEPTH_UNITS:
         return cast(Kept, head.encoding)
     return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
@@ -104,7 +116,7 @@ class PlannedEpisode:
     Attributes:
         info: What is known of it.
         rows: Its rows.
-        plans: Camera -> its pictures.
+        plans: Camera -> its images.
         subtasks: Row -> what is begun there, in words.
     """
 
@@ -137,7 +149,7 @@ class ImportedEpisodeWriter:
     Args:
         path: Of the recording.
         episode: The episode.
-        video: How pixels are coded.
+        video: How pixels are encoded.
     """
 
     def __init__(self, path: Path, episode: PlannedEpisode, *, video: VideoConfig) -> None:
@@ -166,7 +178,7 @@ class ImportedEpisodeWriter:
         """Take a message of a camera's topic, if the episode wants it.
 
         Raises:
-            FieldError: Its picture cannot be decoded.
+            FieldError: Its image cannot be decoded.
             RecordingError: It cannot be written.
         """
         for name, waiting in self._waiting.items():
@@ -187,9 +199,7 @@ class ImportedEpisodeWriter:
             self._writer.picture(name, int(waiting.plan.stamps_ns[waiting.num_written]), picture)
             waiting.num_written += 1
         if waiting.num_bytes > _MAX_WAITING:
-            raise BagError(
-                f"The pictures of {waiting.plan.topic} are too far out of order to be read in bounded memory."
-            )
+            raise BagError(f"The images of {waiting.plan.topic} are too far out of order to be read in bounded memory.")
 
     def _write_rows(self) -> None:
         while self._next_row < len(self._rows.times_ns) and all(
@@ -207,10 +217,79 @@ class ImportedEpisodeWriter:
             self._next_row += 1
 
     def finish(self) -> None:
-        """Write what is left and give the recording its name; BagError when pictures have not come."""
+        """Write what is left and give the recording its name; BagError when images have not come."""
         self._write_rows()
         if self._next_row < len(self._rows.times_ns):
             missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
-            raise BagError(f"The bag has changed while it was read: pictures of {missing[0]} are missing.")
+            raise BagError(f"The bag has changed while it was read: images of {missing[0]} are missing.")
         self._writer.finish(Outcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True
+
+
+_MAX_URDF_BYTES = 4 << 20
+
+
+def urdf_text(name: str, mapping_path: Path) -> str:
+    """The URDF that a mapping names a file for; "" when it names none. ConfigError when it cannot be read."""
+    if not name:
+        return ""
+    path = mapping_path.parent / name
+    try:
+        return read_text_limited(path, _MAX_URDF_BYTES)
+    except (OSError, ValueError) as error:  # no text, or NUL in the name
+        raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
+
+
+def urdf_in_bag(bag: Bag, streams: BagStreams, topic: str) -> str:
+    """The URDF that a topic of the bag holds; BagError when it holds none."""
+    text = streams.texts[topic][0].value if streams.texts[topic] else ""
+    if not isinstance(text, str) or not text.strip():
+        raise BagError(f"{topic} holds no robot description: {bag.path}")
+    return text
+
+
+def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints: Container[str]) -> Feature:
+    """A feature as recordings know it, given the joints of the robot's model."""
+    units = tuple(map(recorded_unit, feature.units))
+    sources = lines.mapping.features[name]
+    told = []
+    for index, source in enumerate(sources):
+        if source.next:
+            told.append(f"{source.next} of the next frame")
+            continue
+        clock = "header" if lines.lines[name, index].is_header else "log"
+        told.append(f"{source.topic} {source.field}, {lines.rule((name, index))[0]} by {clock} time")
+    moves = [element if element in joints and name == STATE else "" for element in feature.names]
+    return Feature(
+        name=name,
+        dtype="float32" if feature.values.dtype == np.float32 else "float64",
+        names=feature.names,
+        units=units if any(units) else (),
+        joints=tuple(moves) if any(moves) else (),
+        source="; ".join(told),
+    )
+
+
+def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Camera:
+    """A camera as recordings know it."""
+    clock = "header" if lines.lines[name].is_header else "log"
+    info = lines.streams.infos.get(name, {})
+    matrix, distortion = _first(info, "k", "K"), _first(info, "d", "D")
+    size = (plan.head.width, plan.head.height)
+    fits = (info.get("width") or size[0], info.get("height") or size[1]) == size
+    known = fits and len(matrix) == 9 and matrix[0] > 0 and bool(np.isfinite(matrix).all())
+    return Camera(
+        name=name,
+        width=plan.head.width,
+        height=plan.head.height,
+        kept=plan.kept,
+        intrinsics=tuple(matrix) if known else None,
+        distortion=tuple(distortion) if known and len(distortion) == 5 and np.isfinite(distortion).all() else (),
+        source=f"{plan.topic}, {lines.rule(name)[0]} by {clock} time",
+    )
+
+
+def _first(values: Mapping[str, Any], *keys: str) -> list[float]:
+    """The numbers of the first of these fields that is there."""
+    found = next((values[key] for key in keys if key in values), None)
+    return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) and found.size <= 64 else []

@@ -8,10 +8,10 @@ import numpy as np
 
 from demorec.core.plain import listed
 from demorec.sources.bag import Bag
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.clock import NS, Int, Timeline
 from demorec.sources.fields import FieldError
-from demorec.sources.mapping import BagMapping, Episodes
+from demorec.sources.mapping import Episodes, SourceMapping
 from demorec.sources.streams import BagStreams, Text
 from demorec.sources.words import task_in_name
 
@@ -35,7 +35,7 @@ class Window:
     discarded: str = ""
 
 
-def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: BagMapping) -> list[Window]:
+def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: SourceMapping) -> list[Window]:
     """The episodes of a bag, in order; BagError when there are none, or where a marker has no meaning."""
     begin = min(int(line.times_ns[0]) for line in timelines if len(line.times_ns))
     end = max(int(line.times_ns[-1]) for line in timelines if len(line.times_ns))
@@ -96,7 +96,7 @@ def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:
     return [Window(begin_ns=int(times[a]), end_ns=int(times[b])) for a, b in zip(begins, ends, strict=True)]
 
 
-def _unknown_words(markers: list[Text], mapping: BagMapping) -> str:
+def _unknown_words(markers: list[Text], mapping: SourceMapping) -> str:
     """What markers say that the mapping gives no meaning, each once; "" for nothing. Subtasks may share their topic."""
     words = mapping.episodes
     known = {True, False, "", words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
@@ -109,7 +109,7 @@ def _unknown_words(markers: list[Text], mapping: BagMapping) -> str:
     return listed(found, _MOST_TOLD, ", ")
 
 
-def _between_markers(markers: list[Text], mapping: BagMapping) -> list[Window]:
+def _between_markers(markers: list[Text], mapping: SourceMapping) -> list[Window]:
     words = mapping.episodes
     found: list[Window] = []
     begin: int | None = None
@@ -133,7 +133,7 @@ def _between_markers(markers: list[Text], mapping: BagMapping) -> list[Window]:
     return found
 
 
-def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: BagMapping) -> str:
+def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: SourceMapping) -> str:
     """What the robot was asked to do in an episode; BagError where the bag does not say."""
     task = mapping.task
     if task.text:
@@ -151,7 +151,9 @@ def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: BagMapping
     return value.strip()
 
 
-def subtask_rows(bag: Bag, streams: BagStreams, window: Window, times_ns: Int, mapping: BagMapping) -> dict[int, str]:
+def subtask_rows(
+    bag: Bag, streams: BagStreams, window: Window, times_ns: Int, mapping: SourceMapping
+) -> dict[int, str]:
     """Row -> what is begun there: the texts of the mapping's topic that were said within the episode.
 
     Of several before a row the last one holds from it on; a text that is said again, and an empty one, begins nothing.

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.registry import nearest_match
-from demorec.sources.channel import MAX_TIME_NS
-from demorec.sources.mapping import Source
-from demorec.sources.mapping_file import MAX_ELEMENTS, Part, conversion_factor
+from demorec.sources.bag_files import MAX_TIME_NS
+from demorec.sources.mapping import MAX_ELEMENTS, Source, conversion_factor
 from demorec.sources.ros_types import Values
 
 _STEP = re.compile(r"(?P<name>[^.\[\]]+)|\[(?P<key>[^=\]]+)=(?P<value>[^\]]*)\]|\[(?P<index>\d+)\]")
@@ -140,18 +139,18 @@ def frame_id_of(values: Values) -> str:
 
 
 def picture_bytes(values: Mapping[str, Any]) -> bytes:
-    """The bytes of a picture; JSON has them in base64."""
+    """The bytes of an image; JSON has them in base64."""
     data = values["data"]
     if isinstance(data, str):
         try:
             return base64.b64decode(data, validate=True)
         except ValueError as error:  # binascii's, and of texts that are not ASCII
-            raise FieldError("its picture is no base64") from error
+            raise FieldError("its image is no base64") from error
     if isinstance(data, np.ndarray):
         return data.tobytes()
     if isinstance(data, bytes):
         return data
-    raise FieldError("it holds no picture")
+    raise FieldError("it holds no image")
 
 
 def numbers_in(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -337,7 +336,7 @@ def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
     return np.concatenate([array.astype(np.float32 if single else np.float64) for array in arrays])
 
 
-def converted(part: Part, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+def converted(part: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
     """(N, D) in the unit of the feature; the very same array where that is the source's."""
     factor = conversion_factor(part.unit, part.to)
     if factor is None:

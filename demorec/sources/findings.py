@@ -1,4 +1,4 @@
-"""What is odd in a bag's streams, found from times, numbers and picture heads alone, with names for each kind.
+"""What is odd in a bag's streams, found from times, numbers and image heads alone, with names for each kind.
 
 The limits are such that sensors with ordinary jitter and latency, and robots that stand still for a while, give none.
 Nothing is repaired: a finding tells what the rows hold.
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from demorec.episode.external import DEPTH_UNITS
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.fields import frame_id_of
-from demorec.sources.mapping import BagMapping
-from demorec.sources.mapping_file import ACTION, STATE
+from demorec.sources.mapping import ACTION, STATE, SourceMapping
 from demorec.sources.rows import Timelines
 from demorec.sources.streams import NO_STAMP, BagStreams, Stream
 
@@ -31,7 +30,7 @@ _STEP_S = 0.05
 _STILL_S = 0.5
 """For which a sensor with noise never gives the same number."""
 _FROZEN = 5
-"""Pictures in a row with the same bytes: no camera without noise."""
+"""Images in a row with the same bytes: no camera without noise."""
 _SPIKE = 25.0
 """Times the usual step of an element."""
 _EPOCH_S = 1e8
@@ -304,19 +303,19 @@ def _picture_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     formats = {(head.format, head.encoding) for head in stream.heads.kinds()}
     if len(formats) > 1:
         told = ", ".join(sorted(f"{name} {encoding}".strip() for name, encoding in formats))
-        yield "format", f"its pictures are of several kinds ({told})"
+        yield "format", f"its images are of several kinds ({told})"
     sizes = {(head.width, head.height) for head in stream.heads.kinds() if head.width}
     if len(sizes) > 1:
-        yield "size", f"its pictures change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
+        yield "size", f"its images change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
     sums = stream.picture_sums[line.order]
     begin, end = _longest_run(sums.astype(np.int64))
     if end - begin + 1 >= _FROZEN:
         at = (line.times_ns[begin] - line.times_ns[0]) / NS
-        yield "frozen", f"{end - begin + 1} pictures from {at:.2f} s on have the very same bytes"
+        yield "frozen", f"{end - begin + 1} images from {at:.2f} s on have the very same bytes"
     if stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:
         keyframes = np.flatnonzero(stream.heads.are_keyframes)
         first = int(keyframes[0]) if len(keyframes) else len(stream.heads)
-        yield "keyframe", f"its first {first} pictures cannot be decoded, since no keyframe is before them"
+        yield "keyframe", f"its first {first} images cannot be decoded, since no keyframe is before them"
 
 
 def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
@@ -358,11 +357,11 @@ def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
 
 
 def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
-    """Cameras whose messages are those of another one, by coordinate frame or picture."""
+    """Cameras whose messages are those of another one, by coordinate frame or image."""
     for name, stream in streams.cameras.items():
         frame = frame_id_of(streams.infos.get(name, {}))
         if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
-            text = f"its pictures are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
+            text = f"its images are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
             yield of_stream(stream, "swapped", text)
         elif stream.heads[0].encoding not in DEPTH_UNITS and (other := _claimed_by(name, streams)):  # registered to one
             text = f"its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
@@ -370,7 +369,7 @@ def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
     for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
         shared = min(len(stream), len(other_stream))
         if shared >= _FROZEN and np.mean(np.isin(stream.picture_sums, other_stream.picture_sums)) > 0.9:
-            text = f"{stream.topic} and {other_stream.topic} show the same pictures"
+            text = f"{stream.topic} and {other_stream.topic} show the same images"
             yield Finding(kind="same_pictures", stream=f"camera {name}, camera {other_name}", text=text)
 
 
@@ -407,7 +406,7 @@ def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
             yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
 
 
-def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
+def _unit_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
     for (name, index), stream in streams.sources.items():
         source = mapping.features[name][index]
         if stream.values is None or source.next or (source.to or source.unit) != "rad":
@@ -417,7 +416,7 @@ def _unit_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding
             yield of_stream(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
 
 
-def _action_findings(streams: BagStreams, mapping: BagMapping) -> Iterator[Finding]:
+def _action_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
     """State and action that do not speak of the same thing."""
     if any(source.next for source in mapping.features[ACTION]):
         return

@@ -25,7 +25,7 @@ class FramesImport:
     Attributes:
         num_episodes, num_frames: In the run.
         num_new: Episodes that were written now; the others were there.
-        cameras: Camera -> what became of its pictures, in words.
+        cameras: Camera -> what became of its images, in words.
         left_out: What the run does not have, by its name in the source -> why; "" for what the mapping does not name.
     """
 
@@ -34,6 +34,12 @@ class FramesImport:
     num_new: int
     cameras: Mapping[str, str]
     left_out: Mapping[str, str]
+
+    def left_out_lines(self) -> Iterator[str]:
+        """What the run does not have, for people."""
+        yield from (f"{name} is left out: {reason}." for name, reason in self.left_out.items() if reason)
+        if unnamed := [name for name, reason in self.left_out.items() if not reason]:
+            yield f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}."
 
 
 def write_frames(
@@ -53,10 +59,10 @@ def write_frames(
         folder: The run.
         info: What is known of the episode.
         frames: Feature -> its vector, of each frame.
-        pictures: Camera -> its pictures, one a frame, its lead in front.
+        pictures: Camera -> its images, one a frame, its lead in front.
         outcome: How it ended, of as many frames.
-        video: How pixels are coded.
-        leads: Camera -> how many of its pictures come before the first frame; 0 where not given.
+        video: How pixels are encoded.
+        leads: Camera -> how many of its images come before the first frame; 0 where not given.
         subtasks: Frame -> what the robot begins to do with it.
 
     Raises:

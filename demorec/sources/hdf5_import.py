@@ -1,21 +1,28 @@
-"""HDF5 files of robomimic's or ALOHA's layout become runs: numbers to the bit, JPEG files as they are.
+"""HDF5 files of robomimic's or ALOHA's layout become runs: numbers bit-exact, JPEG files as they are.
 
-All files are looked through before anything is written; then rows and pictures pass in pieces. The same command again
-goes on: episodes that are there are not written.
-"""
+All files are looked through before anything is written; then rows and images pass in pieces. The same command again
+goes on: episodes that are there are not written."""
 
 from __future__ import annotations
 
+import json
+import math
 import reprlib
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
-from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
+from demorec.core.registry import nearest_match
+from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.episode.episode import Outcome
 from demorec.episode.external import EpisodeInfo, Origin, SourceFile, Vector
 from demorec.mcap.external.validity import what_is_wrong
@@ -23,14 +30,12 @@ from demorec.robots.urdf import Urdf
 from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
-from demorec.sources.description import urdf_text
+from demorec.sources.episode_writer import urdf_text
 from demorec.sources.frames_writer import FramesImport, write_frames
-from demorec.sources.hdf5_episodes import episode_places, found_attribute, rate_of, success_of, task_of
-from demorec.sources.hdf5_features import Hdf5FitError, StoredFeature
-from demorec.sources.hdf5_mapping import Hdf5Mapping
-from demorec.sources.hdf5_pictures import StoredCamera, is_camera, picture_lengths
-from demorec.sources.mapping_file import read_mapping_file
-from demorec.sources.words import quoted
+from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, is_camera, picture_lengths
+from demorec.sources.mapping import MAX_FPS, Episodes, SourceMapping
+from demorec.sources.mapping_file import read_mapping
+from demorec.sources.words import in_natural_order, quoted, task_in_name
 
 _LENGTHS = "compress_len"
 """Where ALOHA's recorders say how long the JPEG file in each row is, without what pads it."""
@@ -45,14 +50,14 @@ def import_hdf5(
         paths: Of the files, in the order of their episodes.
         mapping_path: Of the mapping.
         out: The run's folder; one that the same files and mapping began is continued.
-        video: How pictures are coded that come as pixels.
+        video: How images are encoded that come as pixels.
 
     Raises:
         ConfigError: The mapping is impossible, the files differ, or the folder holds something else.
         Hdf5Error: A file cannot be read, or does not fit the mapping.
         RecordingError: The disk is full or gone.
     """
-    mapping = read_mapping_file(mapping_path, Hdf5Mapping)
+    mapping = read_mapping(mapping_path, "hdf5")
     urdf = urdf_text(mapping.robot.urdf, mapping_path)
     for path in paths:
         expect(path, "hdf5")
@@ -82,7 +87,7 @@ def import_hdf5(
 class _Stored:
     """An episode in an opened file; Hdf5FitError when its datasets do not fit the mapping."""
 
-    def __init__(self, file: ForeignFile, place: str, mapping: Hdf5Mapping) -> None:
+    def __init__(self, file: ForeignFile, place: str, mapping: SourceMapping) -> None:
         def array(name: str, *, may_be_ragged: bool = False) -> StoredArray:
             return file.array("/".join(filter(None, (place, name.strip("/")))), may_be_ragged=may_be_ragged)
 
@@ -140,7 +145,7 @@ def _num_rows(observed: Sequence[StoredArray], others: Sequence[StoredArray]) ->
     return num_rows
 
 
-def _write(plans: Sequence[_Plan], mapping: Hdf5Mapping, out: Path, video: VideoConfig) -> int:
+def _write(plans: Sequence[_Plan], mapping: SourceMapping, out: Path, video: VideoConfig) -> int:
     """Record what is not there; how many episodes that were."""
     with open_external_run(out, recovers=False) as folder:
         missing = [plan for plan in plans if not folder.has(plan.info)]
@@ -157,7 +162,7 @@ class _Plan:
     """What an episode shall be; every number is looked at."""
 
     def __init__(
-        self, file: ForeignFile, place: str, mapping: Hdf5Mapping, urdf: str, source: SourceFile, episode_index: int
+        self, file: ForeignFile, place: str, mapping: SourceMapping, urdf: str, source: SourceFile, episode_index: int
     ) -> None:
         self.path, self.place = file.path, place
         with _named(file.path):
@@ -196,7 +201,7 @@ def _make_alike(plan: _Plan, first: _Plan) -> None:
     plan.info = replace(plan.info, urdf=first.info.urdf)
 
 
-def _unnamed(file: ForeignFile, place: str, mapping: Hdf5Mapping) -> dict[str, str]:
+def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str, str]:
     """Datasets that the mapping does not name; groups of which it names none, as one.
 
     Raises:
@@ -230,3 +235,142 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except Hdf5FitError as error:
         raise Hdf5Error(f"The mapping does not fit the file: {error}: {path}") from error
+
+
+_RATES = ("fps", "env_args.env_kwargs.fps", "env_args.env_kwargs.control_freq")
+"""Attributes that say how many rows a second has: our own, and robosuite's."""
+
+
+def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
+    """The groups of the episodes, demo_2 before demo_10.
+
+    Raises:
+        Hdf5Error: There are none, not those of the mask, or one of them twice.
+    """
+    group = episodes.group.strip("/")
+    if not group:
+        return [""]
+    kinds = file.children(group)
+    names = [name for name, kind in kinds.items() if kind != "dataset"]
+    if episodes.mask:
+        wanted = set(file.names(f"mask/{episodes.mask}"))
+        if missing := sorted(wanted - set(names)):
+            raise Hdf5Error(f"mask/{episodes.mask} lists {missing[0]!r}, which is not in {group}: {file.path}")
+        names = [name for name in names if name in wanted]
+    if not names:
+        raise Hdf5Error(f"There are no episodes in {group}: {file.path}")
+    if others := [name for name in names if kinds[name] == "other"]:
+        raise Hdf5Error(
+            f"{group}/{others[0]} is a link or a type, only groups within the file are episodes: {file.path}"
+        )
+    places = [f"{group}/{name}" for name in sorted(names, key=in_natural_order)]
+    seen: dict[int, str] = {}
+    for place in places:
+        first = seen.setdefault(file.address(place), place)
+        if first != place:
+            raise Hdf5Error(f"{place} is the same group as {first}, an episode stands in a file once: {file.path}")
+    return places
+
+
+def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:
+    """An attribute of an episode, or of a group above it; a name with dots goes on into the JSON of one."""
+    groups = place.split("/")
+    for level in ("/".join(groups[:depth]) for depth in range(len(groups), -1, -1)):
+        if (found := file.attribute(level, name)) is not None:
+            return found
+        first, _, keys = name.partition(".")
+        text = file.attribute(level, first) if keys else None
+        if isinstance(text, str) and (inside := _in_json(text, keys.split("."))) is not None:
+            return inside
+    return None
+
+
+def _in_json(text: str, keys: list[str]) -> Scalar | None:
+    value = _parsed(text)
+    for key in keys:
+        if isinstance(value, list):
+            value = value[int(key)] if key.isdecimal() and len(key) < 10 and int(key) < len(value) else None
+        else:
+            value = value.get(key) if isinstance(value, dict) else None
+    return value if isinstance(value, str | bool | int | float) else None
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: str) -> Any:
+    """Of JSON, which may stand above a thousand episodes; None when it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def rate_of(file: ForeignFile, place: str, mapping: SourceMapping) -> int:
+    """Rows a second; Hdf5Error when neither the mapping nor the file says it, or no whole number."""
+    if mapping.clock.fps:
+        return mapping.clock.fps
+    found = told_rate(file, place)
+    if found is None:
+        raise Hdf5Error(
+            f"Nothing in the file says how many rows a second has: give clock.fps in the mapping: {file.path}"
+        )
+    if not 1 <= found <= MAX_FPS or found != int(found):
+        raise Hdf5Error(
+            f"The file says that it has {found:g} rows a second, allowed are whole numbers from 1 to {MAX_FPS}: give "
+            f"clock.fps in the mapping: {file.path}"
+        )
+    return int(found)
+
+
+def told_rate(file: ForeignFile, place: str) -> float | None:
+    """What the file's attributes say of the rate; None when they say nothing."""
+    for name in _RATES:
+        found = found_attribute(file, place, name)
+        if isinstance(found, int | float) and not isinstance(found, bool):
+            return float(found) if abs(found) <= sys.float_info.max else math.inf
+    return None
+
+
+def task_of(file: ForeignFile, place: str, mapping: SourceMapping) -> str:
+    """What the robot was asked to do; Hdf5Error when the file does not say."""
+    task = mapping.task
+    if task.text:
+        return " ".join(task.text.split())
+    if task.file_name:
+        if text := task_in_name(file.path.stem):
+            return text
+        raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {file.path}")
+    found = found_attribute(file, place, task.attribute)
+    if not isinstance(found, str) or not found.strip():
+        raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {place or 'the episode'}: {file.path}")
+    return " ".join(found.split())
+
+
+def success_of(file: ForeignFile, place: str, mapping: SourceMapping, num_rows: int) -> bool | None:
+    """How an episode ended; None where the mapping does not ask, or other episodes of the file alone say it.
+
+    Raises:
+        Hdf5Error: No episode says it, or this one says something else.
+    """
+    name = mapping.episodes.success.strip("/")
+    if not name:
+        return None
+    found = file.attribute(place, name)
+    if isinstance(found, str) or (isinstance(found, float) and not math.isfinite(found)):
+        raise Hdf5Error(
+            f"{place or 'The episode'} says {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
+            f"{file.path}"
+        )
+    if found is not None:
+        return bool(found)
+    if not file.has(f"{place}/{name}"):
+        if any(file.attribute(other, name) is not None for other in episode_places(file, mapping.episodes)):
+            return None
+        near = nearest_match(name, list(file.children(place)))
+        raise Hdf5Error(
+            f"{place or 'The episode'} has no attribute or dataset {name!r} that says how it ended.{near}".rstrip(".?")
+            + f": {file.path}"
+        )
+    array = file.array(f"{place}/{name}".lstrip("/"))
+    if len(array) != num_rows:
+        raise Hdf5Error(f"{array.place} has {len(array)} rows, the episode has {num_rows}: {file.path}")
+    return bool((array.read(num_rows - 1, num_rows).astype(np.float64) > 0).all())

@@ -15,9 +15,9 @@ from demorec.core.errors import without_path
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.episode.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.runs.find import expect
-from demorec.sources.hdf5_episodes import episode_places, found_attribute, told_rate
-from demorec.sources.hdf5_mapping import Hdf5Episodes
-from demorec.sources.hdf5_pictures import is_camera
+from demorec.sources.hdf5_arrays import is_camera
+from demorec.sources.hdf5_import import episode_places, found_attribute, told_rate
+from demorec.sources.mapping import Episodes
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
 _ROBOMIMIC, _OBSERVATIONS = "data", "obs"
@@ -80,7 +80,7 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
                 "This is neither robomimic's layout (data/demo_0/actions) nor ALOHA's (action, observations/qpos), it "
                 f"holds {held}: write the mapping by hand (docs/import.md): {path}"
             )
-        episodes = Hdf5Episodes(group="" if is_aloha else _ROBOMIMIC)
+        episodes = Episodes(group="" if is_aloha else _ROBOMIMIC)
         places = episode_places(file, episodes)
         contents = _Contents(file, places[0])
         lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
@@ -232,4 +232,4 @@ def _cameras(contents: _Contents) -> Iterator[str]:
         taken.append(camera)
         yield from ("", f"[cameras.{camera}]", f"dataset = {quoted(name)}")
         if len(contents.arrays[name].shape) <= 2:
-            yield '# colors = "bgr"  # where red and blue are exchanged in the pictures, as recorders with OpenCV do'
+            yield '# colors = "bgr"  # where red and blue are exchanged in the images, as recorders with OpenCV do'

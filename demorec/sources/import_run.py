@@ -31,18 +31,24 @@ from demorec.runs.external import (
     open_external_run,
 )
 from demorec.sources.bag import Bag, bags_in
-from demorec.sources.batch import Batch, ImportResult, Job, PlannedBag, files_of
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
+from demorec.sources.batch import Batch, ImportResult, Job, PlannedBag, files_of, processes
 from demorec.sources.clock import NS, Int
-from demorec.sources.description import described_camera, described_feature, urdf_in_bag, urdf_text
-from demorec.sources.episode_writer import ImportedEpisodeWriter, PlannedEpisode, picture_plan
+from demorec.sources.episode_writer import (
+    ImportedEpisodeWriter,
+    PlannedEpisode,
+    described_camera,
+    described_feature,
+    picture_plan,
+    urdf_in_bag,
+    urdf_text,
+)
 from demorec.sources.episodes import Window, subtask_rows, task_text, windows
 from demorec.sources.fields import FieldError
 from demorec.sources.findings import LOST, NOTE, Finding, all_findings, of_stream
-from demorec.sources.import_file import ImportFile, load_import_file
-from demorec.sources.mapping import BagMapping, read_mapping
-from demorec.sources.pipeline import processes
-from demorec.sources.report import BagReport, EpisodeReport, stream_reports
+from demorec.sources.import_file import BagReport, EpisodeReport, ImportFile, load_import_file, stream_reports
+from demorec.sources.mapping import SourceMapping
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.rows import RATE, EpisodeRows, NoRowsError, Timelines
 from demorec.sources.streams import BagDecoder, read_streams
 
@@ -100,7 +106,7 @@ def import_bags(
 class _Recipe:
     """What all bags have in common."""
 
-    mapping: BagMapping
+    mapping: SourceMapping
     urdf: str
     video: VideoConfig
 
@@ -124,7 +130,7 @@ class _Import:
 
     bag: Bag
     files: dict[str, str]
-    mapping: BagMapping
+    mapping: SourceMapping
     urdf: str
     video: VideoConfig
 
@@ -212,13 +218,13 @@ class _Import:
                 return
 
     def _check_pictures(self, episodes: Sequence[PlannedEpisode]) -> None:
-        """BagError when the pictures unpack to more than a bag of its size holds: a PNG file of zeros is small."""
+        """BagError when the images unpack to more than a bag of its size holds: a PNG file of zeros is small."""
         limits = Limits.of_file(self.bag.num_bytes)
         plans = [plan for episode in episodes for plan in episode.plans.values()]
         try:
             limits.check_total(sum(len(plan.numbers) * plan.num_bytes for plan in plans))
         except LimitError as error:
-            raise BagError(f"The pictures of the bag cannot be used, since {error}: {self.bag.path}") from error
+            raise BagError(f"The images of the bag cannot be used, since {error}: {self.bag.path}") from error
 
     def _check_alike(self, episodes: Sequence[PlannedEpisode]) -> None:
         """ConfigError unless the episodes are of one kind."""
@@ -227,7 +233,7 @@ class _Import:
                 raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {self.bag.path}")
 
     def write(self, episodes: Sequence[PlannedEpisode], folder: Path) -> None:
-        """Read the bag's pictures once more, and write each episode into a run while they pass."""
+        """Read the bag's images once more, and write each episode into a run while they pass."""
         waiting = sorted(episodes, key=lambda episode: int(episode.rows.times_ns[0]))
         for episode in (episode for episode in waiting if not episode.plans):
             with self._writer(episode, folder) as writer:
@@ -261,7 +267,7 @@ class _Import:
         return ImportedEpisodeWriter(path, episode, video=self.video)
 
     def _pictures(self, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str, int, dict[str, object]]]:
-        """(topic, number, values) of the pictures that any episode takes."""
+        """(topic, number, values) of the images that any episode takes."""
         taken: dict[str, list[Int]] = {}
         for episode in episodes:
             for plan in episode.plans.values():
@@ -279,7 +285,7 @@ class _Import:
                 yield topic, number, values
 
     def _unusable(self, topic: str, error: ValueError) -> BagError:
-        return BagError(f"A picture of {topic} cannot be used, since {error}: {self.bag.path}")
+        return BagError(f"An image of {topic} cannot be used, since {error}: {self.bag.path}")
 
 
 @cache
@@ -288,7 +294,7 @@ def _versions() -> Mapping[str, str]:
 
 
 def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:
-    """(topic, number) -> the episodes whose first picture of that topic it is; a topic's messages come in order."""
+    """(topic, number) -> the episodes whose first image of that topic it is; a topic's messages come in order."""
     found: dict[tuple[str, int], list[PlannedEpisode]] = {}
     for episode in episodes:
         for plan in episode.plans.values():

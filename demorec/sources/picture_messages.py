@@ -1,4 +1,7 @@
-"""Messages that hold a picture, as ROS and Foxglove define them: what is in them, and whether they are whole."""
+"""Messages that hold an image, as ROS and Foxglove define them: what is in them, whether they are whole, their pixels.
+
+Reordering of bytes changes no value. Bayer patterns and YUV are computed, in the plainest way that others agree on:
+bilinear interpolation, ITU-R BT.601 with limited range."""
 
 from __future__ import annotations
 
@@ -17,8 +20,112 @@ from demorec.core.errors import in_words
 from demorec.mcap.depth import decode_millimetres
 from demorec.mcap.video import is_keyframe
 from demorec.sources.fields import FieldError, picture_bytes, whole
-from demorec.sources.raw_pictures import RAW_ENCODINGS, check_raw, raw_picture
 from demorec.sources.ros_types import Values
+
+Rgb = NDArray[np.uint8]
+_CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
+    "rgb8": (3, (0, 1, 2)),
+    "bgr8": (3, (2, 1, 0)),
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+    "8UC3": (3, (2, 1, 0)),
+    "mono8": (1, (0, 0, 0)),
+    "8UC1": (1, (0, 0, 0)),
+}
+"""Encoding -> bytes of a pixel, which of them are red, green, blue; OpenCV's own names mean blue first."""
+_BAYER = {"bayer_rggb8": (0, 0), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0), "bayer_bggr8": (1, 1)}
+"""Encoding -> row and column of the first red pixel."""
+_YUV = {"uyvy": (1, 0, 2), "yuv422": (1, 0, 2), "yuyv": (0, 1, 3), "yuv422_yuy2": (0, 1, 3)}
+"""Encoding -> where the first luma, U and V of a pair of pixels are, of its four bytes."""
+_DEPTH = {"16UC1": "u2", "32FC1": "f4"}
+"""Encoding of distances -> type of one."""
+_PIXEL_BYTES = (
+    {encoding: count for encoding, (count, _) in _CHANNELS.items()}
+    | dict.fromkeys(_BAYER, 1)
+    | dict.fromkeys(_YUV, 2)
+    | {encoding: np.dtype(kind).itemsize for encoding, kind in _DEPTH.items()}
+)
+RAW_ENCODINGS = tuple(_PIXEL_BYTES)
+
+
+def raw_picture(values: Values) -> NDArray[Any]:
+    """(H, W, 3) uint8 of a message, or (H, W) distances as they are: uint16 (16UC1) or float32 (32FC1).
+
+    Raises:
+        FieldError: Its bytes are not those of its size and encoding.
+    """
+    encoding, height = str(values["encoding"]), whole(values, "height")
+    rows = _rows(values)
+    if encoding in _DEPTH:
+        kind = np.dtype(_DEPTH[encoding]).newbyteorder(">" if values.get("is_bigendian") else "<")
+        stored = np.ascontiguousarray(rows).view(kind)
+        return stored.astype(stored.dtype.newbyteorder("="))
+    if encoding in _CHANNELS:
+        channels, order = _CHANNELS[encoding]
+        return np.ascontiguousarray(rows.reshape(height, -1, channels)[:, :, list(order)])
+    return _from_bayer(rows, *_BAYER[encoding]) if encoding in _BAYER else _from_yuv(rows, *_YUV[encoding])
+
+
+def check_raw(values: Values) -> tuple[int, int]:
+    """Bytes of a row, with and without what pads it; FieldError when a message's are not those of its size."""
+    encoding, width, height = str(values["encoding"]), whole(values, "width"), whole(values, "height")
+    used = _bytes_of_row(encoding, width)
+    step = whole(values, "step") if values.get("step") and height > 1 else used
+    data = values["data"]
+    count = len(data) if isinstance(data, bytes | np.ndarray) else len(picture_bytes(values))
+    if step < used or count < step * (height - 1) + used:
+        raise FieldError(f"its image has {count:,} bytes, too few for {width}x{height} {encoding}")
+    return step, used
+
+
+def _bytes_of_row(encoding: str, width: int) -> int:
+    if encoding in _PIXEL_BYTES and not (encoding in _YUV and width % 2):
+        return width * _PIXEL_BYTES[encoding]
+    raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
+
+
+def _rows(values: Values) -> NDArray[np.uint8]:
+    """(H, B) bytes, without what pads each row."""
+    step, used = check_raw(values)
+    height, data = whole(values, "height"), np.frombuffer(picture_bytes(values), np.uint8)
+    if step == used:
+        return data[: used * height].reshape(height, used)
+    padded = np.zeros(step * height, np.uint8)
+    padded[: min(len(data), len(padded))] = data[: len(padded)]
+    return padded.reshape(height, step)[:, :used]
+
+
+def _from_bayer(pixels: NDArray[np.uint8], red_row: int, red_column: int) -> Rgb:
+    height, width = pixels.shape
+    rows, columns = np.indices((height, width))
+    is_red = ((rows % 2) == red_row) & ((columns % 2) == red_column)
+    is_blue = ((rows % 2) != red_row) & ((columns % 2) != red_column)
+    masks = (is_red, ~(is_red | is_blue), is_blue)
+    return np.stack([_filled(pixels, mask) for mask in masks], axis=2)
+
+
+def _filled(pixels: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A colour at every pixel: its own, or the mean of the neighbours that have it, the nearer ones counting double."""
+    known, weights = np.pad(np.where(mask, pixels, 0).astype(np.float64), 1), np.pad(mask.astype(np.float64), 1)
+
+    def blurred(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+        lines = plane[:-2] + 2 * plane[1:-1] + plane[2:]
+        return np.asarray(lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:])
+
+    mean = blurred(known) / np.maximum(blurred(weights), 1e-9)
+    return np.where(mask, pixels, np.rint(mean)).astype(np.uint8)
+
+
+def _from_yuv(pixels: NDArray[np.uint8], luma: int, u: int, v: int) -> Rgb:
+    quads = pixels.reshape(pixels.shape[0], -1, 4).astype(np.float64)
+    y = np.repeat(quads[:, :, [luma]], 2, axis=2)
+    y[:, :, 1] = quads[:, :, luma + 2]
+    scaled = 1.164383 * (y - 16)
+    blue, red = quads[:, :, [u]] - 128, quads[:, :, [v]] - 128
+    channels = (scaled + 1.596027 * red, scaled - 0.391762 * blue - 0.812968 * red, scaled + 2.017232 * blue)
+    rgb = np.stack([channel.reshape(len(pixels), -1) for channel in channels], axis=2)
+    return np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
+
 
 VIDEO_FORMATS = ("h264", "h265", "av1")
 KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
@@ -26,21 +133,21 @@ KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
 _MAX_UNITS = 256
-"""Of a coded picture before its first slice, that are looked at."""
+"""Of an encoded image before its first slice, that are looked at."""
 _SEQUENCE_BYTES = 24
 """Of an AV1 keyframe, within which its sequence header ends."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
 
 
 _FREE_SETS, _FRAMES_OF_A_SET = 40, 20
-"""Decoding a picture takes up to a tenth of a second: cameras have one set of parameters, or a few."""
+"""Decoding an image takes up to a tenth of a second: cameras have one set of parameters, or a few."""
 _HEAD_BYTES = 12
 """ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class PictureHead(NamedTuple):
-    """What is known of a picture before it is decoded.
+    """What is known of an image before it is decoded.
 
     Attributes:
         format: raw, jpeg, png, compressedDepth or a codec of `VIDEO_FORMATS`.
@@ -57,7 +164,7 @@ class PictureHead(NamedTuple):
 
 
 class PictureHeads:
-    """The heads of a camera's pictures in order: a bag has a million of them, which are of a few kinds."""
+    """The heads of a camera's images in order: a bag has a million of them, which are of a few kinds."""
 
     def __init__(self) -> None:
         self._kinds: list[PictureHead] = []
@@ -79,7 +186,7 @@ class PictureHeads:
         return self._kinds[self._of[index]]
 
     def kinds(self, among: NDArray[np.int64] | None = None) -> list[PictureHead]:
-        """The different ones, of all or of the pictures of these numbers."""
+        """The different ones, of all or of the images of these numbers."""
         if among is None:
             return list(self._kinds)
         return [self._kinds[place] for place in np.unique(np.array(self._of)[among]).tolist()]
@@ -91,16 +198,16 @@ class PictureHeads:
 
 
 def picture_head(values: Values) -> PictureHead:
-    """Of a message; FieldError when it holds no picture, a damaged one, or one in a format that is not read."""
+    """Of a message; FieldError when it holds no image, a damaged one, or one in a format that is not read."""
     if "data" not in values:
-        raise FieldError("it holds no picture")
+        raise FieldError("it holds no image")
     if "encoding" in values and "width" in values and "height" in values:
         size = whole(values, "width"), whole(values, "height")
         head = _checked(PictureHead("raw", str(values["encoding"]), *size, True))
         check_raw(values)
         return head
     if "format" not in values:
-        raise FieldError("it holds no picture")
+        raise FieldError("it holds no image")
     data = picture_bytes(values)
     name = str(values["format"]).lower()
     if "compresseddepth" in name:
@@ -119,7 +226,7 @@ def picture_head(values: Values) -> PictureHead:
 
 def _checked(head: PictureHead) -> PictureHead:
     if head.width < 1 or head.height < 1 or head.width * head.height > MAX_PIXELS:
-        raise FieldError(f"its picture has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
+        raise FieldError(f"its image has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
     if head.format == "raw" and head.encoding not in RAW_ENCODINGS:
         raise FieldError(f"its encoding {head.encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
     return head
@@ -135,10 +242,10 @@ def file_head(data: bytes) -> PictureHead:
                 _check_mode(image)
                 image.verify()
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its picture is damaged ({in_words(error)})") from error
+        raise FieldError(f"its image is damaged ({in_words(error)})") from error
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
-    if end not in data[-64:]:  # some cameras pad their pictures
-        raise FieldError("its picture is cut off")
+    if end not in data[-64:]:  # some cameras pad their images
+        raise FieldError("its image is cut off")
     return _checked(PictureHead(kind, "", width, height, True))
 
 
@@ -148,7 +255,7 @@ def _check_mode(image: Image.Image) -> None:
 
 
 def decode_picture(values: Values) -> NDArray[Any]:
-    """(H, W, 3) RGB of a picture that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
+    """(H, W, 3) RGB of an image that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
     if "encoding" in values:
         return raw_picture(values)
     if "compresseddepth" in str(values["format"]).lower():
@@ -163,7 +270,7 @@ def decode_file(data: bytes) -> NDArray[np.uint8]:
             _check_mode(image)
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its picture cannot be decoded ({in_words(error)})") from error
+        raise FieldError(f"its image cannot be decoded ({in_words(error)})") from error
 
 
 def _starts_by_itself(codec: str, data: bytes) -> bool:
@@ -189,14 +296,14 @@ def _nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
 
 
 class _VideoSizes:
-    """Sizes of keyframes: their parameter sets say them, in bits, and one picture of each kind is decoded for it."""
+    """Sizes of keyframes: their parameter sets say them, in bits, and one image of each kind is decoded for it."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[str, bytes], tuple[int, int]] = {}
         self._num_seen = self._num_decoded = 0
 
     def of(self, codec: str, data: bytes) -> tuple[int, int]:
-        """Width and height of a keyframe; FieldError when it gives no picture."""
+        """Width and height of a keyframe; FieldError when it gives no image."""
         self._num_seen += 1
         key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
         size = self._known.get(key)
@@ -206,7 +313,7 @@ class _VideoSizes:
             self._num_decoded += 1
             frame = next(_frames(codec, [data]), None)
             if frame is None:
-                raise FieldError(f"its {codec} keyframe gives no picture")
+                raise FieldError(f"its {codec} keyframe gives no image")
             if len(self._known) > 1000:
                 self._known.clear()
             size = self._known[key] = (frame.width, frame.height)
@@ -217,7 +324,7 @@ _sizes = _VideoSizes()
 
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:
-    """Those in front of a keyframe's picture, without what may differ from picture to picture beside them."""
+    """Those in front of a keyframe's image, without what may differ from image to image beside them."""
     units = list(_nal_units(codec, data))
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
     places = [place for _, place in units[1:]] + [units[-1][1]]
@@ -225,7 +332,7 @@ def _parameter_sets(codec: str, data: bytes) -> bytes:
 
 
 def decode_video(codec: str, packets: Iterable[bytes]) -> Iterator[NDArray[np.uint8]]:
-    """The pictures of packets, from a keyframe on; FieldError when they cannot be decoded."""
+    """The images of packets, from a keyframe on; FieldError when they cannot be decoded."""
     for frame in _frames(codec, packets):
         try:
             yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
@@ -246,7 +353,7 @@ def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
 
 
 def compressed_depth_head(form: str, data: bytes) -> tuple[str, int, int]:
-    """Encoding, width and height of a picture; FieldError when it is none, or does not hold whole millimetres."""
+    """Encoding, width and height of an image; FieldError when it is none, or does not hold whole millimetres."""
     encoding = form.split(";")[0].strip()
     if encoding != "16UC1":
         raise FieldError(
@@ -284,5 +391,5 @@ def _size(data: bytes) -> tuple[int, int]:
         raise FieldError("its distances are cut off")
     width, height = (int.from_bytes(size[at : at + 4], order) for at in (0, 4))  # type: ignore[arg-type]
     if not 1 <= width * height <= MAX_PIXELS:
-        raise FieldError(f"its picture has {width}x{height} pixels, at most {MAX_PIXELS} are read")
+        raise FieldError(f"its image has {width}x{height} pixels, at most {MAX_PIXELS} are read")
     return width, height

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from demorec.episode.external import DEPTH_UNITS
 from demorec.mcap.limits import VARIABLE, Limits
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline
 from demorec.sources.episodes import Window
-from demorec.sources.mapping import ROWS, BagMapping, CameraSource, Sampling, Source
+from demorec.sources.mapping import ROWS, CameraSource, Sampling, Source, SourceMapping
 from demorec.sources.streams import BagStreams, Stream
 
 RATE = 0.05
@@ -67,7 +67,7 @@ class CameraRows:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeRows:
-    """An episode before its pictures are read.
+    """An episode before its images are read.
 
     Attributes:
         window: Where it is in the bag.
@@ -98,7 +98,7 @@ class Timelines:
         lines: Stream -> timeline.
     """
 
-    def __init__(self, streams: BagStreams, mapping: BagMapping) -> None:
+    def __init__(self, streams: BagStreams, mapping: SourceMapping) -> None:
         self.streams, self.mapping = streams, mapping
         pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
         self.lines = {
@@ -297,7 +297,7 @@ class Timelines:
         formats = sorted({head.format for head in heads})
         if len(sizes) > 1:
             return f"{self._label(key)} changes its size ({', '.join(f'{w}x{h}' for w, h in sizes)})"
-        return f"{self._label(key)} has pictures of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
+        return f"{self._label(key)} has images of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
 
     def _feature(self, name: str, sources: tuple[Source, ...], chosen: Mapping[Key, Chosen]) -> FeatureRows:
         parts, ages = [], []

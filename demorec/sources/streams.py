@@ -1,6 +1,6 @@
 """A bag's streams: when each message of the mapping's topics was, and the numbers of those that hold any.
 
-Numbers stay in memory, some hundred bytes a message; of pictures only what is needed to choose among them does. They
+Numbers stay in memory, some hundred bytes a message; of images only what is needed to choose among them does. They
 are read from the bag once more when their rows are written.
 """
 
@@ -20,7 +20,7 @@ from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
 from demorec.mcap.limits import SpentError
 from demorec.sources.bag import Bag
-from demorec.sources.channel import BagChannel, BagError, BagMessage
+from demorec.sources.bag_files import BagChannel, BagError, BagMessage
 from demorec.sources.decoding import Decoder, UnknownEncodingError, decoder_of
 from demorec.sources.fields import (
     FieldError,
@@ -35,7 +35,7 @@ from demorec.sources.fields import (
     picture_bytes,
     stamp_of,
 )
-from demorec.sources.mapping import BagMapping, Source
+from demorec.sources.mapping import Source, SourceMapping
 from demorec.sources.picture_messages import PictureHeads, picture_head
 from demorec.sources.ros_types import Budgets, Values
 from demorec.sources.service_calls import CallReader, ServiceCall
@@ -68,9 +68,9 @@ class Stream:
         numbers: (N,) int64, which of the topic's messages it is, from 0; empty for others than cameras.
         values: (N, D) in the unit of the feature; None for cameras.
         layout: Of the values; None for cameras.
-        heads: (N,) what is known of each picture; empty for others.
+        heads: (N,) what is known of each image; empty for others.
         checksums: (N,) CRC-32 of each message's bytes.
-        picture_sums: (N,) CRC-32 of each picture's bytes; empty for others.
+        picture_sums: (N,) CRC-32 of each image's bytes; empty for others.
         frame_ids: Coordinate frames that messages name, in the order of their first occurrence.
         num_malformed: Messages that cannot be read or lack something.
         first_problem: What is wrong with the first of them.
@@ -287,7 +287,7 @@ def _unnamed_joints(stream: _Growing, others: Sequence[str]) -> str:
     )
 
 
-def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
+def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:
     """Read a bag from its front to its end.
 
     Raises:
@@ -305,7 +305,7 @@ def read_streams(bag: Bag, mapping: BagMapping) -> BagStreams:
 
 
 class _Reading:
-    def __init__(self, mapping: BagMapping, num_bytes: int) -> None:
+    def __init__(self, mapping: SourceMapping, num_bytes: int) -> None:
         self._mapping, self._num_bytes = mapping, num_bytes
         self._decoder = BagDecoder(num_bytes)
         budgets = self._decoder.budgets

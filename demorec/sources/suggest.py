@@ -20,8 +20,8 @@ import numpy as np
 from demorec.episode.external import DEPTH_UNITS
 from demorec.mcap.limits import SpentError
 from demorec.sources.bag import Bag, open_bag
+from demorec.sources.bag_files import BagError, BagMessage
 from demorec.sources.candidates import Vector, transforms_of, vectors_of
-from demorec.sources.channel import BagError, BagMessage
 from demorec.sources.choice import Choice, choose_features
 from demorec.sources.clock import NS, SKEW_S
 from demorec.sources.decoding import UnknownEncodingError
@@ -253,13 +253,13 @@ def _timed(vector: Vector, parts: Sequence[Sequence[int]]) -> Vector:
 
 
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
-    """Name of each camera -> topic: of several topics of the same one, the coded one."""
+    """Name of each camera -> topic: of several topics of the same one, the encoded one."""
     heads = {name: _head(topic.values[0]) for name, topic in topics.items() if topic.values}
     pictures = [name for name, head in heads.items() if head is not None]
     cameras: dict[str, str] = {}
     for name in sorted(pictures):
         if any(other != name and other.startswith(f"{name}/") for other in pictures):
-            continue  # image_raw beside image_raw/compressed: the same pictures
+            continue  # image_raw beside image_raw/compressed: the same images
         head = heads[name]
         is_depth = head is not None and head.encoding in DEPTH_UNITS
         ignored = _STOP_WORDS | _DEPTH_WORDS if is_depth else _STOP_WORDS

@@ -80,7 +80,9 @@ def test_required_flags_say_so(capsys: pytest.CaptureFixture[str], monkeypatch: 
     lines = help_of("demorec export", 80, capsys, monkeypatch)
     assert any(line.startswith("│ --out PATH") and "(required)" in line for line in lines)
     text = " ".join(" ".join(lines).replace("│", " ").split())
-    assert "Runs, recordings, or folders of recordings. (required)" in text
+    assert (
+        "Runs, recordings, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags. (required)" in text
+    )
 
 
 @pytest.mark.parametrize("program", ["demorec export", *(f"demorec export {name}" for name in EXPORTERS.names())])

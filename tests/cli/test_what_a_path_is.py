@@ -93,6 +93,8 @@ def test_every_command_tells_the_same_about_a_path(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "x.mcap"
+    if make is make_hdf5 and command in ("info", "check", "report", "view", "export"):
+        pytest.skip("reads it")  # tests/contract/test_everything_readable.py
     make(path)
     before = sorted(tmp_path.iterdir())
     words = ["export", "lerobot"] if command == "export" else [command]

@@ -27,10 +27,10 @@ from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources import import_run
 from demorec.sources.bag import Bag
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
+from demorec.sources.import_file import BagReport
 from demorec.sources.import_run import import_bags
-from demorec.sources.mapping import BagMapping
-from demorec.sources.report import BagReport
+from demorec.sources.mapping import SourceMapping
 from demorec.sources.streams import BagStreams, read_streams
 
 FRONT = "/follower/cam_front/image_raw/compressed"
@@ -304,7 +304,7 @@ def test_an_unexpected_error_skips_a_bag_too(tmp_path: Path, monkeypatch: pytest
     good, bad = _bag(tmp_path / "a.mcap"), _bag(tmp_path / "b.mcap")
     mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
 
-    def fails(bag: Bag, mapping: BagMapping) -> BagStreams:
+    def fails(bag: Bag, mapping: SourceMapping) -> BagStreams:
         if bag.path == bad:
             raise KeyError("nobody thought of it")
         return read_streams(bag, mapping)

@@ -32,12 +32,10 @@ from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.mcap import Recording, SimulatedRecording
 from demorec.runs.external import load_external_run
 from demorec.sources.frames_writer import FramesImport, Picture
-from demorec.sources.hdf5_episodes import episode_places
-from demorec.sources.hdf5_features import Hdf5FitError, StoredFeature
-from demorec.sources.hdf5_import import import_hdf5
-from demorec.sources.hdf5_mapping import DatasetPart, Hdf5Episodes
-from demorec.sources.hdf5_pictures import StoredCamera
+from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature
+from demorec.sources.hdf5_import import episode_places, import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
+from demorec.sources.mapping import Episodes, Source
 
 DEMOS = ("demo_0", "demo_1", "demo_10")
 Vectors = dict[str, NDArray[np.generic]]
@@ -130,7 +128,7 @@ def test_a_mask_chooses_and_a_dataset_tells_the_outcome(tmp_path: Path) -> None:
 def test_aloha_becomes_a_run(is_compressed: bool, tmp_path: Path) -> None:
     files = [write_aloha(tmp_path / f"episode_{k}.hdf5", is_compressed=is_compressed, seed=k) for k in range(2)]
     result, run = imported(*files)
-    kept = "jpeg kept as it is" if is_compressed else "pixels, coded once"
+    kept = "jpeg passed through as it is" if is_compressed else "pixels, encoded once"
     assert result.cameras == dict.fromkeys(ALOHA_CAMERAS, f"64x48, {kept}")
     for source, path in zip(files, recordings(run), strict=True):
         with h5py.File(source) as file, Recording(path) as recording:
@@ -158,7 +156,7 @@ def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) ->
     file = write_aloha(tmp_path / "episode_0.hdf5", is_compressed=is_compressed)
     dataset = 'dataset = "observations/images/cam_high"'
     result, run = imported(file, changes={dataset: f'{dataset}\ncolors = "bgr"'})
-    assert result.cameras["cam_high"].endswith("with red and blue exchanged, coded once")
+    assert result.cameras["cam_high"].endswith("with red and blue exchanged, encoded once")
     with Recording(recordings(run)[0]) as recording:
         shown = recording.picture("cam_high", 0)
     red, blue = shown[: HEIGHT // 2, : WIDTH // 2 - 4, 0].mean(), shown[: HEIGHT // 2, : WIDTH // 2 - 4, 2].mean()
@@ -223,7 +221,7 @@ def test_distances_stay(kind: str, tmp_path: Path) -> None:
     with h5py.File(file, "r+") as opened:
         opened["observations/images/cam_high_depth"] = given
     result, run = imported(file)
-    assert result.cameras["cam_high_depth"].endswith("kept as they are")
+    assert result.cameras["cam_high_depth"].endswith("passed through as they are")
     with Recording(recordings(run)[0]) as recording:
         assert recording.depth_cameras == ("cam_high_depth",)
         found = np.array(list(recording.distances("cam_high_depth")))
@@ -318,7 +316,7 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
             for row, data in enumerate(given):
                 stored[row] = np.frombuffer(data, np.uint8)
     result, run = imported(file)
-    assert result.cameras == dict.fromkeys(ALOHA_CAMERAS, "64x48, jpeg kept as it is")
+    assert result.cameras == dict.fromkeys(ALOHA_CAMERAS, "64x48, jpeg passed through as it is")
     with Recording(recordings(run)[0]) as recording:
         for camera in ALOHA_CAMERAS:
             assert [packet.data for packet in recording.packets(camera)] == given
@@ -537,8 +535,8 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "another width": (
         _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 8)))), "The episodes differ"
     ),
-    "pictures of integers": (_pictures(np.zeros((5, 8, 8, 3), np.int32)), "pictures are uint8 or floats"),
-    "pictures of one colour": (_pictures(np.zeros((5, 8, 8, 1), np.uint8)), "pictures are uint8 or floats"),
+    "pictures of integers": (_pictures(np.zeros((5, 8, 8, 3), np.int32)), "images are uint8 or floats"),
+    "pictures of one colour": (_pictures(np.zeros((5, 8, 8, 1), np.uint8)), "images are uint8 or floats"),
     "pictures from -1": (_pictures(np.linspace(-1, 1, 5 * 192).reshape(5, 8, 8, 3)), "has pixels from -1 to 1, floats"),
     "pictures of nan": (_pictures(np.full((5, 8, 8, 3), np.nan)), "not finite in row 0"),
     "soft link": (_soft_link, "data/demo_1/actions is a link"),
@@ -603,7 +601,7 @@ def test_episodes_are_in_the_order_of_their_numbers_however_long_these_are(tmp_p
         for name in names:
             file[f"data/{name}/actions"] = np.zeros((2, 1))
     with ForeignFile(tmp_path / "many.hdf5") as opened:
-        places = episode_places(opened, Hdf5Episodes(group="data"))
+        places = episode_places(opened, Episodes(group="data"))
     assert [place.removeprefix("data/") for place in places] == ["demo_2", "demo_9", "demo_010", names[2]]
 
 
@@ -625,10 +623,10 @@ def test_whole_numbers_are_exact(edge: int, tmp_path: Path) -> None:
         file["other"] = np.array([[edge + (1 if edge > 0 else -1)]])
         file["unsigned"] = np.array([[2**64 - 1]], np.uint64)
     with ForeignFile(tmp_path / "a.hdf5") as opened:
-        held = StoredFeature("a", [DatasetPart(dataset="held")], [array("held")], shift=0)
+        held = StoredFeature("a", [Source(dataset="held")], [array("held")], shift=0)
         assert [vector.tolist() for vector in held.vectors(1)] == [[edge]]
         for name in ("other", "unsigned"):
-            feature = StoredFeature("a", [DatasetPart(dataset=name)], [array(name)], shift=0)
+            feature = StoredFeature("a", [Source(dataset=name)], [array(name)], shift=0)
             with pytest.raises(Hdf5FitError, match="whole numbers that float64 cannot hold"):
                 list(feature.vectors(1))
 

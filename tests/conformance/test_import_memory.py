@@ -11,7 +11,7 @@ from support import bags
 
 from demorec.sources.bag import open_bag
 from demorec.sources.import_run import import_bags
-from demorec.sources.mapping import read_mapping
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.streams import read_streams
 
 MAPPING = """

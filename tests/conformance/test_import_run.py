@@ -19,7 +19,7 @@ from support import bag_mappings, bags
 from demorec.cli import main
 from demorec.core.errors import ConfigError
 from demorec.mcap import Recording
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.import_run import import_bags
 
 SECONDS = 1.5
@@ -204,7 +204,7 @@ def test_an_episode_that_lacks_something_is_dropped_where_the_mapping_says_so(tm
 
 @pytest.mark.parametrize("encoding", ["bgr8", "mono8", "bgra8", "bayer_rggb8"])
 def test_raw_pictures_of_other_encodings(encoding: str, tmp_path: Path) -> None:
-    from demorec.sources.raw_pictures import raw_picture
+    from demorec.sources.picture_messages import raw_picture
 
     image = bags.picture(bags.EPOCH_NS, 1)
     smooth = np.broadcast_to(np.linspace(0, 255, bags.WIDTH).astype(np.uint8)[:, None], (bags.HEIGHT, bags.WIDTH, 3))
@@ -343,7 +343,7 @@ def test_a_video_that_begins_between_keyframes(tmp_path: Path) -> None:
     bag, mapping = _video(tmp_path, gop=10, first=3)
     (report,) = import_bags([bag], mapping, tmp_path / "run").reports
     (finding,) = [finding for finding in report.findings if finding.kind == "keyframe"]
-    assert "first 7 pictures" in finding.text
+    assert "first 7 images" in finding.text
     with _open(tmp_path / "run") as recording:
         assert next(iter(recording.packets("high"))).is_keyframe
         assert len(list(recording.images("high"))) == len(recording.columns().picture_stamps["high"])

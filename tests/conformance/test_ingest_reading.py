@@ -15,7 +15,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from support import bags
 
 from demorec.sources.bag import Bag, open_bag
-from demorec.sources.channel import BagChannel, BagError
+from demorec.sources.bag_files import BagChannel, BagError
 from demorec.sources.decoding import UnknownEncodingError, decoder_of
 from demorec.sources.fields import stamp_of
 from demorec.sources.streams import BagDecoder

@@ -13,7 +13,8 @@ from support import bag_mappings, bags
 
 from demorec.sources.bag import open_bag
 from demorec.sources.episodes import windows
-from demorec.sources.mapping import BagMapping, read_mapping
+from demorec.sources.mapping import SourceMapping
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.rows import EpisodeRows, NoRowsError, Timelines
 from demorec.sources.streams import read_streams
 
@@ -38,14 +39,14 @@ LAYOUTS: dict[str, tuple[bags.Notes, Write, str]] = {
 }
 
 
-def _rows(path: Path, mapping: BagMapping) -> list[EpisodeRows]:
+def _rows(path: Path, mapping: SourceMapping) -> list[EpisodeRows]:
     bag = open_bag(path)
     streams = read_streams(bag, mapping)
     lines = Timelines(streams, mapping)
     return [lines.rows(window) for window in windows(bag, streams, list(lines.lines.values()), mapping)]
 
 
-def _mapping(text: str, tmp_path: Path) -> BagMapping:
+def _mapping(text: str, tmp_path: Path) -> SourceMapping:
     return read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
 
 

@@ -12,10 +12,10 @@ from support.bag_faults import ACTION, FAULTS, FRONT, hurt
 
 from demorec.core.tables import CHECKS
 from demorec.sources.bag import open_bag
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.findings import all_findings
 from demorec.sources.import_run import import_bags
-from demorec.sources.mapping import read_mapping
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.rows import Timelines
 from demorec.sources.streams import read_streams
 

@@ -16,7 +16,7 @@ from demorec.sources.episodes import Window
 from demorec.sources.fields import layout_of
 from demorec.sources.findings import all_findings
 from demorec.sources.import_run import row_findings
-from demorec.sources.mapping import BagMapping, CameraSource, Clock, Robot, Source, TaskText
+from demorec.sources.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
 from demorec.sources.picture_messages import PictureHead, PictureHeads
 from demorec.sources.rows import EpisodeRows, Timelines
 from demorec.sources.streams import BagStreams, Stream
@@ -61,7 +61,7 @@ def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, Episo
     """Of a bag with these cameras and joints at a kilohertz, from before the first image to after the last."""
     first, last = min(min(times) for times in cameras.values()), max(max(times) for times in cameras.values())
     joints = list(range(first - 2_000_000, last + 2 * NS // clock.fps, 1_000_000))
-    mapping = BagMapping(
+    mapping = SourceMapping(
         robot=Robot(name="r"), task=TaskText(text="t"), clock=clock,
         features={"observation.state": (SOURCE,), "action": (SOURCE,)},
         cameras={name: CameraSource(topic=f"/{name}") for name in cameras},

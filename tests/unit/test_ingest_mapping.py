@@ -10,7 +10,7 @@ from support import bag_mappings, bags
 
 from demorec.core.errors import ConfigError
 from demorec.sources.bag import open_bag
-from demorec.sources.channel import BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.fields import (
     FieldError,
     OtherPublisherError,
@@ -20,7 +20,8 @@ from demorec.sources.fields import (
     layout_of,
     parse_path,
 )
-from demorec.sources.mapping import Source, read_mapping
+from demorec.sources.mapping import Source
+from demorec.sources.mapping_file import read_mapping
 from demorec.sources.streams import read_streams
 
 WRONG = [
@@ -65,7 +66,7 @@ MISFITS = [
     ('field = "position"', 'field = "position"\njoints = ["shoulder_pam"]', r"Did you mean 'shoulder_pan'\?"),
     ('field = "position"', 'field = "position"\nelements = [9]', r"no element 9 among the 6"),
     ('field = "position"', 'field = "position"\nnames = ["a"]', r"names has 1 names for the 6 elements"),
-    ("/follower/cam_front/image_raw/compressed", "/follower/joint_states", r"camera front .* it holds no picture"),
+    ("/follower/cam_front/image_raw/compressed", "/follower/joint_states", r"camera front .* it holds no image"),
 ]
 
 
@@ -173,3 +174,23 @@ def test_units(unit: str, to: str, given: list[float], expected: list[float]) ->
 def test_without_a_conversion_no_bit_changes() -> None:
     values = np.array([[0.1, np.nan]], dtype=np.float32)
     assert converted(Source(topic="/j", field="x", unit="rad"), values) is values
+
+
+def test_digests_are_those_of_the_runs_that_may_be_continued(tmp_path: Path) -> None:
+    """As demorec gave them when bags and HDF5 files had a language each."""
+    bag = read_mapping(bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "bag.toml"))
+    assert bag.digest == "0f572a2612d74310"
+    text = """
+[robot]
+name = "arm"
+[task]
+text = "lift"
+[episodes]
+group = "data"
+[[features."observation.state"]]
+dataset = "obs/q"
+[[features.action]]
+dataset = "actions"
+"""
+    stored = read_mapping(bag_mappings.write_mapping(text, tmp_path / "hdf5.toml"), "hdf5")
+    assert stored.digest == "32cc4285c9e4acc2"

@@ -10,8 +10,10 @@ import contextlib
 import json
 import logging
 import os
+import re
 import sys
-from typing import TextIO
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -21,6 +23,41 @@ from demorec.core.text import printable
 
 class OutputError(DemorecError):
     """Standard output cannot take the answer: the disk behind it is full, for example."""
+
+
+_names: dict[str, str] = {}
+"""Path of a run that is no user's -> what the user named, while such runs are read."""
+_EPISODE_FILE = r"(?:/episodes/episode_0*(\d+)\.mcap)?"
+
+
+@contextlib.contextmanager
+def renamed(names: Mapping[str, str]) -> Iterator[Callable[[Any], Any]]:
+    """Let all that is written say `names[path]` for a path, and "NAME: episode 3" for a recording in it.
+
+    Gives what does so: to texts, and to those in lists and dicts.
+    """
+    _names.update(names)
+    try:
+        yield _in_users_words
+    finally:
+        for path in names:
+            del _names[path]
+
+
+def _in_users_words(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _in_users_words(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_in_users_words(item) for item in value]
+    if isinstance(value, str):
+        for path, name in _names.items():
+            if path in value:
+                value = re.sub(
+                    re.escape(path) + _EPISODE_FILE,
+                    lambda found, name=name: f"{name}: episode {found[1]}" if found[1] else name,  # type: ignore[misc]
+                    value,
+                )
+    return value
 
 
 def say(*lines: str) -> None:
@@ -35,7 +72,7 @@ def say(*lines: str) -> None:
 
 def say_json(value: object) -> None:
     """Write a value as JSON to standard output; characters beyond ASCII are escaped by JSON itself."""
-    say(*json.dumps(value, indent=2).splitlines())
+    say(*json.dumps(_in_users_words(value), indent=2).splitlines())
 
 
 def tell(*lines: str) -> None:
@@ -50,7 +87,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def _write(stream: TextIO, lines: tuple[str, ...]) -> None:
-    text = "".join(f"{printable(line)}\n" for line in lines)
+    text = "".join(f"{printable(_in_users_words(line))}\n" for line in lines)
     encoding = stream.encoding or "utf-8"
     text = text.encode(encoding, "backslashreplace").decode(encoding)  # a terminal of another alphabet
     try:

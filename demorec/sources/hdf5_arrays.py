@@ -1,0 +1,310 @@
+"""What datasets of an HDF5 file hold: vectors with every bit as it is, and images, JPEG and distances as they are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Container, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.config import MAX_PIXELS
+from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
+from demorec.episode.external import Camera, Feature, Kept, Vector
+from demorec.sources.fields import FieldError, converted
+from demorec.sources.frames_writer import Picture
+from demorec.sources.mapping import MAX_ELEMENTS, STATE, CameraSource, Source, conversion_factor, recorded_unit
+from demorec.sources.picture_messages import PictureHead, decode_picture, picture_head
+from demorec.sources.ros_types import Values
+
+_BLOCK_ROWS = 1024
+_EXACT = 2**53
+"""Up to which float64 holds every whole number."""
+
+
+class Hdf5FitError(ValueError):
+    """A dataset is not what the mapping takes it for; `str` says why, for the inside of a sentence."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Column:
+    """One part of a feature, and where its numbers are."""
+
+    part: Source
+    array: StoredArray
+    names: tuple[str, ...]
+
+    @property
+    def is_single(self) -> bool:
+        """Whether float32 holds all its numbers."""
+        kind = self.array.dtype
+        return kind.kind == "f" and kind.itemsize <= 4 and conversion_factor(self.part.unit, self.part.to) is None
+
+    def block(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
+        rows: NDArray[Any] = self.array.read(begin, end).reshape(end - begin, -1)
+        if self.part.elements:
+            rows = rows[:, list(self.part.elements)]
+        if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
+            raise Hdf5FitError(f"{self.array.place} has whole numbers that float64 cannot hold")
+        is_small = rows.dtype.kind == "f" and rows.dtype.itemsize <= 4
+        return converted(self.part, rows.astype(np.float32 if is_small else np.float64))
+
+
+class StoredFeature:
+    """A feature of an episode.
+
+    Attributes:
+        columns: Of each part the dataset.
+
+    Args:
+        name: Of it.
+        parts, arrays: What it is made of, and where each is.
+        shift: By how many rows the frames are behind the datasets' rows: 1 for what another feature is next.
+
+    Raises:
+        Hdf5FitError: They are no vectors.
+    """
+
+    def __init__(self, name: str, parts: Sequence[Source], arrays: Sequence[StoredArray], *, shift: int) -> None:
+        self.name, self.shift = name, shift
+        pairs = zip(parts, arrays, strict=True)
+        self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
+
+    @property
+    def dtype(self) -> type[np.float32] | type[np.float64]:
+        """float32 where that holds all numbers as they are."""
+        return np.float32 if all(column.is_single for column in self.columns) else np.float64
+
+    def described(self, joints: Container[str]) -> Feature:
+        """The feature as recordings know it, given the joints of the robot's model."""
+        names = tuple(name for column in self.columns for name in column.names)
+        units = tuple(
+            recorded_unit(column.part.to or column.part.unit) for column in self.columns for _ in column.names
+        )
+        called = (name.removesuffix(".pos") for name in names)  # as LeRobot calls the position of a joint
+        moves = tuple(name if name in joints and self.name == STATE else "" for name in called)
+        source = "; ".join(column.part.dataset for column in self.columns)
+        return Feature(
+            name=self.name,
+            dtype="float32" if self.dtype is np.float32 else "float64",
+            names=names,
+            units=units if any(units) else (),
+            joints=moves if any(moves) else (),
+            source=f"{source} of the next row" if self.shift else source,
+        )
+
+    def vectors(self, count: int) -> Iterator[Vector]:
+        """(D,) of each of the first `count` frames.
+
+        Raises:
+            Hdf5FitError: A number is not finite, or not to be held.
+            Hdf5Error: They cannot be read.
+        """
+        for begin in range(0, count, _BLOCK_ROWS):
+            first, last = begin + self.shift, min(begin + _BLOCK_ROWS, count) + self.shift
+            parts = [column.block(first, last) for column in self.columns]
+            for column, part in zip(self.columns, parts, strict=True):
+                if len(wrong := np.argwhere(~np.isfinite(part))):
+                    row, element = wrong[0].tolist()
+                    raise Hdf5FitError(
+                        f"{column.array.place} is {part[row, element]} in row {first + row} ({column.names[element]}), "
+                        "numbers must be finite"
+                    )
+            yield from np.concatenate(parts, axis=1).astype(self.dtype)
+
+
+def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
+    """Of the elements that are taken."""
+    if len(array.shape) > 2:
+        shape = "x".join(map(str, array.shape))
+        raise Hdf5FitError(f"{array.place} is an array of {shape}, a feature takes rows of numbers")
+    count = array.shape[1] if len(array.shape) == 2 else 1
+    if not 1 <= count <= MAX_ELEMENTS:
+        raise Hdf5FitError(f"{array.place} has {count:,} numbers a row, allowed are 1 to {MAX_ELEMENTS:,}")
+    if outside := [element for element in part.elements if element >= count]:
+        raise Hdf5FitError(f"there is no element {outside[0]} among the {count} of {array.place}")
+    labels = _labels(array, count)
+    labels = [labels[element] for element in part.elements] if part.elements else labels
+    for what, given in (("names", part.names), ("limits", part.limits)):
+        if given and len(given) != len(labels):
+            raise Hdf5FitError(f"{what} has {len(given)} entries for the {len(labels)} elements of {array.place}")
+    return tuple(part.prefix + name for name in part.names or labels)
+
+
+def _labels(array: StoredArray, count: int) -> list[str]:
+    """What the dataset's attribute `names` calls its elements, where it has one, or else its own name and a number."""
+    try:
+        named = json.loads(str(array.attribute("names") or ""))
+    except (ValueError, RecursionError, Hdf5Error):
+        named = None
+    is_list = isinstance(named, list) and len(named) == count and all(isinstance(name, str) for name in named)
+    if is_list and all(name and name.isprintable() and "," not in name for name in named):
+        return list(named)
+    base = array.place.rpartition("/")[2].replace(",", " ")
+    return [base] if len(array.shape) == 1 else [f"{base}_{number}" for number in range(count)]
+
+
+_LEAST_SIDE = 16
+"""Pixels, below which arrays of floats are no images unless the mapping says so."""
+_JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+
+
+class StoredCamera:
+    """A camera of an episode.
+
+    Attributes:
+        width, height: Pixels.
+        kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are
+            encoded once.
+        told: What becomes of the images, in words.
+
+    Args:
+        name: Of the camera.
+        camera: What the mapping says of it.
+        array: Its dataset.
+        lengths: (C, T) of the JPEG files of all cameras, in an order of cameras that nobody tells; None where the file
+            has none.
+
+    Raises:
+        Hdf5FitError: They are no images.
+        Hdf5Error: They cannot be read.
+    """
+
+    def __init__(
+        self, name: str, camera: CameraSource, array: StoredArray, lengths: NDArray[np.generic] | None
+    ) -> None:
+        self.name = name
+        self._camera, self._array, self._lengths = camera, array, lengths
+        self._scale = 0.0
+        self.kept: Kept = ""
+        shape = array.shape
+        form = picture_form(array)
+        if form is None:
+            found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
+            raise Hdf5FitError(
+                f"{array.place} is {found}, images are uint8 or floats of rows, height, width and 3 colours, or of "
+                "rows, 3 colours, height and width, or rows of JPEG, distances uint16 or float32 of rows, height, width"
+            )
+        self._form = form
+        if form == "jpeg":
+            head = self._head(array.read(0, 1)[0], 0)[1]
+            self.width, self.height = head.width, head.height
+            self.kept = "jpeg" if camera.colors == "rgb" else ""
+            self.told = (
+                "jpeg passed through as it is" if self.kept else "jpeg with red and blue exchanged, encoded once"
+            )
+        elif form == "depth":
+            self.height, self.width = shape[1:3]
+            self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
+            self.told = f"distances ({self.kept}) passed through as they are"
+        else:
+            self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
+            self.told = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
+        if not 1 <= self.width * self.height <= MAX_PIXELS:
+            raise Hdf5FitError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
+        if form == "pixels" and array.dtype.kind == "f":
+            self._scale = _float_scale(array)
+            self.told = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.told}"
+
+    def described(self) -> Camera:
+        """The camera as recordings know it."""
+        return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=self._camera.dataset)
+
+    def pictures(self) -> Iterator[Picture]:
+        """One a row.
+
+        Raises:
+            Hdf5FitError: A JPEG file is cut off, or of another size.
+            Hdf5Error: They cannot be read.
+        """
+        for number, row in enumerate(self._array.rows()):
+            if self._form == "depth":
+                yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
+                continue
+            if self._form == "pixels":
+                picture = row if row.shape[2] == 3 else row.transpose(1, 2, 0)
+                scaled = np.rint(picture.astype(np.float64) * self._scale) if self._scale else picture
+                yield self._ordered(np.ascontiguousarray(scaled, dtype=np.uint8))
+                continue
+            data, head = self._head(row, number)
+            if (head.width, head.height) != (self.width, self.height):
+                raise Hdf5FitError(
+                    f"{self._array.place} changes its size to {head.width}x{head.height} in row {number}"
+                )
+            yield data if self.kept else self._ordered(self._used(decode_picture, data, number))
+
+    def _ordered(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return picture if self._camera.colors == "rgb" else np.ascontiguousarray(picture[:, :, ::-1])
+
+    def _head(self, row: NDArray[np.generic], number: int) -> tuple[bytes, PictureHead]:
+        """The JPEG file of a row and its head, without what pads it: it ends with its own mark, never with a zero."""
+        data = row.tobytes().rstrip(b"\0")
+        if not data.endswith(_JPEG_END):
+            raise Hdf5FitError(f"{self._array.place} holds no whole JPEG file in row {number}")
+        if self._lengths is not None and len(data) not in self._lengths[:, number].tolist():
+            raise Hdf5FitError(
+                f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
+                "that compress_len tells"
+            )
+        head = self._used(picture_head, data, number)
+        if head.format != "jpeg":
+            raise Hdf5FitError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
+        return data, head
+
+    def _used[T](self, read: Callable[[Values], T], data: bytes, number: int) -> T:
+        """What is read of the JPEG file in a row."""
+        try:
+            return read({"format": "jpeg", "data": data})
+        except FieldError as error:
+            raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
+
+
+def _float_scale(array: StoredArray) -> float:
+    """What pixels that are floats are multiplied with: 255 where none is above 1; Hdf5FitError for other numbers."""
+    lowest, highest = 0.0, 0.0
+    for number, row in enumerate(array.rows()):
+        values = row.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise Hdf5FitError(f"{array.place} has pixels that are not finite in row {number}")
+        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
+    if lowest < 0 or highest > 255:
+        raise Hdf5FitError(
+            f"{array.place} has pixels from {lowest:g} to {highest:g}, floats are read from 0 to 1 or from 0 to 255"
+        )
+    return 255.0 if highest <= 1 else 1.0
+
+
+def is_camera(array: StoredArray) -> bool:
+    """Whether a dataset holds images, JPEG files or, by its name or its last axis, distances.
+
+    Raises:
+        Hdf5Error: Its first row cannot be read.
+    """
+    form, place = picture_form(array), array.place.rpartition("/")[2]
+    if form == "jpeg":
+        return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)
+    if form == "pixels" and array.dtype.kind == "f":  # points and transforms are arrays like these
+        first = array.read(0, min(1, len(array))).astype(np.float64)
+        return min(sorted(array.shape[1:])[1:]) >= _LEAST_SIDE and bool(((first >= 0) & (first <= 255)).all())
+    is_image = len(array.shape) == 4 and min(array.shape[1:3]) >= _LEAST_SIDE  # as our own exports have distances
+    return form == "pixels" or (form == "depth" and (is_image or "depth" in place))
+
+
+def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
+    """What the rows of a dataset can be as images; None for numbers that are none."""
+    shape, kind = array.shape, array.dtype
+    if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
+        return "jpeg"
+    if len(shape) == 4 and (kind == np.uint8 or kind.kind == "f") and 3 in (shape[1], shape[3]):
+        return "pixels"
+    is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
+    return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None
+
+
+def picture_lengths(array: StoredArray, num_rows: int) -> NDArray[np.generic]:
+    """(C, T) of ALOHA's `compress_len`; Hdf5FitError when it is of another shape."""
+    if len(array.shape) != 2 or array.shape[1] != num_rows:
+        raise Hdf5FitError(f"{array.place} has the shape {array.shape}, it must have {num_rows} columns")
+    return array.read(0, len(array))
