@@ -1,26 +1,28 @@
-"""`demorec generate`, also called `generate-dataset`: the main job."""
+"""`demorec generate`, also called `generate-dataset`: the main job. `demorec reproduce`: the same data once more."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
-from demorec.cli.shared.output import tell
+from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, read_toml
 from demorec.core.errors import ConfigError
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.registry import nearest_match
-from demorec.generate.options import RunOptions, default_out, default_repo_id
+from demorec.generate.options import RunObserver, RunOptions
 
 if TYPE_CHECKING:
-    from demorec.runs.run_file import Attempt
+    from demorec.runs.run_file import Attempt, RunFile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +69,11 @@ class Generate:
         self.options.validate()
         if self.deep_every < 0:
             raise ConfigError(f"deep-every is {self.deep_every}, allowed are 0 (none) and more.")
+        name = self.episodes.task.rpartition(":")[2]  # of somebody else's "package.module:Name", its name
         options = replace(
             self.options,
-            out=self.options.out or default_out(self.episodes.task),
-            repo_id=self.options.repo_id or default_repo_id(self.episodes.task),
+            out=self.options.out or Path("recordings") / name,
+            repo_id=self.options.repo_id or f"local/{name}",
         )
         assert options.out is not None
         refuse_inside([options.out])
@@ -82,9 +85,7 @@ class Generate:
             return 0
 
         from demorec.cli.generate_report import check_run, print_result
-        from demorec.cli.shared.progress import RunProgress
-        from demorec.generate.interrupts import terminate_as_interrupt
-        from demorec.generate.run import generate
+        from demorec.generate.run import generate, terminate_as_interrupt
 
         with ExitStack() as stack:
             watch = stack.enter_context(_viewer(options.out)) if self.view else None
@@ -108,6 +109,62 @@ class Generate:
         if report is not None and report.not_verified:
             tell(f"Not verified: {report.not_verified}")
         return 1 if result.run.given_up or (checked is not None and checked.failures) else 0
+
+
+class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
+    """How a run goes, one bar after another; a context manager.
+
+    `watch` is called with every attempt that has ended.
+    """
+
+    def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
+        self._watch = watch
+        self._bar: ProgressBar | None = None
+        self._title = ""
+        self._failed = 0
+
+    def __exit__(self, *exc: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def verifying(self, done: int, total: int) -> None:
+        """Recordings that are there already are being verified."""
+        self._show("verifying", total).set(done)
+
+    def checking(self, done: int, total: int) -> None:
+        """Run, recordings and dataset are being checked."""
+        self._show("checking", total, unit="item").set(done)
+
+    def exporting(self, done: int, total: int) -> None:
+        """Recordings are being exported."""
+        self._show("exporting", total).set(done)
+
+    def started(self, run: RunFile, workers: int) -> None:
+        """The work begins."""
+        self._show("generating", run.num_episodes, done=len(run.successes), at_once=workers)
+
+    def ended(self, attempt: Attempt) -> None:
+        """An attempt has come to its end."""
+        if self._watch is not None:
+            self._watch(attempt)
+        assert self._bar is not None  # `started` comes first
+        if attempt.success:
+            self._bar.advance()
+        else:
+            self._failed += 1
+            self._bar.note(counted(self._failed, "failed attempt"))
+
+    def says(self, message: str) -> None:
+        """Something that a person should know."""
+        tell(message)
+
+    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode", at_once: int = 1) -> ProgressBar:
+        if self._bar is None or title != self._title:
+            if self._bar is not None:
+                self._bar.close()
+            self._title = title
+            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
+        return self._bar
 
 
 @contextmanager
@@ -167,3 +224,59 @@ def _replaced(owner: Any, above: tuple[str, ...], key: str, value: Any) -> Any:
     if isinstance(getattr(owner, key), tuple) and not isinstance(value, list):
         value = [value]  # cameras = "front" says what it means
     return dataclasses.replace(owner, **{key: getattr(from_plain({**to_plain(owner), key: value}, type(owner)), key)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Make a run or a dataset again and compare every episode to the bit.
+
+    Config and seed are read from run.json, or from what a dataset says about itself; compared is what the recordings,
+    or the dataset's tables and videos, hold now. Exit code 1 when an episode differs or cannot be read. The same
+    command again goes on where it stopped.
+
+    Examples:
+      demorec reproduce recordings/cubes --out /tmp/cubes
+      demorec reproduce datasets/cubes --out /tmp/cubes --workers 8
+    """
+
+    source: Positional[Path]
+    """A run, or a dataset that was exported from one."""
+    out: Path
+    """Folder of the new run."""
+    workers: int | None = None
+    """Processes that simulate (auto: one for each core)."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes of this machine, or tasks of a Ray cluster."""
+    address: str = "local"
+    """Ray: the cluster, for example auto or HOST:6379; local: this machine alone."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the source names."""
+
+    def run(self) -> int:
+        """Generate again, compare, report."""
+        from demorec.generate.options import RunOptions
+        from demorec.generate.reproduce import Reproduction, reproduce
+
+        options = RunOptions(
+            out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
+        )
+        options.validate()
+        refuse_inside([self.out])
+        with RunProgress() as progress:
+            found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
+        if not isinstance(found, Reproduction):
+            tell(f"Interrupted; the same command goes on: {self.out}")
+            return 130
+        total = len(found.same) + len(found.different)
+        say(f"{len(found.same)} of {total} episodes are the same to the bit: {self.source} and {found.result.folder}")
+        before = total - len(found.result.made)
+        if before > 0:
+            tell(
+                f"Note: {before} of them were in {self.out} before and were not made now: a new --out proves them, too."
+            )
+        tell(*found.faults[:10])
+        if found.different:
+            shown = ", ".join(f"{episode} (attempt {attempt})" for episode, attempt in found.different[:10])
+            tell(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}")
+            return 1
+        return 0

@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.output import aligned, counted, say, tell
 from demorec.cli.shared.progress import duration
-from demorec.cli.shared.table import aligned
 from demorec.core.processes import available_cores
 from demorec.generate.contents import set_aside
 from demorec.generate.estimate import Estimate
-from demorec.generate.observer import RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunOptions, RunResult
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 

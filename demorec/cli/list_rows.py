@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.output import say, say_json
-from demorec.cli.shared.table import aligned
+from demorec.cli.shared.output import aligned, say, say_json
 from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:

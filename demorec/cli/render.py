@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.processes import available_cores, in_turn
-from demorec.core.user_modules import modules_of
+from demorec.core.registry import modules_of
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 if TYPE_CHECKING:

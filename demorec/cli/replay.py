@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, say_json, tell
 from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar

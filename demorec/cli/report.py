@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import places_read, refuse_inside
 from demorec.cli.shared.progress import ProgressBar

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import places_read, refuse_inside, tell_unfinished
 from demorec.core.errors import ConfigError, check_option

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from demorec.core.errors import ConfigError, OptionError, check_option
 from demorec.core.plain import from_plain, leave_out_defaults
-from demorec.core.user_modules import modules_of
+from demorec.core.registry import modules_of
 from demorec.episode.variation import PRESET_NAMES, Preset, Ranges
 
 MAX_PIXELS = 16_000_000

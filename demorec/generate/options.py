@@ -1,4 +1,7 @@
-"""How a run is carried out: where, how many, by whom. None of it decides what an episode contains."""
+"""How a run is carried out (where, how many, by whom), who watches it, and what it comes to.
+
+None of it decides what an episode contains.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Literal
 
 from demorec.core.errors import ConfigError, check_option
 from demorec.datasets.lerobot.options import check_repo_id
-from demorec.runs.run_file import MAX_EPISODES
+from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile, RunSession
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +61,36 @@ class RunOptions:
                 raise ConfigError("--repo-id names the exported dataset, but --no-export leaves it out: drop one.")
 
 
-def default_out(task: str) -> Path:
-    """recordings/TASK; for somebody else's "package.module:Name", its name."""
-    return Path("recordings") / task.rpartition(":")[2]
+class RunObserver:
+    """Told how a run goes; does nothing itself."""
+
+    def verifying(self, done: int, total: int) -> None:
+        """Recordings of an earlier session are being verified."""
+
+    def started(self, run: RunFile, workers: int) -> None:
+        """The work begins; `run` knows what is there already."""
+
+    def ended(self, attempt: Attempt) -> None:
+        """An attempt has come to its end."""
+
+    def says(self, message: str) -> None:
+        """Something that a person should know."""
 
 
-def default_repo_id(task: str) -> str:
-    """local/TASK."""
-    return f"local/{task.rpartition(':')[2]}"
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """What a session has come to.
+
+    Attributes:
+        folder: Of the run.
+        run: All that is known now, earlier sessions included.
+        session: This one.
+        made: The attempts of this session.
+        interrupted: Whether Ctrl-C or SIGTERM ended it.
+    """
+
+    folder: Path
+    run: RunFile
+    session: RunSession
+    made: tuple[Attempt, ...]
+    interrupted: bool

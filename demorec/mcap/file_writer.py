@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from demorec.core.closing import Closing
 from demorec.core.errors import RecordingError
+from demorec.core.files import Closing
 from demorec.episode.episode import Outcome
 from demorec.episode.external import ExternalOutcome, Origin
 from demorec.mcap.metadata import OUTCOME, outcome_metadata

@@ -18,8 +18,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, NotAllowedError
 from demorec.core.plain import to_plain
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RUN_NAME, RunFile, save_run_file
+from demorec.runs.run_file import RUN_NAME, RunFile, inspect_recording, save_run_file
 
 SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap"))
 MODULE = "names_of_a_stranger"

@@ -33,8 +33,7 @@ from demorec.core.replacing import (
 )
 from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import reproduce as reproducing
-from demorec.generate.observer import RunObserver
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunObserver, RunOptions
 from demorec.learn.evaluate.rollouts import Settings, _open
 from demorec.runs.find import EVALUATION_NAME
 

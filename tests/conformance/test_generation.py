@@ -15,8 +15,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
 from demorec.datasets.lerobot.verify import Verifier
 from demorec.generate.export_step import export_run
-from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.mcap import SimulatedRecording
 from demorec.runs.run_file import load_run_file

@@ -20,7 +20,7 @@ from support.mcap import rewritten
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
-from demorec.generate.observer import RunResult
+from demorec.generate.options import RunResult
 from demorec.loop import Workshop
 from demorec.mcap import SimulatedRecording, recover
 from demorec.mcap.metadata import EPISODE, OUTCOME

@@ -16,8 +16,7 @@ from demorec.core.errors import GenerationError
 from demorec.generate import executor as executing
 from demorec.generate import run as running
 from demorec.generate.executor import Executor, Lost, Report, attempt_episode
-from demorec.generate.observer import RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
 
 NUM_EPISODES = 4

@@ -18,7 +18,7 @@ from support.commands import workers_of
 from support.generate import Remembers, attempts_of, expected_attempts, num_finished, run_fake
 
 from demorec.core.errors import ConfigError, DemorecError, GenerationError
-from demorec.generate.observer import RunResult
+from demorec.generate.options import RunResult
 from demorec.generate.run import GRACE_S
 from demorec.runs.run_file import load_run_file
 

@@ -26,8 +26,7 @@ from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.frames import decoded_images, frames_of
 from demorec.mcap.part_file import PartFile
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, save_run_file
+from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 from support.mcap import metadata_of
 
 Pictures = list[dict[str, CameraImages]]

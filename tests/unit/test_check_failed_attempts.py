@@ -14,9 +14,8 @@ from demorec.check.report import CheckOptions, SubjectReport, check_subjects, fi
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.core.config import GenerateConfig
-from demorec.generate.observer import RunResult
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, RunSession, save_run_file
+from demorec.generate.options import RunResult
+from demorec.runs.run_file import RunFile, RunSession, inspect_recording, save_run_file
 
 FAILED = "failed/episode_000000.attempt_0.mcap"
 

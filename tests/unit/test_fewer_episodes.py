@@ -13,8 +13,7 @@ from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.core.config import GenerateConfig
 from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import export_step
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, save_run_file
+from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 
 
 def test_the_dataset_has_what_was_asked_for_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,8 @@ import time
 
 import pytest
 
-from demorec.cli.shared.progress import ProgressBar, RunProgress
+from demorec.cli.generate import RunProgress
+from demorec.cli.shared.progress import ProgressBar
 
 
 class Clock:

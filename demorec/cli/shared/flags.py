@@ -20,6 +20,7 @@ from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
+from tyro.conf import UseAppendAction, arg
 from tyro.constructors import (
     MISSING_NONPROP,
     ConstructorRegistry,
@@ -30,6 +31,7 @@ from tyro.constructors import (
 )
 
 from demorec.cli.shared.output import say, tell
+from demorec.core.registry import check_allowed
 from demorec.core.text import printable
 
 FLAG_TYPES = ConstructorRegistry()
@@ -195,3 +197,13 @@ def _kind_beside_none(kind: Any) -> Any:
     """`X` of `X | None`; None for every other type."""
     kinds = [part for part in get_args(kind) if part is not NoneType]
     return kinds[0] if NoneType in get_args(kind) and len(kinds) == 1 else None
+
+
+Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_behavior_hint="(may be given again)")]
+"""One module or package each time, since paths may follow."""
+
+
+def allowed_modules(names: Sequence[str]) -> tuple[str, ...]:
+    """What --allow names; ConfigError where that can be no module."""
+    check_allowed(names)
+    return tuple(names)

@@ -11,12 +11,13 @@ import json
 import logging
 import os
 import sys
+from collections.abc import Iterable, Sequence
 from typing import TextIO
 
 from tqdm import tqdm
 
 from demorec.core.errors import DemorecError
-from demorec.core.text import printable
+from demorec.core.text import display_width, printable
 
 
 class OutputError(DemorecError):
@@ -72,3 +73,20 @@ class PrintableFormatter(logging.Formatter):
         """One line, or several for a traceback, each made printable."""
         level = "" if record.name.startswith("demorec.") else f"{record.levelname}: "
         return "\n".join(printable(line) for line in f"{level}{super().format(record)}".splitlines())
+
+
+def aligned(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Columns of equal width, two spaces between them, on a terminal that shows `printable` text."""
+    table = [[printable(cell) for cell in row] for row in rows]
+    widths = [max(map(display_width, column)) for column in zip(*table, strict=True)]
+    return [
+        "  ".join(cell + " " * (width - display_width(cell)) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in table
+    ]
+
+
+def size_in_words(num_bytes: int) -> str:
+    """In kB or MB."""
+    if num_bytes < 1_000_000:
+        return f"{num_bytes / 1000:.0f} kB"
+    return f"{num_bytes / 1e6:.1f} MB"

@@ -7,15 +7,11 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
-from demorec.cli.shared.output import counted, tell
-from demorec.generate.observer import RunObserver
-
-if TYPE_CHECKING:
-    from demorec.runs.run_file import Attempt, RunFile
+from demorec.cli.shared.output import tell
 
 _QUIET_S = 10.0
 """Shortest time between two lines, and before the first: what is over by then needs none."""
@@ -141,62 +137,6 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
                 left = (self._clock() - began) * (self.total - self.done) / since
                 words.insert(0, f"about {duration(left)} left")
         return ", ".join(words)
-
-
-class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
-    """How a run goes, one bar after another; a context manager.
-
-    `watch` is called with every attempt that has ended.
-    """
-
-    def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
-        self._watch = watch
-        self._bar: ProgressBar | None = None
-        self._title = ""
-        self._failed = 0
-
-    def __exit__(self, *exc: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def verifying(self, done: int, total: int) -> None:
-        """Recordings that are there already are being verified."""
-        self._show("verifying", total).set(done)
-
-    def checking(self, done: int, total: int) -> None:
-        """Run, recordings and dataset are being checked."""
-        self._show("checking", total, unit="item").set(done)
-
-    def exporting(self, done: int, total: int) -> None:
-        """Recordings are being exported."""
-        self._show("exporting", total).set(done)
-
-    def started(self, run: RunFile, workers: int) -> None:
-        """The work begins."""
-        self._show("generating", run.num_episodes, done=len(run.successes), at_once=workers)
-
-    def ended(self, attempt: Attempt) -> None:
-        """An attempt has come to its end."""
-        if self._watch is not None:
-            self._watch(attempt)
-        assert self._bar is not None  # `started` comes first
-        if attempt.success:
-            self._bar.advance()
-        else:
-            self._failed += 1
-            self._bar.note(counted(self._failed, "failed attempt"))
-
-    def says(self, message: str) -> None:
-        """Something that a person should know."""
-        tell(message)
-
-    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode", at_once: int = 1) -> ProgressBar:
-        if self._bar is None or title != self._title:
-            if self._bar is not None:
-                self._bar.close()
-            self._title = title
-            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
-        return self._bar
 
 
 def duration(seconds: float) -> str:

@@ -14,9 +14,9 @@ from typing import Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.closing import Closing
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError, in_words
+from demorec.core.files import Closing
 from demorec.core.registry import nearest_match
 from demorec.episode.external import (
     Camera,
@@ -30,8 +30,15 @@ from demorec.mcap import EpisodeWriter
 from demorec.mcap.external.frame_check import SampledFrameCheck
 from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.recorder.coder import Buffers, Coder, WaitingPictures, WhenFull
-from demorec.mcap.recorder.robot import RobotLike, robot_facts
-from demorec.mcap.recorder.vectors import NamedVectors, Vectors, as_declared, features_of, named_vectors
+from demorec.mcap.recorder.vectors import (
+    NamedVectors,
+    RobotLike,
+    Vectors,
+    as_declared,
+    features_of,
+    named_vectors,
+    robot_facts,
+)
 from demorec.mcap.video import size_problem
 from demorec.runs.external import ExternalFolder, open_external_run
 
