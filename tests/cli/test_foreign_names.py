@@ -64,7 +64,7 @@ def recording_of(name: str, path: Path) -> Path:
 
 def run_of(name: str, folder: Path) -> Path:
     file = "episodes/episode_000000.mcap"
-    attempt = replace(inspect_recording(recording_of(name, folder / file)).attempt, file=file, success=True)
+    attempt = replace(inspect_recording(recording_of(name, folder / file))[0], file=file, success=True)
     config = GenerateConfig(task=name, robot=name, cameras=(name,))
     save_run_file(RunFile(config=config, versions={}, num_episodes=1, attempts=(attempt,)), folder)
     return folder

@@ -91,7 +91,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     from demorec.core.config import GenerateConfig
 
-    attempt = replace(inspect_recording(good).attempt, file="episodes/episode_000000.mcap")
+    attempt = replace(inspect_recording(good)[0], file="episodes/episode_000000.mcap")
     config = GenerateConfig(cameras=())
     save_run_file(RunFile(config=config, versions={}, num_episodes=1, attempts=(attempt,)), run)
     file = run / "run.json"

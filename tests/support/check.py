@@ -57,7 +57,7 @@ def simulate_run(folder: Path, num_episodes: int, **config: Any) -> Path:
     for index in range(num_episodes):
         file = f"episodes/episode_{index:06d}.mcap"
         simulate(folder / file, episode_index=index, **config)
-        attempts.append(replace(inspect_recording(folder / file).attempt, file=file))
+        attempts.append(replace(inspect_recording(folder / file)[0], file=file))
         assert attempts[-1].success
     (folder / "failed").mkdir(exist_ok=True)
     run = RunFile(config=GenerateConfig(**config), versions={}, num_episodes=num_episodes, attempts=tuple(attempts))

@@ -101,7 +101,7 @@ class Odd:
         self.filmed = write_episode(
             good / "filmed.mcap", num_frames=6, cameras=("front",), width=32, height=32, depth=True, segmentation=True
         )
-        attempt = inspect_recording(self.plain).attempt
+        attempt = inspect_recording(self.plain)[0]
         config = GenerateConfig(cameras=())
         from dataclasses import replace
 
