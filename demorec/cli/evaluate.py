@@ -31,45 +31,44 @@ class RolloutFlags:
     policy: Path | None = None
     """Output folder of lerobot-train, or a pretrained_model folder."""
     task: str = "pick_place"
-    """A name of `demorec list tasks`, or my_package.my_module:MyTask."""
+    """A name from `demorec list tasks`, or my_package.my_module:MyTask."""
     robot: str = "panda"
-    """A name of `demorec list robots`, or my_package.my_module:MY_ARM."""
+    """A name from `demorec list robots`, or my_package.my_module:MY_ARM."""
     cameras: tuple[str, ...] = ()
-    """Those of your own that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
+    """Cameras of your own that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
     num_episodes: int = 50
-    """How many scenes."""
+    """Number of scenes."""
     seed: int = 0
-    """Root of the scenes; with another split than eval take another one than the dataset's."""
+    """Root seed of the scenes; unless --split is eval, choose another one than the dataset's."""
     out: Path | None = None
-    """Folder of the results (auto: one for each task)."""
+    """Folder for the results (auto: one per task)."""
     action: str | None = None
     """joint, joint_increment, ee or ee_delta (auto: as in the dataset that the policy was trained on)."""
     action_steps: int | None = None
-    """Actions that are executed before the policy looks again (auto: as trained)."""
+    """Actions to execute before the policy is queried again (auto: as trained)."""
     episode_length: int | None = None
-    """Time limit in frames (auto: 15 s for each object to be moved)."""
+    """Time limit in frames (auto: 15 s per object to be moved)."""
     fps: int = 30
-    """Frames per second, those of the dataset."""
+    """Frames per second, as in the dataset."""
     variation: Literal["none", "mild", "full"] = "mild"
-    """How much the scenes differ, as of generate-dataset."""
+    """How much the scenes vary, as in generate-dataset."""
     renderer: str | None = None
-    """For a policy that looks at pictures (auto: that of generate-dataset)."""
+    """Renderer for a policy that uses images (auto: that of generate-dataset)."""
     video: VideoConfig = field(default_factory=VideoConfig)
-    """Coding of the recorded pictures."""
+    """Encoding of the recorded images."""
     workers: int | None = None
-    """Processes (auto: one for each core)."""
+    """Processes (auto: one per core)."""
     allow: Allow = ()
     """A module or package of your own that may be imported for the cameras and steps that the policy names."""
     overwrite: bool = False
-    """Delete what the same command made in the output folder, and begin anew."""
+    """Delete what this command made in the output folder before and start again."""
     split: Split = "eval"
-    """As of generate-dataset."""
+    """As in generate-dataset."""
 
     def carry_out(self, policy: Path, out: Path, *, title: str, takeover: TakeOver | None = None) -> Evaluation:
         """Let a policy act in every scene; the recordings go to `out`."""
         check_option("num_episodes", self.num_episodes, 1, 1_000_000)
-        if self.workers is not None:
-            check_option("workers", self.workers, 1, 1024)
+        check_option("workers", self.workers, 1, 1024)
         refuse_inside([out])
         from demorec.core.processes import available_cores
         from demorec.core.registry import check_choice
@@ -117,11 +116,11 @@ class RolloutFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(RolloutFlags):
-    """Run a policy that LeRobot saved over held-out scenes: success rate, where it fails, every rollout recorded.
+    """Run a policy saved by LeRobot on held-out scenes: success rate, where it fails, every rollout recorded.
 
-    Success is the task's own strict conditions, held for five frames. The same command again goes on where it
-    stopped. The scenes are those of lerobot-eval with --env.split and --env.scene_seed, numbered from 0 here and from
-    its --seed there.
+    An episode succeeds when the task's own strict conditions hold for five frames. Run the same command again to
+    continue where it stopped. The scenes are those of lerobot-eval with --env.split and --env.scene_seed, numbered from
+    0 here and from its --seed there.
 
     Examples:
       demorec evaluate --policy outputs/train --task pick_place --num-episodes 100
@@ -131,14 +130,14 @@ class Evaluate(RolloutFlags):
     """
 
     split: Split = "eval"
-    """eval: scenes and seeds that --split train leaves out; all or train: as generate-dataset makes them."""
+    """eval: scenes and seeds that --split train excludes; all or train: as generate-dataset makes them."""
     compare: tuple[Path, Path] | None = None
     """Compare two finished evaluations instead: FOLDER FOLDER."""
     json: bool = False
     """Print the result as JSON."""
 
     def run(self) -> int:
-        """Evaluate or compare, and tell."""
+        """Evaluate or compare, and report."""
         if self.compare is not None:
             return self._compare(*self.compare)
         if self.policy is None:
@@ -160,7 +159,7 @@ class Evaluate(RolloutFlags):
         for name in ("task", "robot", "split", "seed", "variation"):
             there, here = getattr(scenes_a, name), getattr(scenes_b, name)
             if there != here:
-                raise ConfigError(f"The two were not tried on the same scenes: {name} is {there} and {here}.")
+                raise ConfigError(f"The two evaluations did not use the same scenes: {name} is {there} and {here}.")
         comparison = compare(a.successes, b.successes)
         if self.json:
             say_json(asdict(comparison))
@@ -212,12 +211,13 @@ def _compared(comparison: RateComparison, first: Path, second: Path) -> list[str
 
 @dataclass(frozen=True, kw_only=True)
 class Correct(RolloutFlags):
-    """Let a policy act until it strays, and the scripted expert finish from there: demonstrations of what it lacks.
+    """Let a policy act until it strays, then let the scripted expert finish: demonstrations of what the policy lacks.
 
-    The expert takes over when the policy strays from what the expert would do, is stuck, has had its time, or at a
-    random moment. It stops the arm, brings what the hand holds to its goal or opens it, and does what is left of the
-    task, or hands back. Every episode is one recording, in which the phase "policy" says who acted; it replays like any
-    other. The same command again goes on where it stopped. demorec improve does it in rounds with trainings.
+    The expert takes over when the policy strays from what the expert would do, gets stuck, runs out of time, or at a
+    random moment. It stops the arm, brings what the hand holds to its goal or releases it, and finishes the task or
+    hands back control. Every episode is one recording, in which the phase "policy" marks the policy's frames; it can be
+    replayed like any other. Run the same command again to continue where it stopped. demorec improve alternates this
+    with training.
 
     Examples:
       demorec correct --policy outputs/train --num-episodes 100 --seed 1 --out fix1
@@ -226,12 +226,12 @@ class Correct(RolloutFlags):
     """
 
     split: Split = "train"
-    """train and all: scenes as generate-dataset makes them, take another --seed than the dataset's; eval: held out."""
+    """train or all: scenes as generate-dataset makes them (with another --seed than the dataset's); eval: held out."""
     takeover: TakeOver = field(default_factory=TakeOver)
     """When the expert takes over."""
 
     def run(self) -> int:
-        """Let both act, and tell."""
+        """Let both act, and report."""
         if self.policy is None:
             raise ConfigError("There is no policy to correct: give --policy FOLDER.")
         self.takeover.validate()

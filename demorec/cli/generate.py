@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 class Generate:
     """Generate scripted demonstrations: simulate, record (MCAP), export (LeRobot), check.
 
-    The same command again goes on where it stopped; a larger --num-episodes extends the run, a smaller one is content
-    with its first episodes and leaves the others where they are. Episodes are a pure
-    function of the options below and the seed: the same for any number of workers, any executor and any order.
+    Run the same command again to continue where it stopped. A larger --num-episodes extends the run; a smaller one
+    uses its first episodes and leaves the others where they are. The episodes depend on the episode options and the
+    seed alone: they are the same for any number of workers, any executor and any order.
 
     Examples:
       generate-dataset --num-episodes 50 --out recordings/cubes
-      generate-dataset --config run.toml --seed 7        (a flag wins over the file)
+      generate-dataset --config run.toml --seed 7        (flags override the file)
       generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
       generate-dataset --num-episodes 1000 --dry-run   (time, size and success rate)
       generate-dataset --executor ray --address auto --out /shared/cubes
@@ -44,18 +44,18 @@ class Generate:
     config: Path | None = None
     """TOML file with any of the options below, without the dashes: num_episodes = 50."""
     options: Annotated[RunOptions, arg(name="run")] = field(default_factory=RunOptions)
-    """How it is carried out; leaves the data alone."""
+    """How the run is carried out; does not affect the data."""
     check: bool = True
-    """Check run, recordings and dataset at the end, without decoding pictures (demorec check decodes them)."""
+    """Check run, recordings and dataset at the end, without decoding images (demorec check does)."""
     deep_every: int = 50
-    """Make one of so many episodes again at the end, from config and seed, and compare every number and picture with
-    the recorded ones (demorec check --deep does it with all); 0: none."""
+    """At the end, make every Nth episode again from config and seed and compare every number and image with the
+    recording (demorec check --deep does so for all); 0: none."""
     dry_run: bool = False
-    """Make a few pilot episodes in a temporary folder and tell what the whole run would take."""
+    """Make a few pilot episodes in a temporary folder and estimate time, size and success rate of the whole run."""
     view: bool = False
-    """Show the episodes in Rerun while they are made."""
+    """Show the episodes in Rerun as they are made."""
     episodes: Annotated[GenerateConfig, arg(name="episode")] = field(default_factory=GenerateConfig)
-    """What decides the data."""
+    """What determines the data."""
 
     @classmethod
     def defaults(cls, args: Sequence[str]) -> Generate:
@@ -92,7 +92,7 @@ class Generate:
             result = generate(self.episodes, options, progress=stack.enter_context(RunProgress(watch=watch)))
         if result.interrupted:
             done = f"{len(result.run.successes)} of {result.run.num_episodes}"
-            tell(f"Interrupted: {done} episodes are complete; the same command goes on: {result.folder}")
+            tell(f"Interrupted: {done} episodes are complete; run the same command again to continue: {result.folder}")
             return 130
         export, report, checked = None, None, None
         with RunProgress() as progress, terminate_as_interrupt():
@@ -108,7 +108,7 @@ class Generate:
         print_result(result, export, checked)
         if report is not None and report.not_verified:
             tell(f"Not verified: {report.not_verified}")
-        return 1 if result.run.given_up or (checked is not None and checked.failures) else 0
+        return 1 if result.run.given_up or (checked is not None and checked[1]) else 0
 
 
 class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
@@ -228,11 +228,11 @@ def _replaced(owner: Any, above: tuple[str, ...], key: str, value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
-    """Make a run or a dataset again and compare every episode to the bit.
+    """Make a run or a dataset again and check that every episode is bit-exact.
 
-    Config and seed are read from run.json, or from what a dataset says about itself; compared is what the recordings,
-    or the dataset's tables and videos, hold now. Exit code 1 when an episode differs or cannot be read. The same
-    command again goes on where it stopped.
+    Config and seed are read from run.json or from the dataset's own metadata. The new episodes are compared with what
+    the recordings, or the dataset's tables and videos, hold now. Exit code 1 if an episode differs or cannot be read.
+    Run the same command again to continue where it stopped.
 
     Examples:
       demorec reproduce recordings/cubes --out /tmp/cubes
@@ -244,13 +244,13 @@ class Reproduce:
     out: Path
     """Folder of the new run."""
     workers: int | None = None
-    """Processes that simulate (auto: one for each core)."""
+    """Processes that simulate (auto: one per core)."""
     executor: Literal["local", "ray"] = "local"
-    """Processes of this machine, or tasks of a Ray cluster."""
+    """Processes on this machine, or tasks on a Ray cluster."""
     address: str = "local"
-    """Ray: the cluster, for example auto or HOST:6379; local: this machine alone."""
+    """Ray: the cluster, for example auto or HOST:6379; local: this machine only."""
     allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras that the source names."""
+    """A module or package of your own that may be imported for the tasks, robots and cameras named in the source."""
 
     def run(self) -> int:
         """Generate again, compare, report."""
@@ -265,14 +265,15 @@ class Reproduce:
         with RunProgress() as progress:
             found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
         if not isinstance(found, Reproduction):
-            tell(f"Interrupted; the same command goes on: {self.out}")
+            tell(f"Interrupted; run the same command again to continue: {self.out}")
             return 130
         total = len(found.same) + len(found.different)
-        say(f"{len(found.same)} of {total} episodes are the same to the bit: {self.source} and {found.result.folder}")
+        say(f"{len(found.same)} of {total} episodes are bit-exact: {self.source} and {found.result.folder}")
         before = total - len(found.result.made)
         if before > 0:
             tell(
-                f"Note: {before} of them were in {self.out} before and were not made now: a new --out proves them, too."
+                f"Note: {before} of them were in {self.out} already and were not made again: use a new --out to check "
+                "them too."
             )
         tell(*found.faults[:10])
         if found.different:

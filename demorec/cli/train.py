@@ -15,10 +15,10 @@ from demorec.learn.evaluate.moments import TakeOver
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy with lerobot-train, which reads its dataset by demorec's reader: equal items, in less time.
+    """Train a policy with lerobot-train and demorec's faster dataset reader, which gives the same items.
 
-    Every other flag is lerobot-train's own and goes to it unchanged, see lerobot-train --help; so do checkpoints and
-    logs stay what they are. Datasets of others are read as well as those of demorec.
+    All other flags are passed on to lerobot-train unchanged (see lerobot-train --help); checkpoints and logs are its
+    own. Any LeRobot dataset can be read, not only demorec's.
 
     Examples:
       demorec train --config_path=examples/act_numbers.json
@@ -28,13 +28,13 @@ class Train:
     """
 
     frame_cache_mb: int = 256
-    """Decoded frames that each process keeps, in MB of 2^20 bytes; a small dataset is then decoded only once."""
+    """Cache of decoded frames in each process, in MiB; a small dataset is then decoded only once."""
     expert_only: bool = False
-    """Of corrected episodes (demorec correct, export --intervention) learn from the expert's frames alone."""
+    """In corrected episodes (demorec correct, export --intervention), learn from the expert's frames only."""
     freeze_encoder: bool = False
-    """Do not train the encoder of an ACT policy's pictures (demorec pretrain): each picture goes through it once."""
+    """Do not train the image encoder of an ACT policy (see demorec pretrain): each image is encoded only once."""
     others: tuple[str, ...] = ()
-    """What goes to lerobot-train."""
+    """Flags for lerobot-train."""
 
     def run(self) -> int:
         """Train."""
@@ -53,12 +53,12 @@ class Train:
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain:
-    """Teach the encoder of an ACT policy's pictures to see, before the policy is trained.
+    """Pretrain the image encoder of an ACT policy before the policy is trained.
 
-    It learns to tell from the pictures where the hand will be when the gripper is next told to close or to open. That
-    is read off the dataset's own poses and commands: no poses of objects are needed. What comes out is a policy folder
-    for --policy.path of demorec train. Flags that are not its own are those of lerobot-train, of which the dataset's,
-    the policy's and the seed count. A stopped call goes on with the same command.
+    From the images, it learns to predict where the hand will be when the gripper is next commanded to close or open.
+    The targets come from the dataset's own poses and commands; no object poses are needed. The result is a policy
+    folder for --policy.path of demorec train. All other flags are those of lerobot-train, of which only those about the
+    dataset, the policy and the seed matter. Run the same command again to continue where it stopped.
 
     Examples:
       demorec pretrain --config_path=examples/act_pictures.json --out outputs/eye
@@ -69,18 +69,18 @@ class Pretrain:
     out: Path
     """Folder of the policy."""
     num_updates: int = 1500
-    """Updates of the encoder's weights."""
+    """Number of updates of the encoder's weights."""
     frames_per_update: int = 64
-    """Frames of each update, with the pictures of all cameras."""
+    """Frames per update, each with the images of all cameras."""
     learning_rate: float = 1e-3
-    """At its highest; it falls along a cosine."""
+    """Peak learning rate; it decays along a cosine."""
     frame_cache_mb: int = 256
-    """Decoded frames that are kept, in MB of 2^20 bytes; a small dataset is then decoded only once."""
+    """Cache of decoded frames, in MiB; a small dataset is then decoded only once."""
     others: tuple[str, ...] = ()
-    """Flags of lerobot-train."""
+    """Flags for lerobot-train."""
 
     def run(self) -> int:
-        """Teach, and tell what was learnt."""
+        """Train the encoder and report what it has learnt."""
         check_option("num_updates", self.num_updates, 1, 10_000_000)
         check_option("frames_per_update", self.frames_per_update, 2, 65_536)
         check_option("learning_rate", self.learning_rate, 1e-7, 1.0)
@@ -115,12 +115,12 @@ class Pretrain:
 
 @dataclass(frozen=True, kw_only=True)
 class Improve:
-    """Train a policy, let the expert correct it where it strays, and train it again on everything, in rounds.
+    """Train a policy, let the expert correct it where it strays, and train again on everything, in rounds.
 
-    Round 0 learns from the demonstrations alone. In every further one the policy of the round before acts in new
-    scenes, the expert takes over (see demorec correct), and a new policy learns from the demonstrations and from what
-    the expert did in all rounds. Each policy is tried on held-out scenes. What a stopped call has left is used: the
-    same command goes on. Flags that are not its own go to lerobot-train.
+    Round 0 learns from the demonstrations alone. In each later round, the policy of the round before acts in new
+    scenes, the expert takes over (see demorec correct), and a new policy learns from the demonstrations and from the
+    expert's corrections of all rounds. Each policy is evaluated on held-out scenes. Run the same command again to
+    continue where it stopped. All other flags are passed on to lerobot-train.
 
     Examples:
       demorec improve recordings/cubes --config-path examples/act_numbers.json \\
@@ -129,41 +129,40 @@ class Improve:
     """
 
     demonstrations: Positional[Path]
-    """A run of generate-dataset with --split train, so that its scenes are not the held-out ones."""
+    """A run of generate-dataset with --split train, which excludes the held-out scenes."""
     config_path: Path
-    """Settings for lerobot-train, a JSON file; dataset, output folder and seed of it are replaced."""
+    """Settings for lerobot-train (JSON); its dataset, output folder and seed are replaced."""
     num_rounds: int = 2
-    """Rounds of corrections."""
+    """Number of rounds of corrections."""
     num_episodes: int = 50
-    """Scenes of each round in which the policy is corrected."""
+    """Scenes per round in which the policy is corrected."""
     num_scenes: int = 50
-    """Held-out scenes on which each policy is tried."""
+    """Held-out scenes on which each policy is evaluated."""
     seed: int = 1
-    """Of the trainings; the scenes of round k have the root seed of the demonstrations plus SEED + k."""
+    """Seed of the trainings; the scenes of round k use the root seed of the demonstrations plus SEED + k."""
     action: str = "joint_increment"
     """joint, joint_increment, ee or ee_delta."""
     state: str = "joint"
-    """joint or joint_ee, as of demorec export lerobot."""
+    """joint or joint_ee, as in demorec export lerobot."""
     privileged: bool = False
-    """As of demorec export lerobot: let the policy see observation.environment_state."""
+    """As in demorec export lerobot: let the policy see observation.environment_state."""
     features: tuple[str, ...] = ()
-    """As of demorec export lerobot: which features the policy learns from; all by default."""
+    """As in demorec export lerobot: the features to learn from; all by default."""
     takeover: TakeOver = field(default_factory=TakeOver)
     """When the expert takes over."""
     out: Path = Path("outputs/improve")
-    """Folder of the rounds."""
+    """Folder for the rounds."""
     workers: int | None = None
-    """Processes that simulate (auto: one for each core)."""
+    """Processes that simulate (auto: one per core)."""
     others: tuple[str, ...] = ()
-    """What goes to lerobot-train."""
+    """Flags for lerobot-train."""
 
     def run(self) -> int:
-        """Go through the rounds, and tell."""
+        """Go through the rounds and report."""
         check_option("num_rounds", self.num_rounds, 0, 1000)
         check_option("num_episodes", self.num_episodes, 1, 1_000_000)
         check_option("num_scenes", self.num_scenes, 1, 1_000_000)
-        if self.workers is not None:
-            check_option("workers", self.workers, 1, 1024)
+        check_option("workers", self.workers, 1, 1024)
         self.takeover.validate()
         refuse_inside([self.out])
         from demorec.core.processes import available_cores

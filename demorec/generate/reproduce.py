@@ -62,7 +62,7 @@ class Reproduction:
 
     Attributes:
         result: The run that was made.
-        same: Episodes and attempts whose content is the same to the bit.
+        same: Episodes and attempts whose content is the same bit for bit.
         different: Those whose content is not, or that the copy does not have.
         faults: As of `Original`.
     """

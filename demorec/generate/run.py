@@ -1,6 +1,6 @@
 """Carries a run out: plans to an executor, lines into run.json, until the asked successes are there.
 
-The driver holds one line per episode and never a picture. Everything that can go wrong ends in one sentence with
+The driver holds one line per episode and never an image. Everything that can go wrong ends in one sentence with
 all finished episodes kept; the same command goes on from there.
 """
 

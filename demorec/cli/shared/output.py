@@ -1,4 +1,4 @@
-"""The only way of the commands to a terminal: whole lines, in which nothing foreign can act.
+"""The only way of the commands to a terminal: whole lines and tables, in which nothing foreign can act.
 
 A file name, a task or a message of a recording may hold escape codes or line ends; `printable` spells them out in
 every line that is written here. `print` is forbidden in the package (ruff's T20).
@@ -85,8 +85,9 @@ def aligned(rows: Iterable[Sequence[str]]) -> list[str]:
     ]
 
 
-def size_in_words(num_bytes: int) -> str:
-    """In kB or MB."""
-    if num_bytes < 1_000_000:
-        return f"{num_bytes / 1000:.0f} kB"
-    return f"{num_bytes / 1e6:.1f} MB"
+def size_in_words(num_bytes: float) -> str:
+    """Bytes in the unit that reads best."""
+    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if num_bytes >= factor:
+            return f"{num_bytes / factor:.1f} {unit}"
+    return f"{num_bytes / 1e3:.0f} kB"
