@@ -119,8 +119,8 @@ class Evaluate(RolloutFlags):
     """Run a policy saved by LeRobot on held-out scenes: success rate, where it fails, every rollout recorded.
 
     An episode succeeds when the task's own strict conditions hold for five frames. Run the same command again to
-    continue where it stopped. The scenes are those of lerobot-eval with --env.split and --env.scene_seed, numbered from
-    0 here and from its --seed there.
+    continue where it stopped. The scenes are those of lerobot-eval with --env.split and --env.scene_seed; their numbers
+    begin at 0 here and at its --seed there.
 
     Examples:
       demorec evaluate --policy outputs/train --task pick_place --num-episodes 100
