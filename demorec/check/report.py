@@ -15,8 +15,8 @@ from demorec.check.motion import Motions
 from demorec.check.run import CheckedRun
 from demorec.core.errors import check_option, resource_error
 from demorec.core.processes import SPAWN
+from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
-from demorec.core.user_modules import is_allowed
 from demorec.episode.episode import SimulatedInfo
 from demorec.mcap import Recording
 from demorec.mcap.opening import is_external

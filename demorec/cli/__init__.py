@@ -45,20 +45,20 @@ COMMANDS: Registry[type[Command]] = Registry(
         "report": "demorec.cli.report:Report",
         "replay": "demorec.cli.replay:Replay",
         "render": "demorec.cli.render:Render",
-        "pretrain": "demorec.cli.pretrain:Pretrain",
+        "pretrain": "demorec.cli.train:Pretrain",
         "train": "demorec.cli.train:Train",
         "evaluate": "demorec.cli.evaluate:Evaluate",
-        "correct": "demorec.cli.correct:Correct",
-        "improve": "demorec.cli.improve:Improve",
-        "reproduce": "demorec.cli.reproduce:Reproduce",
+        "correct": "demorec.cli.evaluate:Correct",
+        "improve": "demorec.cli.train:Improve",
+        "reproduce": "demorec.cli.generate:Reproduce",
         "recover": "demorec.cli.recover:Recover",
         "list": "demorec.cli.list_rows:ListRows",
     },
 )
 
 
-_MAX_TOLD = 4000
-"""Characters of an error's sentence."""
+_LONGEST = 4000
+"""Of an error's sentence."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -119,7 +119,7 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
 
 def _shortened(text: str) -> str:
     """A sentence without its middle where it quotes a file at great length."""
-    return text if len(text) <= _MAX_TOLD else f"{text[: _MAX_TOLD * 3 // 4]} ... {text[-_MAX_TOLD // 4 :]}"
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST * 3 // 4]} ... {text[-_LONGEST // 4 :]}"
 
 
 def parse_command(command: type[Command], args: Sequence[str], *, prog: str) -> Command:
@@ -150,8 +150,14 @@ def _overview() -> list[str]:
     for name in COMMANDS.names():
         summary = (COMMANDS.load(name).__doc__ or "").strip().splitlines()[0]
         indent = " " * 13
-        lines += textwrap.wrap(f"{name:<10} {summary}", terminal_width(), initial_indent="  ", subsequent_indent=indent)
-    lines += ["", "generate-dataset ... is demorec generate ..."]
+        lines += textwrap.wrap(
+            f"{name:<10} {summary}",
+            terminal_width(),
+            initial_indent="  ",
+            subsequent_indent=indent,
+            break_on_hyphens=False,
+        )
+    lines += ["", "generate-dataset ... is the same as demorec generate ..."]
     return lines
 
 

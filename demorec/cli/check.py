@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.replay import demonstrations, told
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths, places_read, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar

@@ -23,9 +23,9 @@ from demorec.datasets.options import CommonOptions, ExportReport
 class Export:
     """Turn recordings into a dataset: lerobot (LeRobot v3.0) or hdf5 (robomimic).
 
-    LeRobot gets each recorded video packet as it is, HDF5 the decoded pictures; the numbers are the same. The dataset
-    appears whole or not at all; the recordings are never touched. The flags below are those of every format; a format
-    named in front of --help shows its own, too.
+    LeRobot datasets get each recorded video packet unchanged, HDF5 files the decoded images; the numbers are the same.
+    The dataset appears whole or not at all; the recordings are never touched. The flags below apply to every format;
+    name a format in front of --help to see its own flags as well.
 
     Examples:
       demorec export lerobot recordings/cubes --out cubes --repo-id me/cubes
@@ -36,16 +36,16 @@ class Export:
     """
 
     format: Annotated[Positional[str], arg(metavar="FORMAT")]
-    """Of the dataset: lerobot or hdf5."""
+    """Format of the dataset: lerobot or hdf5."""
     sources: Positional[tuple[Path, ...]]
     """Runs, recordings, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
     out: Path
-    """Folder (LeRobot) or file (HDF5) to make."""
+    """Folder (LeRobot) or file (HDF5) to create."""
     mapping: Path | None = None
     """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
     that leaves nothing to decide)."""
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
-    """How."""
+    """How to export."""
 
     @classmethod
     def defaults(cls, args: Sequence[str]) -> Export:
@@ -91,8 +91,8 @@ def _told(report: ExportReport) -> Iterator[str]:
     if report.depth_left_out:
         yield f"Distances are left out unless --depth asks for them: camera {', '.join(report.depth_left_out)}."
     if report.silent:
-        yield f"Nobody said a subtask, so nothing is written of it, in {', '.join(report.silent)}."
-    yield from (f"Pictures coded anew: camera {what}." for what in report.transcoded)
+        yield f"No subtask is known, so none is written, in {', '.join(report.silent)}."
+    yield from (f"Images re-encoded: camera {what}." for what in report.transcoded)
     if report.verified_frames:
         yield f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings."
     if report.not_verified:

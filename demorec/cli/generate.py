@@ -1,39 +1,41 @@
-"""`demorec generate`, also called `generate-dataset`: the main job."""
+"""`demorec generate`, also called `generate-dataset`: the main job. `demorec reproduce`: the same data once more."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
-from demorec.cli.shared.output import tell
+from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, read_toml
 from demorec.core.errors import ConfigError
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.registry import nearest_match
-from demorec.generate.options import RunOptions, default_out, default_repo_id
+from demorec.generate.options import RunObserver, RunOptions
 
 if TYPE_CHECKING:
-    from demorec.runs.run_file import Attempt
+    from demorec.runs.run_file import Attempt, RunFile
 
 
 @dataclass(frozen=True, kw_only=True)
 class Generate:
     """Generate scripted demonstrations: simulate, record (MCAP), export (LeRobot), check.
 
-    The same command again goes on where it stopped; a larger --num-episodes extends the run, a smaller one is content
-    with its first episodes and leaves the others where they are. Episodes are a pure
-    function of the options below and the seed: the same for any number of workers, any executor and any order.
+    Run the same command again to continue where it stopped. A larger --num-episodes extends the run; a smaller one
+    uses its first episodes and leaves the others where they are. The episodes depend on the episode options and the
+    seed alone: they are the same for any number of workers, any executor and any order.
 
     Examples:
       generate-dataset --num-episodes 50 --out recordings/cubes
-      generate-dataset --config run.toml --seed 7        (a flag wins over the file)
+      generate-dataset --config run.toml --seed 7        (flags override the file)
       generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
       generate-dataset --num-episodes 1000 --dry-run   (time, size and success rate)
       generate-dataset --executor ray --address auto --out /shared/cubes
@@ -42,18 +44,18 @@ class Generate:
     config: Path | None = None
     """TOML file with any of the options below, without the dashes: num_episodes = 50."""
     options: Annotated[RunOptions, arg(name="run")] = field(default_factory=RunOptions)
-    """How it is carried out; leaves the data alone."""
+    """How the run is carried out; does not affect the data."""
     check: bool = True
-    """Check run, recordings and dataset at the end, without decoding pictures (demorec check decodes them)."""
+    """Check run, recordings and dataset at the end, without decoding images (demorec check does)."""
     deep_every: int = 50
-    """Make one of so many episodes again at the end, from config and seed, and compare every number and picture with
-    the recorded ones (demorec check --deep does it with all); 0: none."""
+    """At the end, make every Nth episode again from config and seed and compare every number and image with the
+    recording (demorec check --deep does so for all); 0: none."""
     dry_run: bool = False
-    """Make a few pilot episodes in a temporary folder and tell what the whole run would take."""
+    """Make a few pilot episodes in a temporary folder and estimate time, size and success rate of the whole run."""
     view: bool = False
-    """Show the episodes in Rerun while they are made."""
+    """Show the episodes in Rerun as they are made."""
     episodes: Annotated[GenerateConfig, arg(name="episode")] = field(default_factory=GenerateConfig)
-    """What decides the data."""
+    """What determines the data."""
 
     @classmethod
     def defaults(cls, args: Sequence[str]) -> Generate:
@@ -67,10 +69,11 @@ class Generate:
         self.options.validate()
         if self.deep_every < 0:
             raise ConfigError(f"deep-every is {self.deep_every}, allowed are 0 (none) and more.")
+        name = self.episodes.task.rpartition(":")[2]  # of somebody else's "package.module:Name", its name
         options = replace(
             self.options,
-            out=self.options.out or default_out(self.episodes.task),
-            repo_id=self.options.repo_id or default_repo_id(self.episodes.task),
+            out=self.options.out or Path("recordings") / name,
+            repo_id=self.options.repo_id or f"local/{name}",
         )
         assert options.out is not None
         refuse_inside([options.out])
@@ -82,16 +85,14 @@ class Generate:
             return 0
 
         from demorec.cli.generate_report import check_run, print_result
-        from demorec.cli.shared.progress import RunProgress
-        from demorec.generate.interrupts import terminate_as_interrupt
-        from demorec.generate.run import generate
+        from demorec.generate.run import generate, terminate_as_interrupt
 
         with ExitStack() as stack:
             watch = stack.enter_context(_viewer(options.out)) if self.view else None
             result = generate(self.episodes, options, progress=stack.enter_context(RunProgress(watch=watch)))
         if result.interrupted:
             done = f"{len(result.run.successes)} of {result.run.num_episodes}"
-            tell(f"Interrupted: {done} episodes are complete; the same command goes on: {result.folder}")
+            tell(f"Interrupted: {done} episodes are complete; run the same command again to continue: {result.folder}")
             return 130
         export, report, checked = None, None, None
         with RunProgress() as progress, terminate_as_interrupt():
@@ -107,7 +108,63 @@ class Generate:
         print_result(result, export, checked)
         if report is not None and report.not_verified:
             tell(f"Not verified: {report.not_verified}")
-        return 1 if result.run.given_up or (checked is not None and checked.failures) else 0
+        return 1 if result.run.given_up or (checked is not None and checked[1]) else 0
+
+
+class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
+    """How a run goes, one bar after another; a context manager.
+
+    `watch` is called with every attempt that has ended.
+    """
+
+    def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
+        self._watch = watch
+        self._bar: ProgressBar | None = None
+        self._title = ""
+        self._failed = 0
+
+    def __exit__(self, *exc: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def verifying(self, done: int, total: int) -> None:
+        """Recordings that are there already are being verified."""
+        self._show("verifying", total).set(done)
+
+    def checking(self, done: int, total: int) -> None:
+        """Run, recordings and dataset are being checked."""
+        self._show("checking", total, unit="item").set(done)
+
+    def exporting(self, done: int, total: int) -> None:
+        """Recordings are being exported."""
+        self._show("exporting", total).set(done)
+
+    def started(self, run: RunFile, workers: int) -> None:
+        """The work begins."""
+        self._show("generating", run.num_episodes, done=len(run.successes), at_once=workers)
+
+    def ended(self, attempt: Attempt) -> None:
+        """An attempt has come to its end."""
+        if self._watch is not None:
+            self._watch(attempt)
+        assert self._bar is not None  # `started` comes first
+        if attempt.success:
+            self._bar.advance()
+        else:
+            self._failed += 1
+            self._bar.note(counted(self._failed, "failed attempt"))
+
+    def says(self, message: str) -> None:
+        """Something that a person should know."""
+        tell(message)
+
+    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode", at_once: int = 1) -> ProgressBar:
+        if self._bar is None or title != self._title:
+            if self._bar is not None:
+                self._bar.close()
+            self._title = title
+            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
+        return self._bar
 
 
 @contextmanager
@@ -167,3 +224,60 @@ def _replaced(owner: Any, above: tuple[str, ...], key: str, value: Any) -> Any:
     if isinstance(getattr(owner, key), tuple) and not isinstance(value, list):
         value = [value]  # cameras = "front" says what it means
     return dataclasses.replace(owner, **{key: getattr(from_plain({**to_plain(owner), key: value}, type(owner)), key)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Make a run or a dataset again and check that every episode is bit-exact.
+
+    Config and seed are read from run.json or from the dataset's own metadata. The new episodes are compared with what
+    the recordings, or the dataset's tables and videos, hold now. Exit code 1 if an episode differs or cannot be read.
+    Run the same command again to continue where it stopped.
+
+    Examples:
+      demorec reproduce recordings/cubes --out /tmp/cubes
+      demorec reproduce datasets/cubes --out /tmp/cubes --workers 8
+    """
+
+    source: Positional[Path]
+    """A run, or a dataset that was exported from one."""
+    out: Path
+    """Folder of the new run."""
+    workers: int | None = None
+    """Processes that simulate (auto: one per core)."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes on this machine, or tasks on a Ray cluster."""
+    address: str = "local"
+    """Ray: the cluster, for example auto or HOST:6379; local: this machine only."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras named in the source."""
+
+    def run(self) -> int:
+        """Generate again, compare, report."""
+        from demorec.generate.options import RunOptions
+        from demorec.generate.reproduce import Reproduction, reproduce
+
+        options = RunOptions(
+            out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
+        )
+        options.validate()
+        refuse_inside([self.out])
+        with RunProgress() as progress:
+            found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
+        if not isinstance(found, Reproduction):
+            tell(f"Interrupted; run the same command again to continue: {self.out}")
+            return 130
+        total = len(found.same) + len(found.different)
+        say(f"{len(found.same)} of {total} episodes are bit-exact: {self.source} and {found.result.folder}")
+        before = total - len(found.result.made)
+        if before > 0:
+            tell(
+                f"Note: {before} of them were in {self.out} already and were not made again: use a new --out to check "
+                "them too."
+            )
+        tell(*found.faults[:10])
+        if found.different:
+            shown = ", ".join(f"{episode} (attempt {attempt})" for episode, attempt in found.different[:10])
+            tell(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}")
+            return 1
+        return 0

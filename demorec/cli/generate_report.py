@@ -1,4 +1,4 @@
-"""What a person sees of a run in the end: a table of what there is, and the commands that come next."""
+"""What a person sees at the end of a run: a table of what there is, and the commands that come next."""
 
 from __future__ import annotations
 
@@ -6,49 +6,30 @@ import shlex
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.progress import duration
-from demorec.cli.shared.table import aligned
 from demorec.core.processes import available_cores
 from demorec.generate.contents import set_aside
 from demorec.generate.estimate import Estimate
-from demorec.generate.observer import RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunOptions, RunResult
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClosingChecks:
-    """What the checks at the end have found.
-
-    Attributes:
-        subjects: How many recordings, runs and datasets were checked.
-        warnings: How many checks gave a warning.
-        failures: One line for each check that failed.
-        failed_attempts: How many failed attempts fail checks of what they recorded, which is told but counts for
-            nothing.
-        made_again: How many episodes were made a second time and compared in every number and picture.
-    """
-
-    subjects: int
-    warnings: int
-    failures: tuple[str, ...]
-    failed_attempts: int
-    made_again: int = 0
-
-
-def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> ClosingChecks:
-    """Every check of run, recordings and dataset that needs no decoded pictures; of the episodes asked for.
+def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> tuple[str, list[str]]:
+    """Every check of run, recordings and dataset that needs no decoded images; of the episodes asked for.
 
     Args:
         result: Of the run.
         deep_every: One of so many episodes is made again; 0 for none.
-        progress: Is told how many things of how many are done.
+        progress: Called with how many things of how many are done.
+
+    Returns:
+        What was found, for the closing table, and one line for each check that failed. A failed attempt that fails
+        checks of what it recorded is reported, but counts for nothing.
     """
     from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
     from demorec.replay.deep import deep_checks
@@ -75,18 +56,17 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
         warnings += again.level == "warn"
         if again.level == "fail":
             first = again.error or str(again.differences[0])
-            failures.append(f"{again.path.name}: made again it is not the same: {first}")
-    return ClosingChecks(
-        subjects=len(subjects),
-        warnings=warnings,
-        failures=tuple(failures),
-        failed_attempts=failed_attempts,
-        made_again=len(sample),
-    )
+            failures.append(f"{again.path.name}: made again, it is not the same: {first}")
+    found = [f"{len(failures)} failed" if failures else "none failed", f", {counted(warnings, 'warning')}"]
+    if failed_attempts:
+        found.append(f" (not counted: those of {counted(failed_attempts, 'failed attempt')})")
+    if sample:
+        found.append(f"; {counted(len(sample), 'episode')} made again and compared")
+    return "".join(found), failures
 
 
-def print_result(result: RunResult, export: ExportRecord | None, checked: ClosingChecks | None) -> None:
-    """The closing table."""
+def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[str, Sequence[str]] | None) -> None:
+    """The closing table, with what `check_run` returned."""
     run, folder = result.run, result.folder
     attempts = run.attempts
     first_tries = sum(a.success and a.attempt == 0 for a in attempts)
@@ -100,12 +80,12 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: Closin
         ),
         ("success", f"{first_tries} of {tried} at the first try" + _failures(run)),
         ("frames", f"{frames} ({frames / run.config.fps:.1f} s at {run.config.fps} fps)"),
-        ("recordings", f"{megabytes(size)} in {folder / EPISODES}"),
+        ("recordings", f"{size_in_words(size)} in {folder / EPISODES}"),
     ]
     if export is not None:
         target = folder / DATASET
         dataset_bytes = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
-        rows.append(("dataset", f"{megabytes(dataset_bytes)} in {target} (repo id {export.repo_id})"))
+        rows.append(("dataset", f"{size_in_words(dataset_bytes)} in {target} (repo id {export.repo_id})"))
     if seconds := _seconds(attempts, export):
         rows.append(("CPU seconds", seconds))
     if result.made:
@@ -119,18 +99,11 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: Closin
     if export is not None:
         rows.append(("dataset digest", export.dataset_digest))
     if checked is not None:
-        verdict = f"{len(checked.failures)} failed" if checked.failures else "none failed"
-        apart = (
-            f" (not counted: those of {counted(checked.failed_attempts, 'failed attempt')})"
-            if checked.failed_attempts
-            else ""
-        )
-        again = f"; {counted(checked.made_again, 'episode')} made again and compared" if checked.made_again else ""
-        rows.append(("checks", f"{verdict}, {counted(checked.warnings, 'warning')}{apart}{again}"))
+        rows.append(("checks", checked[0]))
     say(*aligned(rows))
     if run.successes:
         say("", "Next:", *(f"  {command}" for command in next_commands(result, export)))
-    for failure in () if checked is None else checked.failures[:10]:
+    for failure in () if checked is None else checked[1][:10]:
         tell(f"Check failed: {failure}")
     if run.given_up:
         shown = ", ".join(str(index) for index in run.given_up[:10]) + (", ..." if len(run.given_up) > 10 else "")
@@ -145,7 +118,7 @@ def next_commands(result: RunResult, export: ExportRecord | None) -> list[str]:
     folder = str(result.folder)
     allow = [word for module in result.run.config.modules for word in ("--allow", module)]
     commands = [[_program("demorec"), name, folder, *allow] for name in ("view", "check")]
-    # LeRobot's policies take pictures, or an environment state that this dataset does not have.
+    # LeRobot's policies take images, or an environment state that this dataset does not have.
     if export is not None and result.run.config.cameras and find_spec("torch") and find_spec("lerobot"):
         commands.append(
             [
@@ -162,14 +135,6 @@ def next_commands(result: RunResult, export: ExportRecord | None) -> list[str]:
 def _program(name: str) -> str:
     """What starts it from the user's shell: its path where PATH does not lead to it."""
     return name if shutil.which(name) else str(Path(sys.executable).with_name(name))
-
-
-def megabytes(count: float) -> str:
-    """Bytes in the unit that reads best."""
-    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
-        if count >= factor:
-            return f"{count / factor:.1f} {unit}"
-    return f"{count / 1e3:.1f} kB"
 
 
 def _failures(run: RunFile) -> str:
@@ -197,9 +162,9 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
     workers = counted(estimate.workers, "worker")
     if options.executor == "local" and estimate.workers > cores:
         workers += f" on {cores} cores: at least {duration(estimate.seconds * estimate.workers / cores)}"
-    sizes = f"recording {megabytes(estimate.num_bytes)}"
+    sizes = f"recording {size_in_words(estimate.num_bytes)}"
     if estimate.dataset_bytes:
-        sizes += f" and dataset {megabytes(estimate.dataset_bytes)}"
+        sizes += f" and dataset {size_in_words(estimate.dataset_bytes)}"
     rows = [
         ("success", f"{estimate.successes} of {estimate.attempts} at the first try"),
         ("CPU s/episode", f"{each:.2f} ({stages}), {estimate.num_frames} frames"),
@@ -207,9 +172,9 @@ def print_estimate(estimate: Estimate, options: RunOptions) -> None:
             "time",
             f"{duration(estimate.seconds)} for {estimate.num_episodes} episodes with {workers}; the export is extra",
         ),
-        ("size", f"{megabytes(estimate.total_bytes)} ({sizes} an episode)"),
-        ("memory", f"{megabytes(estimate.peak_worker_bytes)} a worker"),
-        ("free disk", f"{megabytes(estimate.free_bytes)} at {options.out}"),
+        ("size", f"{size_in_words(estimate.total_bytes)} ({sizes} an episode)"),
+        ("memory", f"{size_in_words(estimate.peak_worker_bytes)} a worker"),
+        ("free disk", f"{size_in_words(estimate.free_bytes)} at {options.out}"),
     ]
     say(*aligned(rows))
     if estimate.total_bytes > estimate.free_bytes:

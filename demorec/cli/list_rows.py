@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.output import say, say_json
-from demorec.cli.shared.table import aligned
+from demorec.cli.shared.output import aligned, say, say_json
 from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ListRows:
-    """List the tasks, cameras, robots, renderers, formats of exports or checks that there are.
+    """List the available tasks, cameras, robots, renderers, export formats or checks.
 
     Examples:
       demorec list tasks
@@ -28,11 +27,11 @@ class ListRows:
     """
 
     what: Positional[Literal["tasks", "cameras", "robots", "renderers", "exporters", "checks"]]
-    """Which table."""
+    """What to list."""
     coverage: bool = False
-    """Of checks: which of them read each topic, metadata field and dataset column, and what none reads."""
+    """For checks: which of them read each topic, metadata field and dataset column, and what none of them reads."""
     json: bool = False
-    """Print JSON: a list of names and what they are."""
+    """Print JSON: a list of names and summaries."""
 
     def run(self) -> int:
         """Print one line each."""
@@ -51,7 +50,7 @@ class ListRows:
 
     def _print_coverage(self) -> int:
         if self.what != "checks":
-            raise ConfigError(f"--coverage is of checks alone, found {self.what}: demorec list checks --coverage.")
+            raise ConfigError(f"--coverage is for checks only, found {self.what}: demorec list checks --coverage.")
         from demorec.check.reads import coverage
         from demorec.core.plain import to_plain
 
@@ -59,8 +58,8 @@ class ListRows:
         if self.json:
             say_json([to_plain(row) for row in rows])
         else:
-            told = ((row.kind, row.name, ", ".join(row.checks) or f"no check: {row.why_not}") for row in rows)
-            say(*aligned(told))
+            lines = ((row.kind, row.name, ", ".join(row.checks) or f"no check: {row.why_not}") for row in rows)
+            say(*aligned(lines))
         return 0
 
 
@@ -79,4 +78,4 @@ def _first_line_of_module(registry: Registry[Any], name: str) -> str:
 
 
 _DESCRIBED: Mapping[str, Callable[[Registry[Any], str], str]] = {"robots": _robot, "renderers": _first_line_of_module}
-"""How a row is told in one line, where it does not tell itself."""
+"""How a row is described in one line, where it has no summary of its own."""

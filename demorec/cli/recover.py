@@ -14,10 +14,10 @@ from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 
 @dataclass(frozen=True, kw_only=True)
 class Recover:
-    """Turn what a crash left of a recording into an indexed one.
+    """Recover a recording that a crash cut off or damaged.
 
-    Everything whole is kept: all frames up to the last second before the crash. The damaged file stays as it is; of a
-    recording that is whole, no second one is made unless --out names it. Exits with 1 when there is nothing to keep.
+    Keeps everything that is whole: all frames up to the last second before the crash. The damaged file stays as it is.
+    A recording that is whole is not copied unless --out is given. Exit code 1 if there is nothing to keep.
 
     Examples:
       demorec recover recordings/cubes/unfinished/node-1-0/episode_000003.mcap.part
@@ -27,10 +27,10 @@ class Recover:
     file: Positional[Path]
     """An unfinished recording (NAME.mcap.part), or a finished one that was damaged."""
     out: Path | None = None
-    """The recording to be made (auto: NAME.mcap beside NAME.mcap.part; NAME.recovered.mcap beside NAME.mcap, or in
+    """The recording to write (auto: NAME.mcap beside NAME.mcap.part; NAME.recovered.mcap beside NAME.mcap, or in
     RUN/recovered where that is an episode of a run or an evaluation)."""
     overwrite: bool = False
-    """Replace the recording that is to be made, if it is there."""
+    """Replace an existing recording of that name."""
 
     def run(self) -> int:
         """Recover and say how much was kept."""

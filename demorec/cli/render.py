@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.processes import available_cores, in_turn
-from demorec.core.user_modules import modules_of
+from demorec.core.registry import modules_of
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Draw recordings anew: other cameras, sizes, renderers, looks; every number stays.
+    """Render recordings again with other cameras, sizes, renderers or looks; all numbers stay the same.
 
-    Writes new recordings that name their origin. With the recording's own cameras and looks the pictures come out
-    again to the bit, which is checked (exit code 1 when they do not). The same command again goes on where it stopped.
-    Cameras may be described in a TOML file, one table each:
+    Writes new recordings that name their origin. With the recording's own cameras and looks, the images are bit-exact,
+    which is checked (exit code 1 if they are not). Run the same command again to continue where it stopped. Cameras can
+    be described in a TOML file, one table each:
 
       [side]
       position = [0.5, 0.9, 0.5]
@@ -49,50 +49,49 @@ class Render:
     out: Path
     """Folder for the new recordings, or the name of one (.mcap)."""
     cameras: tuple[str, ...] = ()
-    """Names: of the recording, of the camera file, of `demorec list cameras`, or
-    my_package.my_module:MY_CAMERA; default: the recorded ones and all of the file."""
+    """Names from the recording, the camera file or `demorec list cameras`, or my_package.my_module:MY_CAMERA; default:
+    the recorded ones and all of the file."""
     camera_file: Path | None = None
-    """Cameras by pose and field of view (TOML)."""
+    """TOML file that describes cameras by pose and field of view."""
     width: int | None = None
-    """Of the pictures, pixels (auto: as recorded)."""
+    """Image width in pixels (auto: as recorded)."""
     height: int | None = None
-    """Of the pictures, pixels (auto: as recorded)."""
+    """Image height in pixels (auto: as recorded)."""
     renderer: str | None = None
-    """A name of `demorec list renderers` (auto: as recorded)."""
+    """A name from `demorec list renderers` (auto: as recorded)."""
     antialias: bool = True
-    """Smooth edges where the recording's were (raster only)."""
+    """Smooth edges if the recording has them (raster only)."""
     depth: bool = False
-    """Record depth pictures, too, where the recording has none."""
+    """Add depth images if the recording has none."""
     segmentation: bool = False
-    """Record segmentation pictures, too, where the recording has none."""
+    """Add segmentation images if the recording has none."""
     looks: int | None = None
     """Seed of random light, colours and textures (auto: the recorded looks)."""
     codec: Literal["h264", "av1", "jpeg"] | None = None
-    """Of the new pictures (auto: as recorded)."""
+    """Codec of the new images (auto: as recorded)."""
     gop: int | None = None
-    """Pictures from one keyframe to the next (auto: as recorded)."""
+    """Frames from one keyframe to the next (auto: as recorded)."""
     crf: int | None = None
-    """Constant rate factor, smaller is better (auto: as recorded)."""
+    """Constant rate factor, lower is better (auto: as recorded)."""
     preset: str | None = None
     """Encoder preset (auto: as recorded)."""
     jpeg_quality: int | None = None
-    """Of --codec jpeg, 1 to 100, larger is better (auto: as recorded)."""
+    """Quality for --codec jpeg, 1 to 100, higher is better (auto: as recorded)."""
     workers: int | None = None
-    """Processes (auto: one for each core)."""
+    """Processes (auto: one per core)."""
     allow: Allow = ()
     """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
     overwrite: bool = False
-    """Replace recordings that are there already."""
+    """Replace recordings that exist already."""
 
     def run(self) -> int:
-        """Draw and report."""
+        """Render and report."""
         if not self.paths:
             raise ConfigError("No path is given: name a recording or a run, e.g. demorec render recordings --out new.")
         options = self._options()
         jobs = _jobs(self.paths, self.out)
 
-        if self.workers is not None:
-            check_option("workers", self.workers, 1, 1024)
+        check_option("workers", self.workers, 1, 1024)
         workers = min(self.workers or available_cores(), len(jobs))
         reports: list[RerenderReport] = []
         try:
@@ -104,15 +103,16 @@ class Render:
                         say(f"{report.source.name}: camera {camera} differs from the recording at frame {frame}")
         except KeyboardInterrupt:
             tell(
-                f"Interrupted: {len(reports)} of {len(jobs)} recordings are drawn; the same command goes on: {self.out}"
+                f"Interrupted: {len(reports)} of {len(jobs)} recordings are rendered; run the same command again to "
+                f"continue: {self.out}"
             )
             return 130
         compared, differing = sum(len(r.compared) for r in reports), sum(len(r.differing) for r in reports)
         if kept := sum(report.was_there for report in reports):
-            say(f"{kept} of {len(jobs)} had been drawn before and are kept (--overwrite draws them again).")
-        say(f"{counted(len(jobs), 'recording')}, {sum(r.num_pictures for r in reports)} pictures: {self.out}")
+            say(f"{kept} of {len(jobs)} had been rendered before and are unchanged (--overwrite renders them again).")
+        say(f"{counted(len(jobs), 'recording')}, {sum(r.num_pictures for r in reports)} images: {self.out}")
         if compared:
-            say(f"{compared - differing} of {compared} unchanged cameras give the recorded pictures to the bit.")
+            say(f"{compared - differing} of {compared} unchanged cameras reproduce the recorded images bit-exactly.")
         return 1 if differing else 0
 
     def _options(self) -> RerenderOptions:
@@ -122,8 +122,7 @@ class Render:
 
         if self.renderer is not None:
             RENDERERS.check_name(self.renderer)
-        if self.looks is not None:
-            check_option("looks", self.looks, 0, 2**63 - 1)
+        check_option("looks", self.looks, 0, 2**63 - 1)
         changes = {
             name: getattr(self, name)
             for name in ("codec", "gop", "crf", "preset", "jpeg_quality")

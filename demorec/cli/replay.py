@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, say_json, tell
 from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 class Replay:
     """Send recorded actions back into the simulator and compare every state with the recorded one.
 
-    Recordings must come out the same to the bit (on the same type of machine). Datasets hold float32 actions without
-    the exploration noise that was executed: for them the report tells success and deviations. Exit code 0: as
-    recorded (bit for bit; for a dataset, --noise, --delay or --export-hz: with the recorded outcome); 1: not.
+    Recordings must replay bit-exactly (on the same type of machine). Datasets hold float32 actions without the
+    exploration noise that was executed; for them success and deviations are reported. Exit code 0: as recorded
+    (bit-exact; for a dataset or with --noise, --delay or --export-hz: the recorded outcome); 1: not as recorded.
 
     Examples:
       demorec replay recordings/cubes/episodes/episode_000000.mcap
@@ -41,23 +41,23 @@ class Replay:
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, folders of recordings, or exported datasets."""
     episodes: str = ""
-    """Which, by their number: 0:100, ::2, 3,5,8:10; all by default."""
+    """Which episodes, by number: 0:100, ::2, 3,5,8:10; all by default."""
     states: bool = False
-    """Place the recorded states one after the other instead of sending the actions."""
+    """Set the recorded states one after another instead of sending the actions."""
     export_hz: int | None = None
-    """Send a command only so many times a second; divides the recorded rate."""
+    """Send commands at this rate; must divide the recorded rate."""
     noise: float = 0.0
-    """Standard deviation of noise on every joint target, rad."""
+    """Standard deviation of noise added to every joint target, rad."""
     delay: int = 0
-    """Steps by which every command comes late."""
+    """Delay of every command, in steps."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
     tolerance: float = 0.0
-    """Largest difference, m and rad, that still counts as recorded, for another type of machine."""
+    """Largest difference, in m and rad, that still counts as recorded; for another type of machine."""
     out: Path | None = None
-    """Folder for recordings of the replays, pictures included."""
+    """Folder for recordings of the replays, images included."""
     view: bool = False
-    """Show recording and replay over each other in Rerun."""
+    """Show recording and replay overlaid in Rerun."""
     overwrite: bool = False
     """Replace recordings in the output folder."""
     allow: Allow = ()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import places_read, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
@@ -19,11 +19,11 @@ from demorec.runs.find import EPISODE_FOLDERS, expect
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write one HTML page about a run, recordings or a dataset, to be opened from the file and passed on.
+    """Write a self-contained HTML page about a run, recordings or a dataset.
 
-    It tells outcomes, what the checks found, how the randomised ranges are covered and how states and actions are
-    distributed, and shows a filmstrip of every episode, those that failed first. It needs no network. Exit code 0 says
-    that the page was written, whatever it tells; demorec check judges.
+    It shows outcomes, the results of the checks, how the randomised ranges are covered, how states and actions are
+    distributed, and a filmstrip of every episode, failed ones first. It needs no network. Exit code 0 means that the
+    page was written, whatever the results; use demorec check for a verdict.
 
     Examples:
       demorec report recordings/cubes --out cubes.html
@@ -39,17 +39,17 @@ class Report:
     out: Path
     """The page (.html)."""
     camera: str = ""
-    """Whose pictures the filmstrips show; default: the first one."""
+    """Camera for the filmstrips; default: the first one."""
     checks: bool = True
     """Run the checks."""
     pictures: bool = False
-    """Run those checks, too, that decode all pictures."""
+    """Also run the checks that decode all images."""
     workers: int = 1
     """Processes that read and check recordings."""
     allow: Allow = ()
     """A module or package of your own beside which the models of robots and objects may be read."""
     overwrite: bool = False
-    """Replace the report that is there."""
+    """Replace an existing report."""
 
     def run(self) -> int:
         """Gather, then write."""

@@ -1,18 +1,24 @@
-"""`demorec train`: lerobot-train that waits less for its data."""
+"""`demorec train`, `demorec pretrain` and `demorec improve`: policies learn, with lerobot-train."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from demorec.cli.shared.output import tell
+from tyro.conf import Positional
+
+from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.paths import refuse_inside
+from demorec.core.errors import check_option
+from demorec.learn.evaluate.moments import TakeOver
 
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy with lerobot-train, which reads its dataset by demorec's reader: equal items, in less time.
+    """Train a policy with lerobot-train and demorec's faster dataset reader, which gives the same items.
 
-    Every other flag is lerobot-train's own and goes to it unchanged, see lerobot-train --help; so do checkpoints and
-    logs stay what they are. Datasets of others are read as well as those of demorec.
+    All other flags are passed on to lerobot-train unchanged (see lerobot-train --help); checkpoints and logs are its
+    own. Any LeRobot dataset can be read, not only demorec's.
 
     Examples:
       demorec train --config_path=examples/act_numbers.json
@@ -22,13 +28,13 @@ class Train:
     """
 
     frame_cache_mb: int = 256
-    """Decoded frames that each process keeps, in MB of 2^20 bytes; a small dataset is then decoded only once."""
+    """Cache of decoded frames in each process, in MiB; a small dataset is then decoded only once."""
     expert_only: bool = False
-    """Of corrected episodes (demorec correct, export --intervention) learn from the expert's frames alone."""
+    """In corrected episodes (demorec correct, export --intervention), learn from the expert's frames only."""
     freeze_encoder: bool = False
-    """Do not train the encoder of an ACT policy's pictures (demorec pretrain): each picture goes through it once."""
+    """Do not train the image encoder of an ACT policy (see demorec pretrain): each image is encoded only once."""
     others: tuple[str, ...] = ()
-    """What goes to lerobot-train."""
+    """Flags for lerobot-train."""
 
     def run(self) -> int:
         """Train."""
@@ -41,5 +47,153 @@ class Train:
             on_replaced=lambda: tell(replaced),
             expert_only=self.expert_only,
             freeze_encoder=self.freeze_encoder,
+        )
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pretrain:
+    """Pretrain the image encoder of an ACT policy before the policy is trained.
+
+    From the images, it learns to predict where the hand will be when the gripper is next commanded to close or open.
+    The targets come from the dataset's own poses and commands; no object poses are needed. The result is a policy
+    folder for --policy.path of demorec train. All other flags are those of lerobot-train, of which only those about the
+    dataset, the policy and the seed matter. Run the same command again to continue where it stopped.
+
+    Examples:
+      demorec pretrain --config_path=examples/act_pictures.json --out outputs/eye
+      demorec train --config_path=examples/act_pictures.json \\
+          --policy.path=outputs/eye --freeze-encoder
+    """
+
+    out: Path
+    """Folder of the policy."""
+    num_updates: int = 1500
+    """Number of updates of the encoder's weights."""
+    frames_per_update: int = 64
+    """Frames per update, each with the images of all cameras."""
+    learning_rate: float = 1e-3
+    """Peak learning rate; it decays along a cosine."""
+    frame_cache_mb: int = 256
+    """Cache of decoded frames, in MiB; a small dataset is then decoded only once."""
+    others: tuple[str, ...] = ()
+    """Flags for lerobot-train."""
+
+    def run(self) -> int:
+        """Train the encoder and report what it has learnt."""
+        check_option("num_updates", self.num_updates, 1, 10_000_000)
+        check_option("frames_per_update", self.frames_per_update, 2, 65_536)
+        check_option("learning_rate", self.learning_rate, 1e-7, 1.0)
+        check_option("frame_cache_mb", self.frame_cache_mb, 0, 1 << 20)
+        refuse_inside([self.out])
+        from demorec.learn.training.command import training_config
+
+        config = training_config(self.others)
+        from demorec.learn.training.pretrain import Teaching, pretrain
+
+        teaching = Teaching(
+            updates=self.num_updates,
+            batch_size=self.frames_per_update,
+            learning_rate=self.learning_rate,
+            seed=config.seed or 0,
+        )
+        taught = pretrain(
+            config,
+            teaching,
+            self.out,
+            frame_cache_bytes=self.frame_cache_mb << 20,
+            on_progress=lambda done, loss: tell(f"update {done:,} of {teaching.updates:,}, loss {loss:.3f}"),
+        )
+        say(
+            f"next keyframe {1000 * taught.median_m:.1f} mm off (median; 9 of 10 frames within "
+            f"{1000 * taught.most_m:.0f} mm) in {taught.episodes} episodes left out; unseen, it is "
+            f"{1000 * taught.blind_m:.0f} mm",
+            f"policy        {self.out}",
+        )
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Improve:
+    """Train a policy, let the expert correct it where it strays, and train again on everything, in rounds.
+
+    Round 0 learns from the demonstrations alone. In each later round, the policy of the round before acts in new
+    scenes, the expert takes over (see demorec correct), and a new policy learns from the demonstrations and from the
+    expert's corrections of all rounds. Each policy is evaluated on held-out scenes. Run the same command again to
+    continue where it stopped. All other flags are passed on to lerobot-train.
+
+    Examples:
+      demorec improve recordings/cubes --config-path examples/act_numbers.json \\
+          --privileged --features observation.environment_state
+      demorec improve recordings/cubes --config-path my.json --steps=2000
+    """
+
+    demonstrations: Positional[Path]
+    """A run of generate-dataset with --split train, which excludes the held-out scenes."""
+    config_path: Path
+    """Settings for lerobot-train (JSON); its dataset, output folder and seed are replaced."""
+    num_rounds: int = 2
+    """Number of rounds of corrections."""
+    num_episodes: int = 50
+    """Scenes per round in which the policy is corrected."""
+    num_scenes: int = 50
+    """Held-out scenes on which each policy is evaluated."""
+    seed: int = 1
+    """Seed of the trainings; the scenes of round k use the root seed of the demonstrations plus SEED + k."""
+    action: str = "joint_increment"
+    """joint, joint_increment, ee or ee_delta."""
+    state: str = "joint"
+    """joint or joint_ee, as in demorec export lerobot."""
+    privileged: bool = False
+    """As in demorec export lerobot: let the policy see observation.environment_state."""
+    features: tuple[str, ...] = ()
+    """As in demorec export lerobot: the features to learn from; all by default."""
+    takeover: TakeOver = field(default_factory=TakeOver)
+    """When the expert takes over."""
+    out: Path = Path("outputs/improve")
+    """Folder for the rounds."""
+    workers: int | None = None
+    """Processes that simulate (auto: one per core)."""
+    others: tuple[str, ...] = ()
+    """Flags for lerobot-train."""
+
+    def run(self) -> int:
+        """Go through the rounds and report."""
+        check_option("num_rounds", self.num_rounds, 0, 1000)
+        check_option("num_episodes", self.num_episodes, 1, 1_000_000)
+        check_option("num_scenes", self.num_scenes, 1, 1_000_000)
+        check_option("workers", self.workers, 1, 1024)
+        self.takeover.validate()
+        refuse_inside([self.out])
+        from demorec.core.processes import available_cores
+        from demorec.core.registry import check_choice
+        from demorec.episode.features import STATE_KINDS
+        from demorec.learn.evaluate.improvement import Improvement, Plan
+        from demorec.loop.actions import ACTION_KINDS
+
+        plan = Plan(
+            demonstrations=self.demonstrations,
+            config_path=self.config_path,
+            words=self.others,
+            num_rounds=self.num_rounds,
+            num_episodes=self.num_episodes,
+            num_scenes=self.num_scenes,
+            seed=self.seed,
+            action=check_choice("action", self.action, ACTION_KINDS),
+            state=check_choice("state", self.state, STATE_KINDS),
+            privileged=self.privileged,
+            features=self.features,
+            takeover=self.takeover,
+        )
+        improvement = Improvement(plan, self.out, workers=self.workers or available_cores(), tell=tell)
+        rounds = list(improvement.rounds())
+        say(
+            f"{'round':>5} {'demonstrations':>15} {'corrected':>10} {'training CPU s':>15}  success (Wilson 95 %)",
+            *(
+                f"{r.number:>5} {r.demonstrations:>15} {r.corrections:>10} {r.cpu_seconds:>15.0f}  {r.rate}"
+                for r in rounds
+            ),
+            "",
+            f"policy        {self.out / f'round_{self.num_rounds:02d}' / 'train'}",
         )
         return 0

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.allow import Allow, allowed_modules
-from demorec.cli.shared.output import say, tell
+from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.output import say, size_in_words, tell
 from demorec.cli.shared.paths import places_read, refuse_inside, tell_unfinished
 from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError, check_option
@@ -30,8 +30,8 @@ _MOST = 50
 class View:
     """Watch episodes in Rerun: recordings, runs, exported datasets, and .rrd files of --save.
 
-    Opens a window. With --save, --screenshot or --web no screen is needed. Brings the ffmpeg that Rerun needs for
-    H.264; a bare `rerun FILE.rrd` plays H.264 only where there is an ffmpeg on the PATH.
+    Opens a window; --save, --screenshot and --web need no screen. The ffmpeg that Rerun needs for H.264 is included; a
+    plain `rerun FILE.rrd` plays H.264 only if there is an ffmpeg on the PATH.
 
     Examples:
       demorec view recordings/cubes
@@ -48,30 +48,30 @@ class View:
     """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
     that leaves nothing to decide)."""
     compare: bool = False
-    """Lay two episodes over each other: the same streams in the same views, and the distance between them."""
+    """Overlay two episodes: the same streams in the same views, and the distance between them."""
     episodes: str = ""
-    """Which of them, numbered from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
+    """Which episodes, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
     include_failures: bool = False
-    """Show a run's failed attempts too."""
+    """Also show the failed attempts of a run."""
     save: Path | None = None
-    """Write an .rrd file with the layout inside instead of opening a window; several episodes: NAME-0000.rrd and on."""
+    """Write an .rrd file (layout included) instead of opening a window; several episodes: NAME-0000.rrd and so on."""
     screenshot: Path | None = None
-    """Write a picture (.png) of the viewer instead of opening a window."""
+    """Write a screenshot (.png) of the viewer instead of opening a window."""
     at: float | None = None
     """Second of the episode that the screenshot shows (auto: the middle of the first episode)."""
     size: tuple[int, int] = (1600, 950)
-    """Of the screenshot, pixels."""
+    """Width and height of the screenshot in pixels."""
     web: bool = False
-    """Serve Rerun's web viewer to this machine and print its address; Ctrl-C ends it."""
+    """Serve Rerun's web viewer on this machine and print its address; stop it with Ctrl-C."""
     port: int | None = None
-    """Of the web viewer (auto: a free one)."""
+    """Port of the web viewer (auto: a free one)."""
     allow: Allow = ()
     """A module or package of your own beside which the models of robots and objects may be read."""
     overwrite: bool = False
-    """Replace the file of --save or --screenshot, if it is there."""
+    """Replace an existing file of --save or --screenshot."""
 
     def run(self) -> int:
-        """Convert, then show, save, photograph or serve."""
+        """Convert, then show, save, take a screenshot or serve."""
         self._validate()
         allow_models(allowed_modules(self.allow))
         if any(path.suffix == ".rrd" for path in self.paths):
@@ -101,11 +101,11 @@ class View:
         if self.save is not None:
             if self.compare:
                 save_comparison(sources[0], sources[1], self.save)
-                say(f"{_size(self.save)}: {self.save}")
+                say(f"{size_in_words(self.save.stat().st_size)}: {self.save}")
             else:
                 for source, target in zip(sources, targets, strict=True):
                     save(source, target)
-                    say(f"{_size(target)}: {target}")
+                    say(f"{size_in_words(target.stat().st_size)}: {target}")
             if self.screenshot is None:
                 return 0
         missing: set[str] = set()
@@ -120,7 +120,7 @@ class View:
             code = self._show(files, sources)
         if missing:
             tell(
-                f"The picture lacks {len(missing)} characters for which Rerun's viewer without a screen has no "
+                f"The image lacks {len(missing)} characters for which Rerun's viewer without a screen has no "
                 f"font ({''.join(sorted(missing)[:20])}); the window, --web and --save keep them."
             )
         return code
@@ -128,8 +128,7 @@ class View:
     def _validate(self) -> None:
         if self.web and (self.save is not None or self.screenshot is not None):
             raise ConfigError("--web serves until Ctrl-C: give --save or --screenshot in a call of its own.")
-        if self.port is not None:
-            check_option("port", self.port, 1, 65535)
+        check_option("port", self.port, 1, 65535)
         if self.port is not None and not self.web:
             raise ConfigError("--port belongs to --web.")
         if min(self.size) < 200 or max(self.size) > 8192:
@@ -143,7 +142,7 @@ class View:
                 raise ConfigError(f"{flag}: there is no folder {target.parent}.")
 
     def _check_targets(self, saved: Sequence[Path]) -> None:
-        """Refuse to replace anything but an .rrd file by --save and a picture by --screenshot, before any work."""
+        """Refuse to replace anything but an .rrd file by --save and an image by --screenshot, before any work."""
         kinds = [(target, RERUN_FILE) for target in saved]
         kinds += [] if self.screenshot is None else [(self.screenshot, PICTURE)]
         for target, kind in kinds:
@@ -189,7 +188,3 @@ class View:
             with source.open() as episode:
                 ends.append(max(episode.num_frames - 1, 0) / episode.info.fps)
         return moment(self.at, max(ends)) if ends else self.at
-
-
-def _size(path: Path) -> str:
-    return f"{path.stat().st_size / 1e6:.1f} MB"

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from demorec.core.errors import ConfigError, OptionError, check_option
 from demorec.core.plain import from_plain, leave_out_defaults
-from demorec.core.user_modules import modules_of
+from demorec.core.registry import modules_of
 from demorec.episode.variation import PRESET_NAMES, Preset, Ranges
 
 MAX_PIXELS = 16_000_000
@@ -35,18 +35,18 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class VideoConfig:
-    """How pictures are coded, once, while recording."""
+    """How images are encoded while recording."""
 
     codec: Literal["h264", "av1", "jpeg"] = "h264"
-    """h264: plays everywhere; av1: LeRobot's default, more CPU, larger in short groups; jpeg: single pictures."""
+    """h264: plays everywhere; av1: LeRobot's default, more CPU, larger with a short GOP; jpeg: single images."""
     gop: int = 2
-    """Pictures from one keyframe to the next: 2 is LeRobot's convention for fast random access."""
+    """Frames from one keyframe to the next; 2 is LeRobot's convention for fast random access."""
     crf: int | None = None
-    """Constant rate factor, smaller is better (auto: 23 for h264, 30 for av1)."""
+    """Constant rate factor, lower is better (auto: 23 for h264, 30 for av1)."""
     preset: str | None = None
     """Encoder preset (auto: veryfast for h264, 12 for av1); x264's names, or a number from 0 to 13 for av1."""
     jpeg_quality: int = 90
-    """Of --codec jpeg, 1 to 100, larger is better."""
+    """Quality for --codec jpeg, 1 to 100, higher is better."""
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
@@ -64,51 +64,51 @@ class GenerateConfig:
     """Everything that decides what an episode contains."""
 
     task: str = "pick_place"
-    """What the robot does: a name of `demorec list tasks`, or my_package.my_module:MyTask."""
+    """What the robot does: a name from `demorec list tasks`, or my_package.my_module:MyTask."""
     fixed: bool = False
-    """The task's one exact layout instead of random ones, where it has one (tutorial)."""
+    """Use the task's single fixed layout instead of random ones, if it has one (tutorial)."""
     robot: str = "panda"
-    """Which arm: a name of `demorec list robots`, or my_package.my_module:MY_ARM."""
+    """Which arm: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
     seed: int = 0
-    """Root of all randomness."""
+    """Root seed of all randomness."""
     fps: int = 30
-    """Frames (control steps) per second; divides the physics rate."""
+    """Frames (control steps) per second; must divide the physics rate."""
     physics_hz: int = 240
     """Physics steps per second."""
     cameras: tuple[str, ...] = ("front", "wrist")
-    """Names of `demorec list cameras`, or my_package.my_module:MY_CAMERA; or "none"."""
+    """Names from `demorec list cameras`, or my_package.my_module:MY_CAMERA; or "none"."""
     width: int = 224
-    """Of the pictures, pixels; even."""
+    """Image width in pixels; even."""
     height: int = 224
-    """Of the pictures, pixels; even."""
+    """Image height in pixels; even."""
     renderer: str = "raster"
-    """A name of `demorec list renderers`."""
+    """A name from `demorec list renderers`."""
     antialias: bool = True
     """Smooth edges (raster only)."""
     depth: bool = False
-    """Record depth pictures too."""
+    """Record depth images as well."""
     segmentation: bool = False
-    """Record segmentation pictures too."""
+    """Record segmentation images as well."""
     video: VideoConfig = field(default_factory=VideoConfig)
-    """Video coding."""
+    """Video encoding."""
     variation: Preset = "mild"
-    """How much episodes differ beside their layout: none; mild adds action noise with clean labels; full all."""
+    """How much episodes vary besides their layout: none; mild (action noise with clean labels); full (everything)."""
     ranges: Ranges = field(default_factory=Ranges)
-    """Single ranges in place of those of --variation (auto: as --variation says)."""
+    """Single ranges that override those of --variation (auto: as --variation has them)."""
     interject: bool = False
-    """The expert goes for a wrong thing at first and is corrected in words, where the scene has a thing to mistake."""
+    """The expert first goes for a wrong object and is corrected in words, if the scene has one to mistake."""
     sampling: Literal["random", "sobol", "lhs"] = "random"
-    """How layouts cover the table: independently, or evenly by a Sobol sequence or Latin hypercubes."""
+    """How layouts cover the table: independently at random, or evenly by a Sobol sequence or Latin hypercubes."""
     sampling_block: int = 50
-    """Episodes in one Latin hypercube."""
+    """Episodes per Latin hypercube."""
     split: Literal["all", "train", "eval"] = "all"
-    """train leaves a region and all seeds of eval out; eval starts in that region."""
+    """train excludes a region and all seeds of eval; eval starts in that region."""
     joint_rate: Literal["control", "physics"] = "control"
-    """Joint states once a frame, or at every physics step."""
+    """Record joint states once per frame, or at every physics step."""
     max_attempts: int = 3
-    """How many scenes are tried for an episode before it is given up."""
+    """How many scenes to try for an episode before giving it up."""
     max_episode_seconds: float = 60.0
-    """Simulated seconds after which an episode ends as a failure."""
+    """Simulated seconds after which an episode counts as failed."""
 
     def __post_init__(self) -> None:
         if self.cameras == ("none",):
@@ -172,7 +172,7 @@ class GenerateConfig:
                     name, f"is {value}, but yuv420p video needs even sizes: use {value - 1} or {value + 1}."
                 )
         if self.width * self.height > MAX_PIXELS:
-            raise ConfigError(f"{self.width}x{self.height} is over {MAX_PIXELS} pixels a picture.")
+            raise ConfigError(f"{self.width}x{self.height} is over {MAX_PIXELS} pixels per image.")
         check_choice("variation", self.variation, PRESET_NAMES)
         self.ranges.validate()
         check_option("sampling_block", self.sampling_block, 2, 100_000)
@@ -196,7 +196,7 @@ class EpisodePlan:
 
 
 def deciding_versions(config: GenerateConfig | None = None) -> dict[str, str]:
-    """package -> version, of everything that decides the bits of an episode (numba draws, av codes the pictures).
+    """package -> version, of everything that decides the bits of an episode (numba draws, av codes the images).
 
     With a config, which is taken for the user's own words, also of the modules of the user's own that it names
     (`demorec.core.own_versions`).

@@ -47,9 +47,9 @@ class OptionError(ConfigError):
         return f"--{option.replace('_', '-')} {problem}"
 
 
-def check_option(option: str, value: float, low: float, high: float, unit: str = "") -> None:
-    """Raise OptionError unless low <= value <= high."""
-    if not low <= value <= high:
+def check_option(option: str, value: float | None, low: float, high: float, unit: str = "") -> None:
+    """Raise OptionError unless low <= value <= high; None, which leaves the choice to demorec, is always allowed."""
+    if value is not None and not low <= value <= high:
         least, most = (f"{limit:,}" if isinstance(limit, int) else f"{limit:g}" for limit in (low, high))
         raise OptionError(option, f"is {value}, allowed are {least} to {most}{unit and ' '}{unit}.")
 
@@ -63,7 +63,7 @@ class SceneError(DemorecError):
 
 
 class RenderError(DemorecError):
-    """A picture cannot be drawn: a shape that no renderer knows, a broken mesh, a missing OpenGL library."""
+    """An image cannot be drawn: a shape that no renderer knows, a broken mesh, a missing OpenGL library."""
 
 
 class RecordingError(DemorecError):

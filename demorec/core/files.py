@@ -1,4 +1,4 @@
-"""Files of unknown origin, opened without waiting and read within bounds.
+"""Files of unknown origin, opened without waiting and read within bounds; locks; files written in one step.
 
 A folder may hold anything under the name that is looked for: opening a FIFO waits for its other end for ever, reading
 a device never ends, and a file of some gigabytes fills the memory before anybody has looked at its first byte.
@@ -7,14 +7,19 @@ a device never ends, and a file of some gigabytes fills the memory before anybod
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
+import platform
 import stat
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, resource_error
 from demorec.core.plain import parse_json
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -133,3 +138,76 @@ def irregular_kind(mode: int) -> str:
 def _refuse_irregular(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, f"it is {irregular_kind(mode)}, not a regular file", str(path))
+
+
+class Closing(ABC):
+    """A context manager that is closed when its block ends, however that ends."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free what is held."""
+
+
+LOCK_NAME = ".lock"
+
+
+def open_locked(path: Path) -> int:
+    """Open a file for writing, made if it is not there, locked until the descriptor is closed or the process dies.
+
+    Neither a FIFO is waited for nor a link followed, since what is opened is written to.
+
+    Raises:
+        BlockingIOError: Another process holds the lock.
+        OSError: It is no regular file, or cannot be opened.
+    """
+    if os.path.lexists(path):
+        _refuse_irregular(path, path.lstat().st_mode)
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+    descriptor = os.open(path, flags, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+@contextmanager
+def run_lock(folder: Path) -> Iterator[None]:
+    """Hold `folder` for this process until the context ends or the process dies, however it dies.
+
+    The file stays: removing it would let two runs lock two different files of the same name. Child processes do
+    not inherit the lock (the descriptor is closed on exec).
+
+    Raises:
+        ConfigError: Another process holds it (which one is said), or the folder cannot be written to.
+    """
+    path = folder / LOCK_NAME
+    try:
+        descriptor = open_locked(path)
+    except BlockingIOError as error:
+        owner = read_text_limited(path, 200).strip() or "another process"
+        raise ConfigError(
+            f"Another run is writing here ({owner}): wait until it ends, or choose another --out: {folder}"
+        ) from error
+    except OSError as error:
+        if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
+            raise ConfigError(
+                f"The lock of the output folder is no file: remove it, or choose another --out: {path}"
+            ) from error
+        unusable = ConfigError(
+            f"The output folder cannot be written to ({error.strerror}): choose another --out: {folder}"
+        )
+        raise resource_error(error) or unusable from error
+    try:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode(), 0)
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,4 +1,4 @@
-"""What modules of the user's own are made of: their part in the versions that decide an episode.
+"""The versions that decide an episode, and how two runs differ; what modules of the user's own are made of.
 
 A module counts with its source and with that of what it imports of its own surroundings: modules of its own package
 and, unless it is installed, modules of the folder that it lies in. Imports are read, not carried out. The files beside
@@ -18,10 +18,11 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from demorec.core.errors import DemorecError
+from demorec.core.registry import import_root, is_allowed, split_name
 from demorec.core.tables import load_robot
-from demorec.core.user_modules import import_root, is_allowed, split_name
 from demorec.robots.assets import allow_models, asset_path, mesh_path
 
 SOURCE = "source of "
@@ -68,6 +69,45 @@ def version_differences(there: Mapping[str, str], here: Mapping[str, str]) -> tu
         else:
             lines.append(f"version of {name} is {old} there and {new} here")
     return tuple(lines)
+
+
+def differences(
+    there: Mapping[str, Any],
+    there_versions: Mapping[str, str],
+    here: Mapping[str, Any],
+    here_versions: Mapping[str, str],
+) -> tuple[str, ...]:
+    """One line for each value in which two configs, as plain data, and their versions differ."""
+    return (*plain_differences(there, here), *version_differences(there_versions, here_versions))
+
+
+def plain_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:
+    """The same for plain data."""
+    old, new = _flat(there), _flat(here)
+    return tuple(
+        f"{key} is {_spelt(old, key)} there and {_spelt(new, key)} here"
+        for key in dict.fromkeys((*old, *new))
+        if _spelt(old, key) != _spelt(new, key)
+    )
+
+
+def _flat(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in plain.items():
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{prefix}{key} "))
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _spelt(values: Mapping[str, Any], key: str) -> str:
+    if key not in values:
+        return "nothing"
+    value = values[key]
+    if isinstance(value, list | tuple):
+        return " ".join(str(item) for item in value) or "none"
+    return str(value)
 
 
 def changed_sources(versions: Mapping[str, str], allowed: Collection[str]) -> tuple[str, ...]:

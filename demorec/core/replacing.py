@@ -8,7 +8,6 @@ folder is moved aside first and deleted last.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import sys
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError
-from demorec.core.files import MCAP_MAGIC, RERUN_MAGICS, read_json_limited
+from demorec.core.files import MCAP_MAGIC, RERUN_MAGICS, open_locked, read_json_limited
 
 _SHOWN = 5
 """How many foreign files a refusal names."""
@@ -58,7 +57,7 @@ def _begins_with(*magics: bytes) -> Callable[[Path], bool]:
 
 RECORDING = ReplaceableKind(name="a recording (MCAP)", recognises=_begins_with(MCAP_MAGIC))
 RERUN_FILE = ReplaceableKind(name="a Rerun file (.rrd)", recognises=_begins_with(*RERUN_MAGICS))
-PICTURE = ReplaceableKind(name="a picture (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
+PICTURE = ReplaceableKind(name="an image (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
 REPORT_MARK = "<!doctype html>\n<!-- A report by demorec. -->\n"
 REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
 
@@ -260,12 +259,11 @@ def lock_part(part: Path, kind: ReplaceableKind) -> int:
     while True:
         if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
             raise ConfigError(f"This is no unfinished file and is in the way, move it elsewhere: {part}")
-        handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise ConfigError(f"Another process is writing this file, wait until it is done: {part}") from error
+            handle = open_locked(part)
+        except BlockingIOError as error:
+            raise ConfigError(f"Another process is writing this file, wait until it is done: {part}") from error
+        try:
             # The owner before us may have given the file its final name between the two calls.
             if not part.exists() or not os.path.samestat(os.fstat(handle), part.stat()):
                 os.close(handle)

@@ -9,8 +9,7 @@ from collections.abc import Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from demorec.core.registry import Registry
-from demorec.core.user_modules import modules_of, split_name
+from demorec.core.registry import Registry, modules_of, split_name
 from demorec.robots.assets import model_name
 
 if TYPE_CHECKING:

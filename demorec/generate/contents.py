@@ -1,19 +1,36 @@
-"""What in the folder of a run is the run's own, so that --overwrite may replace it; everything else is somebody's."""
+"""What is in the folder of a run: what is the run's own, so that --overwrite may replace it, and what can be kept.
+
+Everything else is somebody's. Every recording is verified before a run builds on it.
+"""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, DemorecError, in_words, resource_error, without_path
+from demorec.core.own_versions import differences
+from demorec.core.plain import to_plain
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, is_dataset_file
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
-from demorec.generate.survey import recordings_of
 from demorec.runs.run_file import DATASET as DATASET_FOLDER
-from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED, RunFile
+from demorec.runs.run_file import (
+    EPISODES,
+    FAILED,
+    RUN_NAME,
+    UNFINISHED,
+    Attempt,
+    RunFile,
+    free_name,
+    recording_name,
+    sha256_of,
+    sync_folder,
+)
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
 """All that a run writes; what else is in its folder is never touched."""
@@ -127,3 +144,60 @@ def _is_unfinished(name: str) -> bool:
 
 
 RUN = ReplaceableKind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)
+
+
+Inspector = Callable[[Path], tuple[Attempt, Mapping[str, Any], Mapping[str, str]]]
+"""Reads all of a recording, as `inspect_recording` does; DemorecError or OSError when it is none."""
+
+
+def recordings_of(folder: Path) -> list[Path]:
+    """Everything in episodes/ and failed/ that is named as a recording, whatever it is."""
+    return sorted(path for place in (EPISODES, FAILED) for path in (folder / place).glob("*.mcap"))
+
+
+def survey(
+    folder: Path, run: RunFile, *, inspect: Inspector, progress: Callable[[int, int], None]
+) -> tuple[list[Attempt], dict[str, str]]:
+    """Verify every recording of a folder against run.json, or read it in full where run.json does not know it.
+
+    What is damaged, unfinished, of another run or no file at all is moved to unfinished/; nothing is deleted.
+
+    Returns:
+        The attempts whose recordings are there and sound, and those that failed without one; and file -> why it was
+        moved to unfinished/.
+
+    Raises:
+        ResourceError: This machine cannot read one of them now; nothing is moved for that.
+    """
+    known = {a.file: a for a in run.known if a.file}
+    kept = [a for a in run.known if not a.file]
+    set_aside: dict[str, str] = {}
+    files = recordings_of(folder)
+    for number, path in enumerate(files):
+        file = path.relative_to(folder).as_posix()
+        line = known.get(file)
+        try:
+            if line is None:
+                line = _adopt(path, run, inspect)
+            elif path.stat().st_size != line.num_bytes or sha256_of(path) != line.sha256:
+                raise DemorecError("its bytes are not those that run.json knows")
+            kept.append(line)
+        except (DemorecError, OSError, MemoryError) as error:
+            if (lack := resource_error(error, path)) is not None:
+                raise lack from error
+            set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else in_words(error)
+            path.rename(free_name(folder / UNFINISHED / path.name))
+            sync_folder(path.parent)
+        progress(number + 1, len(files))
+    return kept, set_aside
+
+
+def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
+    line, config, versions = inspect(path)
+    place = EPISODES if line.success else FAILED
+    name = recording_name(line.episode_index, line.attempt, success=line.success)
+    if (path.parent.name, path.name) != (place, name):
+        raise DemorecError(f"it holds episode {line.episode_index}, attempt {line.attempt}")
+    if different := differences(config, versions, to_plain(run.config), run.versions):
+        raise DemorecError(f"it is of another run ({'; '.join(different)})")
+    return replace(line, file=f"{place}/{name}")

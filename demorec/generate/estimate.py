@@ -21,9 +21,9 @@ from demorec.generate.options import RunOptions
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED
 
 _MEASURED = 2
-"""Attempts with pictures: the first of a worker compiles, loads and fills caches, the second is what counts."""
+"""Attempts with images: the first of a worker compiles, loads and fills caches, the second is what counts."""
 _TRIED = 20
-"""Episodes made without pictures, to see how often they succeed: pictures do not touch the physics."""
+"""Episodes made without images, to see how often they succeed: images do not touch the physics."""
 
 
 @dataclass(frozen=True, kw_only=True)

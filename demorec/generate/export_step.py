@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.errors import DemorecError, resource_error
+from demorec.core.files import run_lock
 from demorec.core.replacing import obstacle
 from demorec.datasets.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
 from demorec.datasets.lerobot.card import has_own_card
@@ -16,7 +17,6 @@ from demorec.datasets.lerobot.inspect import check_tables
 from demorec.datasets.lerobot.paths import CARD_PATH
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.generate.contents import check_dataset_place, is_dataset_of_run
-from demorec.runs.lock import run_lock
 from demorec.runs.run_file import (
     DATASET,
     UNFINISHED,

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, GenerationError, resource_error
-from demorec.core.files import make_folder
+from demorec.core.files import LOCK_NAME, make_folder, run_lock
+from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.processes import available_cores
 from demorec.core.replacing import (
@@ -27,13 +28,9 @@ from demorec.core.replacing import (
     settle_parts,
     shown,
 )
-from demorec.generate.contents import PARTS, RUN, check_dataset_place
+from demorec.generate.contents import PARTS, RUN, Inspector, check_dataset_place, recordings_of, survey
 from demorec.generate.executor import peak_memory
-from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions
-from demorec.generate.plan import differences
-from demorec.generate.survey import Inspector, recordings_of, survey
-from demorec.runs.lock import LOCK_NAME, run_lock
+from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.runs.run_file import (
     EPISODES,
     FAILED,
@@ -278,13 +275,13 @@ def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Insp
     """The run that the first readable recording belongs to; the survey looks at each of them."""
     for file in recordings:
         try:
-            found = inspect(file)
-            config = from_plain(dict(found.config), GenerateConfig)
+            _, made_with, versions = inspect(file)
+            config = from_plain(dict(made_with), GenerateConfig)
         except (DemorecError, OSError, ValueError, MemoryError) as error:
             if (lack := resource_error(error, file)) is not None:
                 raise lack from error
             continue
-        return RunFile(config=config, versions=found.versions, num_episodes=asked.num_episodes)
+        return RunFile(config=config, versions=versions, num_episodes=asked.num_episodes)
     return asked
 
 

@@ -1,4 +1,7 @@
-"""How a run is carried out: where, how many, by whom. None of it decides what an episode contains."""
+"""How a run is carried out (where, how many, by whom), who watches it, and what it comes to.
+
+None of it decides what an episode contains.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Literal
 
 from demorec.core.errors import ConfigError, check_option
 from demorec.datasets.lerobot.options import check_repo_id
-from demorec.runs.run_file import MAX_EPISODES
+from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile, RunSession
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,35 +19,33 @@ class RunOptions:
     """Everything about a run that leaves the data alone."""
 
     out: Path | None = None
-    """Folder of the run (auto: recordings/TASK). The same command again goes on where it stopped."""
+    """Folder of the run (auto: recordings/TASK). Run the same command again to continue where it stopped."""
     num_episodes: int = 50
-    """How many successful episodes to make; a larger number extends the run, a smaller one leaves the
-    others out of it."""
+    """How many successful episodes to make; a larger number extends the run, a smaller one leaves the rest out."""
     workers: int | None = None
-    """Processes that simulate (auto: one for each core; with Ray: as many as the cluster has room for)."""
+    """Processes that simulate (auto: one per core; with Ray, as many as the cluster has room for)."""
     executor: Literal["local", "ray"] = "local"
-    """Processes of this machine, or tasks of a Ray cluster."""
+    """Processes on this machine, or tasks on a Ray cluster."""
     address: str = "local"
     """Ray: the cluster, for example auto (the one that this machine belongs to) or HOST:6379; local: this machine
-    alone."""
+    only."""
     cpus_per_worker: float = 1.0
     """Ray: CPUs that each worker reserves."""
     gpus_per_worker: float = 0.0
     """Ray: GPUs that each worker reserves (for --renderer egl)."""
     recycle_after: int = 500
-    """Episodes after which a worker process is replaced by a fresh one."""
+    """Replace a worker process by a fresh one after this many episodes."""
     export: bool = True
     """Export the successful episodes to a LeRobot dataset in OUT/dataset."""
     repo_id: str | None = None
     """Name of the dataset, OWNER/NAME (auto: local/TASK)."""
     overwrite: bool = False
-    """Delete the run that the output folder holds, and begin anew."""
+    """Delete the run in the output folder and start again."""
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
         check_option("num_episodes", self.num_episodes, 1, MAX_EPISODES)
-        if self.workers is not None:
-            check_option("workers", self.workers, 1, 100_000)
+        check_option("workers", self.workers, 1, 100_000)
         check_option("recycle_after", self.recycle_after, 1, 1_000_000)
         check_option("cpus_per_worker", self.cpus_per_worker, 0.01, 1024)
         check_option("gpus_per_worker", self.gpus_per_worker, 0, 64)
@@ -58,11 +59,36 @@ class RunOptions:
                 raise ConfigError("--repo-id names the exported dataset, but --no-export leaves it out: drop one.")
 
 
-def default_out(task: str) -> Path:
-    """recordings/TASK; for somebody else's "package.module:Name", its name."""
-    return Path("recordings") / task.rpartition(":")[2]
+class RunObserver:
+    """Told how a run goes; does nothing itself."""
+
+    def verifying(self, done: int, total: int) -> None:
+        """Recordings of an earlier session are being verified."""
+
+    def started(self, run: RunFile, workers: int) -> None:
+        """The work begins; `run` knows what is there already."""
+
+    def ended(self, attempt: Attempt) -> None:
+        """An attempt has come to its end."""
+
+    def says(self, message: str) -> None:
+        """Something that a person should know."""
 
 
-def default_repo_id(task: str) -> str:
-    """local/TASK."""
-    return f"local/{task.rpartition(':')[2]}"
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """What a session has come to.
+
+    Attributes:
+        folder: Of the run.
+        run: All that is known now, earlier sessions included.
+        session: This one.
+        made: The attempts of this session.
+        interrupted: Whether Ctrl-C or SIGTERM ended it.
+    """
+
+    folder: Path
+    run: RunFile
+    session: RunSession
+    made: tuple[Attempt, ...]
+    interrupted: bool

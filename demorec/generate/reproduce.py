@@ -25,8 +25,7 @@ from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.folder import AnotherRunError
-from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.mcap import SimulatedRecording
 from demorec.runs.find import expect
@@ -63,7 +62,7 @@ class Reproduction:
 
     Attributes:
         result: The run that was made.
-        same: Episodes and attempts whose content is the same to the bit.
+        same: Episodes and attempts whose content is the same bit for bit.
         different: Those whose content is not, or that the copy does not have.
         faults: As of `Original`.
     """

@@ -1,35 +1,34 @@
 """Carries a run out: plans to an executor, lines into run.json, until the asked successes are there.
 
-The driver holds one line per episode and never a picture. Everything that can go wrong ends in one sentence with
+The driver holds one line per episode and never an image. Everything that can go wrong ends in one sentence with
 all finished episodes kept; the same command goes on from there.
 """
 
 from __future__ import annotations
 
 import errno
+import signal
+import threading
 import time
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
+from types import FrameType
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
 from demorec.core.processes import available_cores
 from demorec.core.tables import load_robot
+from demorec.generate.contents import Inspector
 from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Lost, Made, Raised, Report
 from demorec.generate.folder import RunFolder, open_run
-from demorec.generate.interrupts import catch_interrupts
 from demorec.generate.local import LocalExecutor
-from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions
-from demorec.generate.plan import Schedule
-from demorec.generate.survey import Inspector
+from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.render.warm import warm_up_renderer
 from demorec.robots.assets import allow_models
 from demorec.robots.inertials import check_masses
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import UNFINISHED, RunFile
+from demorec.runs.run_file import UNFINISHED, Attempt, RunFile, inspect_recording
 
 MAX_LOSSES = 5
 """How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""
@@ -120,6 +119,54 @@ def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -
     return LocalExecutor(maker, folder, workers=workers, recycle_after=options.recycle_after)
 
 
+class Schedule:
+    """Which attempts are due, in which order; nothing else decides them than the run's config and what is known.
+
+    An episode's attempts follow each other (attempt n + 1 when n failed), episodes do not wait for each other.
+
+    Args:
+        run: What is known.
+        episodes: Order in which episodes are begun; the result does not depend on it.
+    """
+
+    def __init__(self, run: RunFile, *, episodes: Iterable[int] | None = None) -> None:
+        self._run = run
+        self._known = {(a.episode_index, a.attempt): a.success for a in run.attempts}
+        self._success = {a.episode_index: a.attempt for a in run.successes}
+        self._episodes = iter(range(run.num_episodes) if episodes is None else episodes)
+        self._waiting: deque[EpisodePlan] = deque()
+
+    def take(self) -> EpisodePlan | None:
+        """The next attempt, or None when none is due now (one may be after another has failed)."""
+        while not self._waiting:
+            index = next(self._episodes, None)
+            if index is None:
+                return None
+            self._waiting.extend(self._due(index))
+        return self._waiting.popleft()
+
+    def give_back(self, plan: EpisodePlan) -> None:
+        """This attempt was not carried out: it comes next."""
+        self._waiting.appendleft(plan)
+
+    def report(self, attempt: Attempt) -> None:
+        """An attempt has ended; after a failure the next one is due, up to the bound."""
+        index = attempt.episode_index
+        self._known[index, attempt.attempt] = attempt.success
+        if not attempt.success and index not in self._success:
+            self._waiting.extend(self._due(index))
+
+    def _due(self, index: int) -> Iterator[EpisodePlan]:
+        """Attempts that must be made now: the first unknown one, or those missing before a known success."""
+        success = self._success.get(index)
+        config, versions = self._run.config, self._run.versions
+        for number in range(config.max_attempts if success is None else success):
+            if (index, number) not in self._known:
+                yield EpisodePlan(config=config, episode_index=index, attempt=number, versions=versions)
+                if success is None:
+                    return
+
+
 class _Driver:
     """The loop between schedule, executor and run.json."""
 
@@ -207,3 +254,43 @@ class _Driver:
             f"Episode {report.plan.episode_index} raised {report.kind}: {report.message or 'no message'} "
             f"(the traceback is in {place}). {self._folder.kept}"
         )
+
+
+class Interrupts:
+    """How often the user has asked for the end."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Count the first, raise KeyboardInterrupt at the second."""
+        self.count += 1
+        if self.count > 1:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def catch_interrupts() -> Iterator[Interrupts]:
+    """Catch SIGINT and SIGTERM inside."""
+    interrupts = Interrupts()
+    with _handled(interrupts.handle, signal.SIGINT, signal.SIGTERM):
+        yield interrupts
+
+
+def terminate_as_interrupt() -> AbstractContextManager[None]:
+    """Inside, SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that every `finally` runs."""
+    return _handled(signal.default_int_handler, signal.SIGTERM)
+
+
+@contextmanager
+def _handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals) -> Iterator[None]:
+    """Handle signals like this inside; leaves them alone outside the main thread, where Python cannot catch them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, usual in before.items():
+            signal.signal(number, usual)

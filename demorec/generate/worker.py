@@ -22,8 +22,16 @@ from demorec.core.errors import ConfigError, SceneError
 from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, Workshop, prepare
 from demorec.mcap import SimulatedWriter
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name, sync_folder
+from demorec.runs.run_file import (
+    EPISODES,
+    FAILED,
+    STARTING,
+    UNFINISHED,
+    Attempt,
+    inspect_recording,
+    recording_name,
+    sync_folder,
+)
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)
@@ -49,7 +57,7 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
                 part.unlink()
             return _without_scene(plan, str(error), clock.seconds())
         with clock.stage(RECORDING):
-            attempt = inspect_recording(path).attempt
+            attempt, *_ = inspect_recording(path)
             file = f"{EPISODES if attempt.success else FAILED}/" + recording_name(
                 plan.episode_index, plan.attempt, success=attempt.success
             )

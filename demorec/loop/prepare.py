@@ -12,9 +12,9 @@ from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, to_plain
+from demorec.core.registry import modules_of
 from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
-from demorec.core.user_modules import modules_of
 from demorec.episode.camera_error import error_values
 from demorec.episode.episode import SimulatedInfo
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera

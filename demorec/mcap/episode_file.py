@@ -10,8 +10,8 @@ from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
-from demorec.core.closing import Closing
 from demorec.core.errors import RecordingError
+from demorec.core.files import Closing
 from demorec.core.plain import to_json, to_plain
 from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.episode.external import EpisodeInfo

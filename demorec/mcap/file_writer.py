@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from demorec.core.closing import Closing
 from demorec.core.errors import RecordingError
+from demorec.core.files import Closing
 from demorec.episode.episode import Outcome
 from demorec.episode.external import Origin
 from demorec.mcap.metadata import OUTCOME, outcome_metadata

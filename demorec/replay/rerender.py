@@ -17,10 +17,9 @@ from demorec.core.errors import ConfigError, DemorecError, NotAllowedError, Reco
 from demorec.core.files import make_folder
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, from_plain, to_json
-from demorec.core.registry import nearest_match
+from demorec.core.registry import nearest_match, split_name
 from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
-from demorec.core.user_modules import split_name
 from demorec.episode.camera_error import told_error, true_camera
 from demorec.episode.episode import Outcome, SimulatedColumns, SimulatedInfo
 from demorec.episode.scene import Scene, SceneCamera

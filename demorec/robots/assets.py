@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
-from demorec.core.user_modules import import_root, is_allowed, is_module_name, module_file
+from demorec.core.registry import import_root, is_allowed, is_module_name, module_file
 
 OWN_PREFIX = "demorec:"
 

@@ -15,12 +15,11 @@ from hashlib import sha256
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
-from demorec.core.files import make_folder, read_json_limited
+from demorec.core.files import LOCK_NAME, make_folder, read_json_limited, run_lock
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.replacing import shown
 from demorec.episode.external import EpisodeInfo
 from demorec.mcap import Recording, recover
-from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import (
     COLLECTED,
     DATASET,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import GenerateConfig
-from demorec.core.errors import ConfigError, DemorecError, in_words, resource_error
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
 from demorec.core.files import open_regular, read_json_limited, replace_text
 from demorec.core.plain import digest, from_plain, to_plain
 
@@ -286,3 +286,35 @@ def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dic
     for index in range(run.num_episodes):
         if index not in tried:
             yield {"state": "planned", "episode_index": index, "seed": run.config.seed}
+
+
+def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[str, str]]:
+    """Read all of a finished recording: nothing that run.json says of it is taken on trust.
+
+    Returns:
+        The line of run.json that it speaks for, with the bare name as its `file`; the config that it was made with, as
+        plain data; and package -> version of what decided the bits.
+
+    Raises:
+        RecordingError: It is no complete recording.
+    """
+    from demorec.mcap import SimulatedRecording  # which reading run.json alone does not need
+
+    with SimulatedRecording(path) as recording:
+        info, outcome = recording.info, recording.outcome
+        if outcome is None:
+            raise RecordingError(f"The recording was cut off by a crash: {path}")
+        attempt = Attempt(
+            episode_index=info.episode_index,
+            attempt=info.attempt,
+            seed=info.root_seed,
+            success=bool(outcome.success),
+            file=path.name,
+            sha256=sha256_of(path),
+            digest=recording.digest(),
+            num_frames=recording.num_frames,
+            num_bytes=path.stat().st_size,
+            phase=outcome.failure_phase,
+            reason=outcome.failure_reason,
+        )
+        return attempt, info.config, info.versions

@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.core.plain import from_json, to_json
+from demorec.core.registry import modules_of
 from demorec.core.tables import load_robot
-from demorec.core.user_modules import modules_of
 from demorec.loop import Episode, make_world, prepare
 from demorec.robots.assets import allow_models, asset_path
 from demorec.robots.robot import RobotSpec

@@ -14,7 +14,7 @@ import numpy as np
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import to_json
-from demorec.core.user_modules import modules_of
+from demorec.core.registry import modules_of
 from demorec.episode.episode import Frame, Outcome, SimulatedInfo
 from demorec.episode.validity import read_episode_info
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare

@@ -19,8 +19,7 @@ from support.recording import write_episode
 
 from demorec.cli import COMMANDS, main, run_command
 from demorec.mcap import SimulatedRecording
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, save_run_file
+from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 
 HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
 NAME = "\x1b[31mred\u202e.mcap"
@@ -92,7 +91,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     from demorec.core.config import GenerateConfig
 
-    attempt = replace(inspect_recording(good).attempt, file="episodes/episode_000000.mcap")
+    attempt = replace(inspect_recording(good)[0], file="episodes/episode_000000.mcap")
     config = GenerateConfig(cameras=())
     save_run_file(RunFile(config=config, versions={}, num_episodes=1, attempts=(attempt,)), run)
     file = run / "run.json"

@@ -33,8 +33,7 @@ from demorec.core.replacing import (
 )
 from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import reproduce as reproducing
-from demorec.generate.observer import RunObserver
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunObserver, RunOptions
 from demorec.learn.evaluate.rollouts import Settings, _open
 from demorec.runs.find import EVALUATION_NAME
 
@@ -455,7 +454,7 @@ def test_pictures_replace_pictures_only(place: Path, capsys: pytest.CaptureFixtu
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(place / "photo.png")
     before = files_of(place.parent)
     for source, target, word in (
-        ("alone.mcap", "thesis.png", "it is not a picture"),
+        ("alone.mcap", "thesis.png", "it is not an image"),
         ("alone.mcap", "link.png", "this command reads it"),
         ("dataset", frame, "it lies in what this command reads"),
     ):

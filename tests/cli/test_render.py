@@ -1,4 +1,4 @@
-"""`demorec render` that was ended in the middle: the same command goes on, another one is refused."""
+"""`demorec render` that was ended in the middle: the same command continues, another one is refused."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def test_the_same_command_keeps_what_is_drawn(
     with monkeypatch.context() as patch:
         patch.setattr(SimulatedWriter, "finish", until_the_second)
         assert exit_code(*command) == 130
-    assert "Interrupted: 1 of 3 recordings are drawn; the same command goes on" in capsys.readouterr().err
+    assert "Interrupted: 1 of 3 recordings are rendered; run the same command again" in capsys.readouterr().err
     before = recordings(out)
     assert len(before) == 1
     assert list((out / "episodes").glob("*.part"))  # the half file
     assert exit_code(*command) == 0
     said = capsys.readouterr().out
-    assert "1 of 3 had been drawn before and are kept" in said
-    assert "3 recordings, 12 pictures" in said
+    assert "1 of 3 had been rendered before and are unchanged" in said
+    assert "3 recordings, 12 images" in said
     after = recordings(out)
     assert before.items() <= after.items()
     assert len(after) == 3
@@ -126,7 +126,7 @@ def test_ended_from_outside_it_is_quiet_and_goes_on(tmp_path: Path, number: sign
     if number == signal.SIGINT:
         assert process.returncode == 130, errors.decode()
         assert len(lines) == 1
-        assert "the same command goes on" in lines[0]
+        assert "run the same command again" in lines[0]
     else:
         assert lines == []
     assert exit_code(*command[3:-1], 1) == 0

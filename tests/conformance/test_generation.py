@@ -15,8 +15,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
 from demorec.datasets.lerobot.verify import Verifier
 from demorec.generate.export_step import export_run
-from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.mcap import SimulatedRecording
 from demorec.runs.run_file import load_run_file
@@ -91,10 +90,10 @@ def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
     record, _ = export_run(source, repo_id="me/cubes")
     assert record.dataset_digest
     assert reproduce(source, tmp_path / "copy") == 0
-    assert f"{NUM_EPISODES} of {NUM_EPISODES} episodes are the same to the bit" in capsys.readouterr().out
+    assert f"{NUM_EPISODES} of {NUM_EPISODES} episodes are bit-exact" in capsys.readouterr().out
     # The same folder again, now against the dataset: nothing has to be simulated.
     assert reproduce(source / "dataset", tmp_path / "copy") == 0
-    assert f"{NUM_EPISODES} of {NUM_EPISODES} episodes are the same to the bit" in capsys.readouterr().out
+    assert f"{NUM_EPISODES} of {NUM_EPISODES} episodes are bit-exact" in capsys.readouterr().out
     text = (source / "run.json").read_text()
     first = reference.run.attempts[0].digest
     (source / "run.json").write_text(text.replace(first, "0" * len(first)))

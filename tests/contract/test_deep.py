@@ -20,7 +20,7 @@ from support.mcap import rewritten
 from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
-from demorec.generate.observer import RunResult
+from demorec.generate.options import RunResult
 from demorec.loop import Workshop
 from demorec.mcap import SimulatedRecording, recover
 from demorec.mcap.metadata import EPISODE, OUTCOME
@@ -413,18 +413,18 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     path = folder / "episodes" / "episode_000003.mcap"
     run = load_run_file(folder)
     result = RunResult(folder=folder, run=run, session=RunSession(started=""), made=(), interrupted=False)
-    found = check_run(result, deep_every=2, progress=lambda done, total: None)
-    assert found.made_again == 2
-    assert not [failure for failure in found.failures if "made again" in failure]
+    found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
+    assert "2 episodes made again" in found
+    assert not [failure for failure in failures if "made again" in failure]
     with SimulatedRecording(path) as recording:
         info = to_plain(recording.info)
     info["instruction"] = "Do something else."
     path.write_bytes(rewritten(path, change={EPISODE: {"info": json.dumps(info)}}))
-    found = check_run(result, deep_every=2, progress=lambda done, total: None)
-    (failure,) = (failure for failure in found.failures if "made again" in failure)
+    found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
+    (failure,) = (failure for failure in failures if "made again" in failure)
     assert failure.startswith(path.name)
     assert "info.instruction" in failure
-    assert check_run(result, deep_every=5, progress=lambda done, total: None).made_again == 0
+    assert "made again" not in check_run(result, deep_every=5, progress=lambda done, total: None)[0]
 
 
 def test_a_recording_that_a_crash_cut_off_is_compared_as_far_as_it_goes(

@@ -52,7 +52,7 @@ def test_what_is_no_longer_what_was_made(run: Path, tmp_path: Path, capsys: pyte
         main(["reproduce", str(spoilt), "--out", str(tmp_path / "copy"), "--workers", "1"])
     told = capsys.readouterr()
     assert ended.value.code == 1
-    assert told.out.startswith("2 of 5 episodes are the same to the bit")
+    assert told.out.startswith("2 of 5 episodes are bit-exact")
     assert "Note: version of pybullet is 3.2.5 there" in told.err.splitlines()[0]
     assert "Different: 1 (attempt 0), 2 (attempt 0), 3 (attempt 0)" in told.err
     for name in names[1:4]:

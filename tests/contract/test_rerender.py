@@ -196,7 +196,7 @@ def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str,
         [sys.executable, "-c", WITHOUT_SIMULATOR, *map(str, command)], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert "2 of 2 unchanged cameras give the recorded pictures to the bit" in done.stdout
+    assert "2 of 2 unchanged cameras reproduce the recorded images bit-exactly" in done.stdout
     with SimulatedRecording(source) as a, SimulatedRecording(tmp_path / "again.mcap") as b:
         for camera in a.cameras:
             assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]

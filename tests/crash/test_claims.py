@@ -100,13 +100,17 @@ def features_of_very_many_numbers(root: Path) -> None:
     (root / "meta/info.json").write_text(json.dumps(info))
 
 
-DATASETS: tuple[Callable[[Path], None], ...] = (
-    one_long_task, a_long_task_again_and_again, long_tasks_in_a_list, a_footer_that_says_little,
-    rows_of_millions_of_numbers, features_of_very_many_numbers,
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("claim", DATASETS)
+@pytest.mark.parametrize(
+    "claim",
+    [
+        pytest.param(one_long_task, marks=pytest.mark.slow),
+        a_long_task_again_and_again,
+        pytest.param(long_tasks_in_a_list, marks=pytest.mark.slow),
+        a_footer_that_says_little,
+        rows_of_millions_of_numbers,
+        features_of_very_many_numbers,
+    ],
+)
 def test_a_dataset_claims_very_much(claim: Callable[[Path], None], commands: LimitedCommands, tmp_path: Path) -> None:
     root = write_foreign(tmp_path / "dataset")
     claim(root)
@@ -119,6 +123,7 @@ def test_a_dataset_claims_very_much(claim: Callable[[Path], None], commands: Lim
     assert len(said.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_large_images_in_a_small_table(commands: LimitedCommands, tmp_path: Path) -> None:
     root = write_foreign(tmp_path / "large", length=200, size=(4000, 4000))
     assert (root / DATA).stat().st_size < 100_000
@@ -246,7 +251,7 @@ def test_the_longest_row_is_that_of_the_table(codec: str, version: Any, tmp_path
 
 def test_what_is_large_and_honest_is_read(tmp_path: Path) -> None:
     """Texts that every row repeats, images, and an hour of joints at 200 Hz."""
-    rows = 20_000
+    rows = 5_000
     said = [[f"the robot does {number % 7}" * 5] * 30 for number in range(rows)]
     noise = np.random.default_rng(0).bytes(300_000)
     table = pa.table(

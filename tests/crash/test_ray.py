@@ -19,8 +19,7 @@ from support.generate import Remembers, expected_attempts, inspect, num_finished
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
 from demorec.generate import on_ray
-from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.runs.run_file import load_run_file
 

@@ -11,7 +11,7 @@ from support.recording import write_episode
 
 from demorec.core.errors import RecordingError, ResourceError
 from demorec.mcap import container
-from demorec.runs.recordings import inspect_recording
+from demorec.runs.run_file import inspect_recording
 
 
 @pytest.mark.parametrize(
@@ -56,4 +56,4 @@ def test_nor_is_one_that_cannot_be_opened_for_too_many_open_files(tmp_path: Path
             inspect_recording(path)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
-    assert inspect_recording(path).attempt.num_frames == 5
+    assert inspect_recording(path)[0].num_frames == 5

@@ -18,9 +18,8 @@ from support.generate import Remembers, attempts_of, expected_attempts, run_fake
 from demorec.cli import main
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
-from demorec.generate import survey
-from demorec.generate.observer import RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate import contents
+from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.runs.run_file import load_run_file
 
@@ -185,7 +184,7 @@ def test_nothing_is_set_aside_for_what_the_machine_lacks(
     def fail(path: Path) -> str:
         raise error
 
-    monkeypatch.setattr(survey, "sha256_of", fail)
+    monkeypatch.setattr(contents, "sha256_of", fail)
     monkeypatch.setattr(generating, "read_text_limited", lambda path, limit: fail(path))
     with pytest.raises(ResourceError, match=words):
         run_fake(out)

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.generate.plan import Schedule, plain_differences
+from demorec.core.own_versions import plain_differences
+from demorec.generate.run import Schedule
 from demorec.runs.run_file import Attempt, RunFile
 
 MAX_ATTEMPTS = 3

@@ -26,8 +26,7 @@ from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.frames import decoded_images, frames_of
 from demorec.mcap.part_file import PartFile
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, save_run_file
+from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 from support.mcap import metadata_of
 
 Pictures = list[dict[str, CameraImages]]
@@ -58,7 +57,7 @@ def simulate_run(folder: Path, num_episodes: int, **config: Any) -> Path:
     for index in range(num_episodes):
         file = f"episodes/episode_{index:06d}.mcap"
         simulate(folder / file, episode_index=index, **config)
-        attempts.append(replace(inspect_recording(folder / file).attempt, file=file))
+        attempts.append(replace(inspect_recording(folder / file)[0], file=file))
         assert attempts[-1].success
     (folder / "failed").mkdir(exist_ok=True)
     run = RunFile(config=GenerateConfig(**config), versions={}, num_episodes=num_episodes, attempts=tuple(attempts))

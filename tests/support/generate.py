@@ -8,25 +8,23 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import DemorecError
 from demorec.core.files import read_text_limited
 from demorec.generate import run as running
-from demorec.generate.observer import RunObserver, RunResult
-from demorec.generate.options import RunOptions
+from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
-from demorec.runs.recordings import Inspected
+from demorec.runs.run_file import Attempt
 from support.makers import line_of, succeeds
 
 
-def inspect(path: Path) -> Inspected:
+def inspect(path: Path) -> tuple[Attempt, dict[str, Any], dict[str, str]]:
     """Reads a stand-in recording."""
     try:
         content = json.loads(read_text_limited(path, 100_000))
-        return Inspected(
-            attempt=line_of(path, content, path.name), config=content["config"], versions=content["versions"]
-        )
+        return line_of(path, content, path.name), content["config"], content["versions"]
     except (ValueError, KeyError) as error:
         raise DemorecError("it is no recording") from error
 

@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 
 from demorec.core.config import GenerateConfig
 from demorec.mcap import SimulatedRecording
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, save_run_file
+from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 from support.export import export
 from support.mcap import metadata_of, rewritten
 from support.recording import write_episode
@@ -102,7 +101,7 @@ class Odd:
         self.filmed = write_episode(
             good / "filmed.mcap", num_frames=6, cameras=("front",), width=32, height=32, depth=True, segmentation=True
         )
-        attempt = inspect_recording(self.plain).attempt
+        attempt = inspect_recording(self.plain)[0]
         config = GenerateConfig(cameras=())
         from dataclasses import replace
 

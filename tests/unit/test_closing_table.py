@@ -14,7 +14,7 @@ from demorec.cli import generate_report
 from demorec.cli.generate_report import next_commands
 from demorec.core.config import GenerateConfig
 from demorec.generate.contents import set_aside
-from demorec.generate.observer import RunResult
+from demorec.generate.options import RunResult
 from demorec.runs.run_file import ExportRecord, RunFile, RunSession
 
 

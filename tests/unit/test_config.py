@@ -37,7 +37,7 @@ from demorec.episode.episode import frame_time_ns
         ({"fps": 0}, "fps is 0"),
         ({"width": 225}, "even"),
         ({"height": 0}, "height is 0"),
-        ({"width": 8000, "height": 8000}, "pixels a picture"),
+        ({"width": 8000, "height": 8000}, "pixels per image"),
         ({"seed": -1}, "seed is -1"),
         ({"max_attempts": 0}, "max_attempts is 0"),
         ({"video": VideoConfig(crf=99)}, "crf is 99"),

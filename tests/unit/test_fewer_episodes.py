@@ -13,8 +13,7 @@ from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.core.config import GenerateConfig
 from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import export_step
-from demorec.runs.recordings import inspect_recording
-from demorec.runs.run_file import RunFile, save_run_file
+from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 
 
 def test_the_dataset_has_what_was_asked_for_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -22,7 +21,7 @@ def test_the_dataset_has_what_was_asked_for_last(tmp_path: Path, monkeypatch: py
     folder = make_run(tmp_path / "run", [9, 11, 10, 12], failures=[1, 3], cameras=())
     lines = []
     for path in folder.rglob("*.mcap"):
-        line = replace(inspect_recording(path).attempt, file=path.relative_to(folder).as_posix())
+        line = replace(inspect_recording(path)[0], file=path.relative_to(folder).as_posix())
         # A success after a failed attempt is the second one; the made-up recordings call all of them the first.
         lines.append(replace(line, attempt=1) if line.success and line.episode_index in (1, 3) else line)
     run = RunFile(config=GenerateConfig(), versions={}, num_episodes=2).with_attempts(lines)

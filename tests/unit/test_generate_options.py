@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from demorec.core.errors import ConfigError
 from demorec.core.processes import available_cores
-from demorec.generate.options import RunOptions, default_out, default_repo_id
+from demorec.generate.options import RunOptions
 
 
 @pytest.mark.parametrize(
@@ -37,12 +36,6 @@ def test_impossible_values_are_refused(values: dict[str, Any], message: str) -> 
 def test_possible_values_are_not() -> None:
     RunOptions(num_episodes=1, workers=3, repo_id="me/cubes").validate()
     RunOptions(executor="ray", address="auto", gpus_per_worker=0.5, cpus_per_worker=2).validate()
-
-
-def test_default_names_come_from_the_task() -> None:
-    assert default_out("pick_place") == Path("recordings/pick_place")
-    assert default_out("my.module:MyTask").name == "MyTask"
-    assert default_repo_id("my.module:MyTask") == "local/MyTask"
 
 
 def test_cores_are_those_that_this_process_may_use() -> None:

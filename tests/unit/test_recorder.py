@@ -25,7 +25,7 @@ from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.episode.external import NO_PICTURE, Camera, Feature
 from demorec.mcap import Recording
 from demorec.mcap.external.writer import EpisodeWriter
-from demorec.mcap.recorder.coder import Coder
+from demorec.mcap.recorder.encoder import Encoder
 from demorec.robots.panda import PANDA
 from demorec.runs.external import load_external_run
 
@@ -322,23 +322,29 @@ def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
 
 
 def held_up(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """The coder waits for this."""
-    go_on, write = threading.Event(), Coder._write
-    monkeypatch.setattr(Coder, "_write", lambda self, *waiting: (go_on.wait(30), write(self, *waiting)))
+    """The encoder waits for this."""
+    go_on, write = threading.Event(), Encoder._write
+
+    def waits(self: Encoder, *waiting: Any) -> None:
+        if not go_on.wait(30):
+            go_on.set()  # a test that fails shall not wait once more for every frame
+        write(self, *waiting)
+
+    monkeypatch.setattr(Encoder, "_write", waits)
     return go_on
 
 
-def test_frames_that_the_coder_cannot_take_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_that_the_encoder_cannot_take_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = held_up(monkeypatch)
     with recorder(tmp_path / "run", when_full="error") as run, run.episode() as episode:
-        with pytest.raises(RecordingError, match="cannot keep up, 15 frames wait for it: give quicker coding"):  # noqa: PT012
+        with pytest.raises(RecordingError, match="cannot keep up, 15 frames wait for it: choose quicker encoding"):  # noqa: PT012
             for _ in range(40):
                 episode.write([0.0])
         go_on.set()
     assert 15 <= load_external_run(tmp_path / "run").episodes[0].num_frames <= 16
 
 
-def test_frames_that_the_coder_cannot_take_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_that_the_encoder_cannot_take_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = held_up(monkeypatch)
     with recorder(tmp_path / "run", when_full="drop") as run, run.episode() as episode:
         taken = [episode.write([float(index)]) for index in range(50)]
@@ -351,7 +357,7 @@ def test_frames_that_the_coder_cannot_take_are_counted(tmp_path: Path, monkeypat
     assert values == [index for index, there in enumerate(taken) if there]
 
 
-def test_an_error_of_the_coder_reaches_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_encoder_reaches_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(self: EpisodeWriter) -> None:
         raise RecordingError("The recording cannot be written (No space left on device)")
 

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.cli.shared.output import OutputError, PrintableFormatter, say, tell
-from demorec.cli.shared.table import aligned
+from demorec.cli.shared.output import OutputError, PrintableFormatter, aligned, say, tell
 from demorec.core.text import display_width, printable
 
 

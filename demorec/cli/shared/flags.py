@@ -1,7 +1,7 @@
 """How the fields of a command become flags, and how its help is laid out.
 
-tyro draws the help; the rules here decide what it says: values that are optional show their type alone, a default is
-told only where it is a value, and texts are broken where the terminal ends.
+tyro draws the help; the rules here decide what it says: optional values show their type alone, a default is shown only
+where it is a value, and texts are broken where the terminal ends.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
+from tyro.conf import UseAppendAction, arg
 from tyro.constructors import (
     MISSING_NONPROP,
     ConstructorRegistry,
@@ -30,7 +32,7 @@ from tyro.constructors import (
 )
 
 from demorec.cli.shared.output import say, tell
-from demorec.core.text import printable
+from demorec.core.registry import check_allowed
 
 FLAG_TYPES = ConstructorRegistry()
 
@@ -58,36 +60,19 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: objec
         defaults: An instance whose values are the defaults, or None for those of the class.
 
     Raises:
-        SystemExit: 0 after --help, 2 after a wrong flag, which was told.
+        SystemExit: 0 after --help, 2 after a wrong flag, which is reported first.
     """
-    shown = [printable(arg) for arg in args]
-    if OTHERS not in command.__dataclass_fields__ and _has_empty_path(args):
+    takes_others = OTHERS in command.__dataclass_fields__
+    # Python would take an empty path for the current folder.
+    if not takes_others and any(not word and not before.startswith("--") for before, word in pairwise(["", *args])):
         tell(f"{prog}: one of the paths is empty (an unset variable of the shell?); the current folder is written as .")
         raise SystemExit(2)
-    try:
-        return _parse(command, args, prog=prog, defaults=defaults, say_why=shown == list(args))
-    except SystemExit as end:
-        if shown != list(args) and end.code:
-            # tyro repeats what it does not understand as it is: it is asked once more, with all of it spelt out.
-            _parse(command, shown, prog=prog, defaults=defaults, say_why=True)
-            tell(f"{prog}: the flags are wrong, see --help.")
-        for word in shown if end.code else ():
-            if word.startswith("-") and Path(word).exists():
-                tell(f"{prog}: a path that begins with a dash is written ./{word}")
-        raise
-
-
-def _has_empty_path(args: Sequence[str]) -> bool:
-    """Whether a word that is no flag's value is empty: Python would take it for the current folder."""
-    return any(not word and not before.startswith("--") for before, word in zip(["", *args], args, strict=False))
-
-
-def _parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: object, say_why: bool) -> Any:
     asks_for_help = "-h" in args or "--help" in args
     # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
-    page = io.TextIOWrapper(io.BytesIO(), encoding=codecs.lookup(sys.stdout.encoding or "utf-8").name)
+    encoding = codecs.lookup(sys.stdout.encoding or "utf-8").name
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
     try:
-        with FLAG_TYPES, redirect_stdout(page):
+        with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err):
             parsed = tyro.cli(  # type: ignore[call-overload]  # which knows True and False, but no bool
                 command,
                 args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
@@ -95,20 +80,23 @@ def _parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: obje
                 description=inspect.cleandoc(command.__doc__ or ""),
                 default=MISSING_NONPROP if defaults is None else defaults,
                 config=(tyro.conf.OmitArgPrefixes,),
-                console_outputs=say_why or asks_for_help,
-                return_unknown_args=OTHERS in command.__dataclass_fields__,
+                return_unknown_args=takes_others,
             )
-    except SystemExit:
-        page.seek(0)
-        say(*laid_out(page.read(), terminal_width()))
+    except SystemExit as end:
+        for page, write in ((out, say), (err, tell)):  # tyro repeats what it does not understand as it is
+            page.seek(0)
+            write(*_laid_out(page.read(), terminal_width()))
+        for word in args if end.code else ():
+            if word.startswith("-") and Path(word).exists():
+                tell(f"{prog}: a path that begins with a dash is written ./{word}")
         raise
-    if OTHERS not in command.__dataclass_fields__:
+    if not takes_others:
         return parsed
     instance, others = parsed
     return dataclasses.replace(instance, **{OTHERS: tuple(others)})
 
 
-def laid_out(page: str, width: int) -> list[str]:
+def _laid_out(page: str, width: int) -> list[str]:
     """tyro's help, which breaks its boxes alone, in lines that fit; indented ones (examples) stay."""
     lines: list[str] = []
     for line in page.splitlines():
@@ -195,3 +183,13 @@ def _kind_beside_none(kind: Any) -> Any:
     """`X` of `X | None`; None for every other type."""
     kinds = [part for part in get_args(kind) if part is not NoneType]
     return kinds[0] if NoneType in get_args(kind) and len(kinds) == 1 else None
+
+
+Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_behavior_hint="(may be given again)")]
+"""One module or package each time, since paths may follow."""
+
+
+def allowed_modules(names: Sequence[str]) -> tuple[str, ...]:
+    """What --allow names; ConfigError where that can be no module."""
+    check_allowed(names)
+    return tuple(names)

@@ -1,4 +1,4 @@
-"""The only way of the commands to a terminal: whole lines, in which nothing foreign can act.
+"""The only way of the commands to a terminal: whole lines and tables, in which nothing foreign can act.
 
 A file name, a task or a message of a recording may hold escape codes or line ends; `printable` spells them out in
 every line that is written here. `print` is forbidden in the package (ruff's T20).
@@ -12,13 +12,13 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TextIO
 
 from tqdm import tqdm
 
 from demorec.core.errors import DemorecError
-from demorec.core.text import printable
+from demorec.core.text import display_width, printable
 
 
 class OutputError(DemorecError):
@@ -109,3 +109,21 @@ class PrintableFormatter(logging.Formatter):
         """One line, or several for a traceback, each made printable."""
         level = "" if record.name.startswith("demorec.") else f"{record.levelname}: "
         return "\n".join(printable(line) for line in f"{level}{super().format(record)}".splitlines())
+
+
+def aligned(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Columns of equal width, two spaces between them, on a terminal that shows `printable` text."""
+    table = [[printable(cell) for cell in row] for row in rows]
+    widths = [max(map(display_width, column)) for column in zip(*table, strict=True)]
+    return [
+        "  ".join(cell + " " * (width - display_width(cell)) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in table
+    ]
+
+
+def size_in_words(num_bytes: float) -> str:
+    """Bytes in the unit that reads best."""
+    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if num_bytes >= factor:
+            return f"{num_bytes / factor:.1f} {unit}"
+    return f"{num_bytes / 1e3:.0f} kB"

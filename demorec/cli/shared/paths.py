@@ -29,9 +29,9 @@ def tell_unfinished(paths: Iterable[Path]) -> None:
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:
-    """Of recordings, runs and datasets: those files and folders in which a picture may be a part of the data.
+    """Of recordings, runs and datasets: those files and folders in which an image may be a part of the data.
 
-    A run's own folder is none: an .rrd file or a picture beside its recordings may be replaced.
+    A run's own folder is none: an .rrd file or an image beside its recordings may be replaced.
     """
     return [path / DATASET if find(path).kind in EPISODE_FOLDERS else path for path in paths]
 

@@ -7,24 +7,18 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
-from demorec.cli.shared.output import counted, tell
-from demorec.generate.observer import RunObserver
-
-if TYPE_CHECKING:
-    from demorec.runs.run_file import Attempt, RunFile
+from demorec.cli.shared.output import tell
 
 _QUIET_S = 10.0
-"""Shortest time between two lines, and before the first: what is over by then needs none."""
+"""Time before the first line, and between the first ones: what is over by then needs none."""
 _SHARE = 0.05
-"""Share of the whole after which the next line is due."""
-_SILENCE_S = 45.0
-"""Longest time without a line, in the midst of long work 5 % of the time since its start."""
+"""Share of the time that has passed after which the next line is due."""
 _LONGEST_S = 300.0
-"""Longest time without a line in the midst of any work: in a run of days, a share takes hours."""
+"""Longest time without a line."""
 _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 """Without tqdm's own time that is left, which counts the start as work."""
 
@@ -32,10 +26,9 @@ _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Counts what is done of one job; a context manager.
 
-    On a terminal a bar. Elsewhere a line after ten seconds and then for every 5 % of the whole, but neither more often
-    than every ten seconds nor less often than every `silence` seconds (later every 5 % of the time that has passed, at
-    most five minutes). The time that is left is counted from the first end on, when all that has to start has started,
-    and told after one more round.
+    On a terminal a bar. Elsewhere a line every ten seconds, in a long job every 5 % of the time that has passed, but
+    at least every five minutes. The time that is left is counted from the first end on, when all that has to start has
+    started, and shown after one more round.
 
     Args:
         title: What is being done, as in "exporting".
@@ -45,7 +38,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         at_once: How many of them are worked on at the same time.
         is_terminal: Whether a person watches (default: whether standard error is a terminal).
         clock: Seconds, monotonic.
-        silence: Longest time without a line, seconds.
+        quiet: Time before the first line, seconds.
     """
 
     def __init__(
@@ -58,22 +51,21 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         at_once: int = 1,
         is_terminal: bool | None = None,
         clock: Callable[[], float] = time.monotonic,
-        silence: float = _SILENCE_S,
+        quiet: float = _QUIET_S,
     ) -> None:
-        self._title, self._unit, self._clock = title, unit, clock
+        self._title, self._unit, self._clock, self._quiet = title, unit, clock, quiet
         self.done, self.total = done, total
         self._at_once = at_once
         self._first_end: tuple[float, int] | None = None  # when, and how many were done then
         self._note = ""
-        self._started = self._told_at = clock()
-        self._told_done: int | None = None
+        self._started = self._last_line = clock()
         watched = sys.stderr.isatty() if is_terminal is None else is_terminal
         self._bar: tqdm[Any] | None = None
         self._closed = threading.Event()
         if watched:
             self._bar = tqdm(desc=title, total=total, initial=done, unit=unit, dynamic_ncols=True)
         else:
-            threading.Thread(target=self._break_silence, args=(silence,), daemon=True).start()
+            threading.Thread(target=self._write_lines, daemon=True).start()
 
     def __exit__(self, *exc: object) -> None:
         self.close()
@@ -99,9 +91,6 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
             self._bar.bar_format = _BAR if self.total else None
             self._bar.set_postfix_str(self._last_words(), refresh=False)
             self._bar.update(done - self._bar.n)
-        elif self._is_due():
-            self._told_at, self._told_done = self._clock(), done
-            tell(self._line())
 
     def note(self, text: str) -> None:
         """Something to be shown with the count from now on: "2 failed attempts"."""
@@ -109,28 +98,22 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         if self._bar is not None:
             self._bar.set_postfix_str(self._last_words())
 
-    def _break_silence(self, longest: float) -> None:
-        while not self._closed.wait(longest / 9):  # so that a line is hardly later than it should be
-            now, is_at_an_end = self._clock(), self._first_end is None or self.done >= self.total - 1
-            allowed = longest if is_at_an_end else max(longest, min(_LONGEST_S, _SHARE * (now - self._started)))
-            if now - self._told_at >= allowed:
-                self._told_at = now
-                tell(self._line())
+    def _write_lines(self) -> None:
+        """However long one of the things takes: a thread of its own."""
+        while not self._closed.wait(self._quiet / 9):  # so that a line is hardly later than it should be
+            self.write_line_if_due()
 
-    def _is_due(self) -> bool:
-        waited = self._clock() - self._told_at
-        if waited < _QUIET_S or (self.total and self.done >= self.total):
-            return False
-        if self._told_done is None or waited >= _LONGEST_S:
-            return True
-        return self.done - self._told_done >= _SHARE * self.total
-
-    def _line(self) -> str:
-        parts = [f"{self._title}: {self.done}"]
+    def write_line_if_due(self) -> None:
+        """Write how far the job is, unless that was done a short time ago."""
+        now = self._clock()
+        if now - self._last_line < max(self._quiet, min(_LONGEST_S, _SHARE * (now - self._started))):
+            return
+        self._last_line = now
+        how_far = f"{self.done}"
         if self.total:
-            parts = [f"{self._title}: {self.done} of {self.total} {self._unit}s ({100 * self.done // self.total} %)"]
-        parts.append(f"{duration(self._clock() - self._started)} passed")
-        return ", ".join([*parts, *filter(None, [self._last_words()])])
+            how_far = f"{self.done} of {self.total} {self._unit}s ({100 * self.done // self.total} %)"
+        passed = f"{duration(now - self._started)} passed"
+        tell(", ".join(filter(None, (f"{self._title}: {how_far}", passed, self._last_words()))))
 
     def _last_words(self) -> str:
         """How much time is left, if that can be told, and the note."""
@@ -141,62 +124,6 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
                 left = (self._clock() - began) * (self.total - self.done) / since
                 words.insert(0, f"about {duration(left)} left")
         return ", ".join(words)
-
-
-class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
-    """How a run goes, one bar after another; a context manager.
-
-    `watch` is called with every attempt that has ended.
-    """
-
-    def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
-        self._watch = watch
-        self._bar: ProgressBar | None = None
-        self._title = ""
-        self._failed = 0
-
-    def __exit__(self, *exc: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def verifying(self, done: int, total: int) -> None:
-        """Recordings that are there already are being verified."""
-        self._show("verifying", total).set(done)
-
-    def checking(self, done: int, total: int) -> None:
-        """Run, recordings and dataset are being checked."""
-        self._show("checking", total, unit="item").set(done)
-
-    def exporting(self, done: int, total: int) -> None:
-        """Recordings are being exported."""
-        self._show("exporting", total).set(done)
-
-    def started(self, run: RunFile, workers: int) -> None:
-        """The work begins."""
-        self._show("generating", run.num_episodes, done=len(run.successes), at_once=workers)
-
-    def ended(self, attempt: Attempt) -> None:
-        """An attempt has come to its end."""
-        if self._watch is not None:
-            self._watch(attempt)
-        assert self._bar is not None  # `started` comes first
-        if attempt.success:
-            self._bar.advance()
-        else:
-            self._failed += 1
-            self._bar.note(counted(self._failed, "failed attempt"))
-
-    def says(self, message: str) -> None:
-        """Something that a person should know."""
-        tell(message)
-
-    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode", at_once: int = 1) -> ProgressBar:
-        if self._bar is None or title != self._title:
-            if self._bar is not None:
-                self._bar.close()
-            self._title = title
-            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
-        return self._bar
 
 
 def duration(seconds: float) -> str:

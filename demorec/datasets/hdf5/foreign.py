@@ -18,9 +18,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.closing import Closing
 from demorec.core.errors import DemorecError, resource_error
-from demorec.core.files import HDF5_MAGIC, open_regular
+from demorec.core.files import HDF5_MAGIC, Closing, open_regular
 from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5 import trial
 from demorec.mcap.limits import LimitError, Limits

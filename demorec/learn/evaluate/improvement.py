@@ -22,19 +22,18 @@ from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, in_words
-from demorec.core.files import read_json_object, replace_text
+from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
+from demorec.core.own_versions import plain_differences
 from demorec.core.plain import to_plain
 from demorec.core.processes import start_program
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.features import ActionKind, StateKind
-from demorec.generate.plan import plain_differences
 from demorec.learn.evaluate.correction import read_takeover
 from demorec.learn.evaluate.moments import TakeOver
 from demorec.learn.evaluate.policy import TRAIN_CONFIG_NAME, find_checkpoint, policy_summary
 from demorec.learn.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
 from demorec.learn.evaluate.statistics import Rate
-from demorec.runs.lock import LOCK_NAME, run_lock
 from demorec.runs.run_file import free_name, load_run_file
 
 SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"

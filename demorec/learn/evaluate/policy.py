@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, OptionError, in_words
 from demorec.core.files import read_json_object
-from demorec.core.user_modules import is_allowed
+from demorec.core.registry import is_allowed
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import ActionKind
 

@@ -23,6 +23,7 @@ from typing import Any
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, in_words
 from demorec.core.files import read_json_object, replace_text
+from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.replacing import (
     ReplaceableKind,
@@ -38,7 +39,6 @@ from demorec.episode.features import ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, Act
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
-from demorec.generate.plan import differences
 from demorec.gym_env import DemorecEnv
 from demorec.learn.evaluate.correction import correcting_behaviour
 from demorec.learn.evaluate.moments import TakeOver

@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
 from demorec.core.errors import ConfigError, DemorecError, in_words
-from demorec.core.files import read_json_object, replace_text
+from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
 from demorec.learn.training.columns import numbers
 from demorec.learn.training.dataset import FastDataset
 from demorec.learn.training.encoder import KeyframeEncoder, loss_of
 from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
-from demorec.runs.lock import LOCK_NAME, run_lock
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
 _STATE, _EE_POSE, _ACTION = "observation.state", "observation.ee_pose", "action"

@@ -14,9 +14,9 @@ from typing import Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.closing import Closing
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError, in_words
+from demorec.core.files import Closing
 from demorec.core.registry import nearest_match
 from demorec.episode.episode import Outcome
 from demorec.episode.external import (
@@ -29,9 +29,16 @@ from demorec.episode.external import (
 from demorec.mcap import EpisodeWriter
 from demorec.mcap.external.frame_check import SampledFrameCheck
 from demorec.mcap.external.validity import what_is_wrong
-from demorec.mcap.recorder.coder import Buffers, Coder, WaitingPictures, WhenFull
-from demorec.mcap.recorder.robot import RobotLike, robot_facts
-from demorec.mcap.recorder.vectors import NamedVectors, Vectors, as_declared, features_of, named_vectors
+from demorec.mcap.recorder.encoder import Buffers, Encoder, WaitingImages, WhenFull
+from demorec.mcap.recorder.vectors import (
+    NamedVectors,
+    RobotLike,
+    Vectors,
+    as_declared,
+    features_of,
+    named_vectors,
+    robot_facts,
+)
 from demorec.mcap.video import size_problem
 from demorec.runs.external import ExternalFolder, open_external_run
 
@@ -52,24 +59,24 @@ class RecordedEpisode:
 
     Attributes:
         success: Whether it succeeded, for you to set; None when you do not say.
-        drops: "frames" -> how many were dropped because the coder could not keep up, where that is allowed.
+        drops: "frames" -> how many were dropped because the encoder could not keep up, where that is allowed.
         num_frames: Frames that were taken.
     """
 
-    def __init__(self, run: Recorder, info: EpisodeInfo, coder: Coder) -> None:
+    def __init__(self, run: Recorder, info: EpisodeInfo, encoder: Encoder) -> None:
         self.success: bool | None = None
         self.drops: dict[str, int] = {}
         self.num_frames = 0
         self._run = run
         self._info = info
-        self._coder: Coder | None = coder
+        self._encoder: Encoder | None = encoder
         self._features: dict[str, Feature] = {}
-        self._picture_stamps: dict[str, int] = {}
+        self._image_stamps: dict[str, int] = {}
 
     @property
     def is_open(self) -> bool:
         """Whether it takes more frames."""
-        return self._coder is not None
+        return self._encoder is not None
 
     def __enter__(self) -> Self:
         return self
@@ -84,7 +91,7 @@ class RecordedEpisode:
                 self.finish(reason="" if exc is None else "interrupted")
         except RecordingError:
             if exc is None:
-                raise  # else the first error is the one to be told
+                raise  # else the first error is the one to be reported
 
     def write(
         self,
@@ -95,38 +102,38 @@ class RecordedEpisode:
         time_ns: int | None = None,
         stamps: Mapping[str, int] | None = None,
     ) -> bool:
-        """Take one frame: copied at once, coded and written by another thread.
+        """Take one frame: copied at once, encoded and written by another thread.
 
         Args:
             observation: At this time: (D,) numbers; or element -> number; or feature -> numbers.
             action: What was commanded upon it: (D,) numbers, or element -> number.
             images: Camera -> (H, W, 3) uint8 RGB, or that with its own stamp. A camera that is left out, or None, has
-                no picture at this frame. A picture with the stamp of the camera's last one is taken for that one, and
-                not coded again.
+                no image at this frame. An image with the stamp of the camera's last one is taken for that one, and
+                not encoded again.
             time_ns: Stamp of the frame; by the recorder's clock when left out.
             stamps: Feature -> stamp of its numbers; that of the frame where left out.
 
         Returns:
-            Whether the frame was taken; False only where drops are allowed, when the coder cannot keep up.
+            Whether the frame was taken; False only where drops are allowed, when the encoder cannot keep up.
 
         Raises:
-            RecordingError: What was given cannot be recorded, the coder cannot keep up and drops are not allowed, or
+            RecordingError: What was given cannot be recorded, the encoder cannot keep up and drops are not allowed, or
                 the disk is full.
         """
-        if self._coder is None:
+        if self._encoder is None:
             raise RecordingError("The episode has ended: begin another with recorder.episode().")
-        if self._coder.error is not None:
-            raise _as_recording_error(self._coder.error)
+        if self._encoder.error is not None:
+            raise _as_recording_error(self._encoder.error)
         if time_ns is None:
             time_ns = self._run.clock()
         vectors = named_vectors(observation, action)
         if not self._features:
-            info = self._coder.info = self._run.described(self._info, vectors)
+            info = self._encoder.info = self._run.described(self._info, vectors)
             self._check = SampledFrameCheck(info)
             self._features = {feature.name: feature for feature in info.features}
         samples = self._samples(vectors, time_ns, stamps or {})
-        pictures = self._pictures(images or {}, time_ns)
-        return self._queue(SampledFrame(time_ns=time_ns, samples=samples), pictures)
+        waiting = self._images(images or {}, time_ns)
+        return self._queue(SampledFrame(time_ns=time_ns, samples=samples), waiting)
 
     def _samples(
         self,
@@ -146,38 +153,38 @@ class RecordedEpisode:
             samples[name] = Sample(stamp_ns=stamps.get(name, time_ns), vector=vector)
         return samples
 
-    def _pictures(self, images: Mapping[str, Image | None], time_ns: int) -> WaitingPictures:
-        """What came of pictures, checked and not yet copied; one that came before is None."""
-        pictures: dict[str, tuple[int, NDArray[np.uint8] | None]] = {}
+    def _images(self, images: Mapping[str, Image | None], time_ns: int) -> WaitingImages:
+        """The images that came, checked and not yet copied; one that came before is None."""
+        waiting: dict[str, tuple[int, NDArray[np.uint8] | None]] = {}
         for camera, image in images.items():
             if isinstance(image, tuple) and len(image) != 2:
                 raise RecordingError(
-                    f"The picture of the camera {camera!r} is a tuple, it must be (pixels, stamp in ns)."
+                    f"The image of the camera {camera!r} is a tuple, it must be (pixels, stamp in ns)."
                 )
             pixels, stamp_ns = image if isinstance(image, tuple) else (image, time_ns)
             if pixels is None:
                 continue
-            is_same = camera in self._picture_stamps and stamp_ns == self._picture_stamps[camera]
-            pictures[camera] = stamp_ns, None if is_same else pixels
-        return pictures
+            is_same = camera in self._image_stamps and stamp_ns == self._image_stamps[camera]
+            waiting[camera] = stamp_ns, None if is_same else pixels
+        return waiting
 
-    def _queue(self, frame: SampledFrame, pictures: WaitingPictures) -> bool:
-        assert self._coder is not None
+    def _queue(self, frame: SampledFrame, images: WaitingImages) -> bool:
+        assert self._encoder is not None
         self._check.check_frame(frame)
-        new = {camera: (stamp, pixels) for camera, (stamp, pixels) in pictures.items() if pixels is not None}
+        new = {camera: (stamp, pixels) for camera, (stamp, pixels) in images.items() if pixels is not None}
         for camera, (stamp_ns, pixels) in new.items():
             self._check.check_picture(camera, stamp_ns, pixels)
-        if not self._coder.put(frame, pictures):
+        if not self._encoder.put(frame, images):
             if self._run.when_full == "drop":
                 self.drops[FRAMES] = self.drops.get(FRAMES, 0) + 1
                 return False
             raise RecordingError(
-                f"The coder cannot keep up, {self._coder.capacity} frames wait for it: give quicker coding "
-                '(video=VideoConfig(codec="jpeg")), smaller or fewer pictures, or when_full="drop" or "wait".'
+                f"The encoder cannot keep up, {self._encoder.capacity} frames wait for it: choose quicker encoding "
+                '(video=VideoConfig(codec="jpeg")), smaller or fewer images, or when_full="drop" or "wait".'
             )
         for camera, (stamp_ns, _) in new.items():
             self._check.note_picture(camera, stamp_ns)
-            self._picture_stamps[camera] = stamp_ns
+            self._image_stamps[camera] = stamp_ns
         self._check.note_frame(frame)
         self.num_frames += 1
         return True
@@ -198,32 +205,32 @@ class RecordedEpisode:
         """
         if success is not None:
             self.success = success
-        coder = self._end()
-        if coder is None:
+        encoder = self._end()
+        if encoder is None:
             return None
         if self.num_frames == 0:
-            coder.writer.discard()
+            encoder.writer.discard()
             return None
-        if coder.error is not None:
-            coder.writer.close()
-            raise _as_recording_error(coder.error)
+        if encoder.error is not None:
+            encoder.writer.close()
+            raise _as_recording_error(encoder.error)
         outcome = Outcome(success=self.success, num_frames=self.num_frames, drops=self.drops, failure_reason=reason)
-        path = coder.writer.finish(outcome).path
+        path = encoder.writer.finish(outcome).path
         self._run.add(path)
         return path
 
     def discard(self) -> None:
         """End the episode and keep nothing of it; harmless when called twice, and after `finish`."""
-        coder = self._end()
-        if coder is not None:
-            coder.writer.discard()
+        encoder = self._end()
+        if encoder is not None:
+            encoder.writer.discard()
 
-    def _end(self) -> Coder | None:
-        """Take no more frames; the coder, with all that came, if nobody else has ended it."""
-        coder, self._coder = self._coder, None
-        if coder is not None:
-            coder.end()
-        return coder
+    def _end(self) -> Encoder | None:
+        """Take no more frames; the encoder, with all that came, if nobody else has ended it."""
+        encoder, self._encoder = self._encoder, None
+        if encoder is not None:
+            encoder.end()
+        return encoder
 
 
 class Recorder(Closing):
@@ -233,14 +240,14 @@ class Recorder(Closing):
         folder: Of the run; made if it is not there. Nothing that is in it is ever written over.
         robot: Its name, the path or text of its URDF, an arm of demorec's, or the names of its joints. Vectors as long
             as there are joints are taken for their positions (rad, m).
-        cameras: Name -> (height, width) of its pictures, or all that is known of it.
+        cameras: Name -> (height, width) of its images, or all that is known of it.
         fps: Nominal frames per second of the loop; the frames' own stamps say what they were.
         task: What the robot is asked to do, in words; LeRobot's task text.
         features: Of the vectors, where the first frame does not say enough: names and units of their elements.
-        video: How pictures are coded; H.264 with the preset "ultrafast" where left out, which takes half the CPU time
+        video: How images are encoded; H.264 with the preset "ultrafast" where left out, which takes half the CPU time
             of generate-dataset's "veryfast".
         clock: Tells the stamp of a frame that comes without one, in nanoseconds; it must never go backwards.
-        when_full: What happens to a frame when the coder cannot keep up and no more frames may wait: "error" raises,
+        when_full: What happens to a frame when the encoder cannot keep up and no more frames may wait: "error" raises,
             "drop" leaves it out and counts it, "wait" holds up your program, which suits a simulator.
 
     Attributes:
@@ -325,8 +332,8 @@ class Recorder(Closing):
         info = self._info(self._features, self._folder.next_index, instruction)
         path = self._folder.path_of(info.episode_index)
         writer = EpisodeWriter(path, info, video=self._video, begins=False)
-        coder = Coder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
-        self._open = RecordedEpisode(self, info, coder)
+        encoder = Encoder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
+        self._open = RecordedEpisode(self, info, encoder)
         return self._open
 
     # ------------------------------------------------------------------------------- for the episode
@@ -366,7 +373,7 @@ def _camera(name: str, camera: tuple[int, int] | Camera) -> Camera:
     if isinstance(camera, Camera):
         if camera.name != name or camera.kept:
             raise ConfigError(
-                f"The camera {name!r} is described as {camera.name!r}{' of kept packets' if camera.kept else ''}: a "
+                f"The camera {name!r} is described as {camera.name!r}{', passthrough' if camera.kept else ''}: a "
                 "recorder takes pixels, under the camera's own name."
             )
         return camera

@@ -6,18 +6,23 @@ makes one vector, or of vectors by the names of features. So is an action, which
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from demorec.core.errors import RecordingError
+from demorec.core.errors import ConfigError, RecordingError, SceneError, in_words
+from demorec.core.files import read_text_limited
 from demorec.core.registry import nearest_match
 from demorec.episode.external import Feature
 from demorec.episode.features import ACTION, STATE
-from demorec.mcap.recorder.robot import RobotFacts
+from demorec.mcap.description import robot_description, self_contained
+from demorec.robots.robot import RobotSpec
+from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
 
 NamedVectors = Mapping[str, tuple[NDArray[Any], tuple[str, ...]]]
 """Feature -> its numbers, and the names of its elements where a mapping gave them."""
@@ -133,3 +138,63 @@ def _joint(element: str, robot: RobotFacts) -> str:
     """The joint of which an element is the position: LeRobot's robots call that "JOINT.pos"."""
     name = element.removesuffix(".pos")
     return name if name in robot.joints else ""
+
+
+RobotLike = str | Path | RobotSpec | Sequence[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotFacts:
+    """What is known of the robot.
+
+    Attributes:
+        name: Of it.
+        urdf: Its description as text, "" when unknown; that of a file with every mesh replaced by boxes and cylinders,
+            so that it can be drawn without any other file.
+        joints: Names of all that move, in the order in which vectors have them, where that is known.
+    """
+
+    name: str
+    urdf: str = ""
+    joints: tuple[str, ...] = ()
+
+
+def robot_facts(robot: RobotLike) -> RobotFacts:
+    """What can be known of a robot that is named so.
+
+    Raises:
+        ConfigError: The URDF cannot be read, or is none; or the joint names are no names.
+    """
+    if isinstance(robot, RobotSpec):
+        joints = robot.joint_names
+        urdf = robot_description(robot.urdf, 1.0)
+        return RobotFacts(name=robot.name, urdf=urdf, joints=joints)
+    if isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith(".urdf")):
+        path = Path(robot)
+        try:
+            return _described(read_text_limited(path, MAX_BYTES), path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"The robot's URDF cannot be read ({in_words(error)}): {path}") from error
+    if isinstance(robot, str):
+        if robot.lstrip().startswith("<"):
+            return _described(robot, None)
+        if not robot.strip():
+            raise ConfigError("The robot's name is empty: give a name, a URDF, or the names of its joints.")
+        return RobotFacts(name=robot)
+    joints = tuple(robot)
+    if not joints or not all(isinstance(joint, str) and joint for joint in joints):
+        raise ConfigError(f"The robot is {joints!r}: give a name, a URDF, or the names of its joints.")
+    return RobotFacts(name="robot", joints=joints)
+
+
+def _described(text: str, path: Path | None) -> RobotFacts:
+    where = "" if path is None else f": {path}"
+    try:
+        urdf = Urdf.parse(text)
+        name = parse_xml(text).get("name") or "robot"
+        if path is not None:
+            text = self_contained(text, path.parent)
+    except (ValueError, SceneError) as error:
+        raise ConfigError(f"The robot's URDF cannot be used ({in_words(error)}){where}") from error
+    moving = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
+    return RobotFacts(name=name, urdf=text, joints=moving)

@@ -1,6 +1,6 @@
-"""The threads that code pictures and write frames, so that the program that gives them need not wait.
+"""The threads that encode images and write frames, so that the program that gives them need not wait.
 
-Libraries that code pictures and write files release Python's lock, so threads are enough, one a camera beside the one
+Libraries that encode images and write files release Python's lock, so threads are enough, one a camera beside the one
 that writes, and nothing has to be carried to another process. What waits is bounded: a queue that grew without end
 would hide that the machine cannot keep up.
 """
@@ -26,18 +26,18 @@ WhenFull = Literal["error", "drop", "wait"]
 
 _FLUSH_SECONDS = 0.25
 _WAITING_SECONDS = 0.5
-"""What has come is written after the first, and of the second at most waits to be coded: so a crash loses less than a
+"""What has come is written after the first, and of the second at most waits to be encoded: so a crash loses less than a
 second, with the time that writing takes."""
 _WAIT_SECONDS = 0.001
 _MAX_WAITING_BYTES = 256 << 20
 _MIN_WAITING_FRAMES = 8
 
-WaitingPictures = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
-"""Camera -> stamp and pixels of a new picture, or its stamp and None for the same one again."""
+WaitingImages = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
+"""Camera -> stamp and pixels of a new image, or its stamp and None for the same one again."""
 
 
 class Buffers:
-    """Memory for pictures that wait, used again and again: fresh memory costs as much as copying into it."""
+    """Memory for images that wait, used again and again: fresh memory costs as much as copying into it."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self._free: dict[tuple[int, ...], deque[NDArray[np.uint8]]] = {
@@ -59,11 +59,11 @@ class Buffers:
         self._free[buffer.shape].append(buffer)
 
 
-class Coder:
+class Encoder:
     """Feeds a writer from a queue in a thread of its own.
 
     Args:
-        buffers: Where pictures are given back to.
+        buffers: Where images are given back to.
         cameras: Of the episode; they decide how many frames may wait.
         fps: Frames a second, nominal: as many may wait as come in half a second, if memory allows.
         waits: Whether `put` waits for room.
@@ -90,15 +90,15 @@ class Coder:
         frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
         most = _MAX_WAITING_BYTES // max(frame_bytes, 1)
         self.capacity = max(_MIN_WAITING_FRAMES, min(round(_WAITING_SECONDS * fps), most))
-        self._queue: Queue[tuple[SampledFrame, WaitingPictures] | None] = Queue(self.capacity)
+        self._queue: Queue[tuple[SampledFrame, WaitingImages] | None] = Queue(self.capacity)
         self._last: dict[str, int] = {}
         self._flushed_at = time.monotonic()
         self._pool = ThreadPoolExecutor(max(len(cameras), 1), thread_name_prefix="demorec-camera")
-        self._thread = threading.Thread(target=self._run, name="demorec-coder", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="demorec-encoder", daemon=True)
         self._thread.start()
 
-    def put(self, frame: SampledFrame, pictures: WaitingPictures) -> bool:
-        """Copy the pictures that a frame holds and queue both; False when the queue is full and is not waited for.
+    def put(self, frame: SampledFrame, images: WaitingImages) -> bool:
+        """Copy the images that a frame holds and queue both; False when the queue is full and is not waited for.
 
         Only one thread may put frames.
         """
@@ -110,7 +110,7 @@ class Coder:
             time.sleep(_WAIT_SECONDS)
         copies = {
             camera: (stamp_ns, None if pixels is None else self._buffers.copy(pixels))
-            for camera, (stamp_ns, pixels) in pictures.items()
+            for camera, (stamp_ns, pixels) in images.items()
         }
         self._queue.put_nowait((frame, copies))
         return True
@@ -147,14 +147,14 @@ class Coder:
         self.writer.flush()
         self._flushed_at = time.monotonic()
 
-    def _write(self, frame: SampledFrame, pictures: WaitingPictures) -> None:
+    def _write(self, frame: SampledFrame, images: WaitingImages) -> None:
         if self.info is not None:
             self.writer.begin(self.info)
             self.info = None
-        new = [(camera, stamp, pixels) for camera, (stamp, pixels) in pictures.items() if pixels is not None]
-        numbers = list(self._pool.map(lambda picture: self.writer.picture(*picture), new))
+        new = [(camera, stamp, pixels) for camera, (stamp, pixels) in images.items() if pixels is not None]
+        numbers = list(self._pool.map(lambda image: self.writer.picture(*image), new))
         for (camera, _, pixels), number in zip(new, numbers, strict=True):
             self._last[camera] = number
             self._buffers.give_back(pixels)
-        held = {camera: self._last[camera] for camera in pictures}
+        held = {camera: self._last[camera] for camera in images}
         self.writer.write(replace(frame, pictures=held))
