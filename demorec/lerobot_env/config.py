@@ -1,4 +1,4 @@
-"""The environment as LeRobot wants to be told about it: flags, features, vectors of environments."""
+"""The environment as LeRobot describes one: flags, features, vectors of environments."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
     observation_height: int = 224
     renderer: str | None = None
     privileged: bool | None = None
+    sensed: list[str] = field(default_factory=list)
     state: str = "joint"
     action: str = "joint"
     episode_length: int | None = None
@@ -70,6 +71,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
         return {name: getattr(self, name) for name in _AS_THEY_ARE} | {
             "seed": self.scene_seed,
             "cameras": tuple(self.cameras),
+            "sensed": tuple(self.sensed),
             "width": self.observation_width,
             "height": self.observation_height,
         }

@@ -9,7 +9,7 @@ from demorec.render.warm import WarmRenderer
 from demorec.sim.world import World
 
 
-class Workshop:
+class SimulatorCache:
     """Makes world and renderer for the first episode, and others only for one that needs others; `close` frees both."""
 
     def __init__(self) -> None:
@@ -19,10 +19,10 @@ class Workshop:
 
     @property
     def is_warm(self) -> bool:
-        """Whether an episode was equipped before."""
+        """Whether an episode was simulated before."""
         return self._world is not None
 
-    def equip(self, info: SimulatedInfo) -> tuple[World, Renderer | None]:
+    def acquire(self, info: SimulatedInfo) -> tuple[World, Renderer | None]:
         """A world and a renderer (None without cameras) for episodes like this one; the present ones where they fit.
 
         Raises:
