@@ -28,9 +28,9 @@ from torch.utils.data import default_collate
 from demorec.core.errors import ConfigError, DemorecError, in_words
 from demorec.core.files import read_json_object, replace_text
 from demorec.learn.training.columns import numbers
-from demorec.learn.training.dataset import FastDataset
 from demorec.learn.training.encoder import KeyframeEncoder, loss_of
 from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
+from demorec.learn.training.reader import FastDataset
 from demorec.runs.lock import LOCK_NAME, run_lock
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
