@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from demorec.annotate.masks import seen_objects
+from demorec.annotate.grounding import seen_objects
 from demorec.annotate.narration import Statement, narrate
 from demorec.annotate.progress import dense_runs
 from demorec.annotate.tries import story_of
