@@ -153,8 +153,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
         self.config, self.render_mode = config, render_mode
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
-        self._render_size = (render_width, render_height)
-        self._render_camera = render_camera
+        self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
         info = self.episode.info
         self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * max(1, len(info.scene.goals)))
