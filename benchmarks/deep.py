@@ -17,14 +17,14 @@ from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.loop import ScriptAgent, Session, Workshop, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import SimulatedWriter
 from demorec.replay.deep import deep_check
 
 
-def generate(path: Path, config: GenerateConfig, index: int, workshop: Workshop) -> None:
+def generate(path: Path, config: GenerateConfig, index: int, simulators: SimulatorCache) -> None:
     episode = prepare(EpisodePlan(config=config, episode_index=index))
-    world, renderer = workshop.equip(episode.info)
+    world, renderer = simulators.acquire(episode.info)
     session = Session.of_episode(world, episode, renderer)
     with SimulatedWriter(path, episode.info, video=config.video) as writer:
         for frame in session.run(ScriptAgent(episode)):
@@ -48,7 +48,10 @@ def main() -> None:
     same = 0
     with tempfile.TemporaryDirectory() as folder:
         for name, config in configs.items():
-            makes, checks = Workshop(), Workshop()  # two, as the processes of generate-dataset and check have
+            makes, checks = (
+                SimulatorCache(),
+                SimulatorCache(),
+            )  # two, as the processes of generate-dataset and check have
             for index in range(-1, arguments.episodes):  # the first one warms up
                 path = Path(folder) / f"{name}_{index}.mcap"
                 starts = [time.process_time()]

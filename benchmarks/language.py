@@ -78,7 +78,7 @@ def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
     import torch
     from lerobot.datasets import LeRobotDataset
 
-    from demorec.learn.training.dataset import FastDataset
+    from demorec.learn.training.reader import FastDataset
 
     torch.set_num_threads(1)  # threads that wait for each other count as CPU time
     features = () if pictures else ("observation.state", "action")

@@ -19,16 +19,16 @@ from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.loop import ScriptAgent, Session, Workshop, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.render.warm import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
 
 
-def generate(path: Path, config: GenerateConfig, index: int, workshop: Workshop) -> None:
+def generate(path: Path, config: GenerateConfig, index: int, simulators: SimulatorCache) -> None:
     episode = prepare(EpisodePlan(config=config, episode_index=index))
-    world, renderer = workshop.equip(episode.info)
+    world, renderer = simulators.acquire(episode.info)
     with SimulatedWriter(path, episode.info, video=config.video) as writer:
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):
@@ -46,8 +46,8 @@ def main() -> None:
     cpu: dict[str, float] = defaultdict(float)
     identical = same_pictures = 0
     stack = ExitStack()
-    workshop, warm = Workshop(), stack.enter_context(WarmRenderer())
-    stack.callback(workshop.close)
+    simulators, warm = SimulatorCache(), stack.enter_context(WarmRenderer())
+    stack.callback(simulators.close)
     simulated = filmed = 0.0
 
     def timed(name: str, start: float) -> None:
@@ -55,11 +55,11 @@ def main() -> None:
 
     with stack, tempfile.TemporaryDirectory() as folder:
         plain = GenerateConfig(task=arguments.task, cameras=())
-        generate(Path(folder) / "warm.mcap", plain, 10_000, workshop)  # compiles what is compiled once
+        generate(Path(folder) / "warm.mcap", plain, 10_000, simulators)  # compiles what is compiled once
         for index in range(arguments.episodes):
             path = Path(folder) / f"{index}.mcap"
             start = time.process_time()
-            generate(path, plain, index, workshop)
+            generate(path, plain, index, simulators)
             timed("generate", start)
             start = time.process_time()
             report = check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=False))
@@ -76,12 +76,12 @@ def main() -> None:
         )
         if arguments.pictures:
             warming = Path(folder) / "warm_pictures.mcap"
-            generate(warming, config, 10_000, workshop)
+            generate(warming, config, 10_000, simulators)
             rerender(warming, Path(folder) / "warm_again.mcap", RerenderOptions(), renderers=warm)
         for index in range(arguments.pictures):
             path = Path(folder) / f"filmed_{index}.mcap"
             start = time.process_time()
-            generate(path, config, index, workshop)
+            generate(path, config, index, simulators)
             timed("generate with pictures", start)
             start = time.process_time()
             rerender(path, Path(folder) / f"as_it_was_{index}.mcap", RerenderOptions())

@@ -4,13 +4,13 @@
     env = gymnasium.make("demorec/PickPlace-v0", cameras=("front", "wrist"), split="eval")
 
 World, cameras, renderer and feature vectors are those of the recordings: stepping a recording's commands through the
-environment gives the recorded observations to the bit. Every task of `demorec list tasks` is registered when this
+environment gives the recorded observations, bit-exact. Every task of `demorec list tasks` is registered when this
 module is imported; `env_id` registers somebody else's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -27,9 +27,9 @@ from demorec.episode import features
 from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SimulatedInfo, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
 from demorec.episode.scene import Scene
-from demorec.episode.sensed import ObservationRows
+from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.episode.variation import Preset
-from demorec.loop import Decision, Episode, Session, Workshop, prepare
+from demorec.loop import Decision, Episode, Session, SimulatorCache, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
 from demorec.render.painter import Painter
 from demorec.render.warm import WarmRenderer
@@ -42,14 +42,6 @@ SECONDS_PER_GOAL = 15.0
 
 PROBED_SCENES = 16
 """How many scenes are looked at to tell whether the number of objects varies."""
-
-_KEYS = {
-    features.STATE: "agent_pos",
-    features.VELOCITY: "velocity",
-    features.EE_POSE: "ee_pose",
-    features.ENVIRONMENT_STATE: "environment_state",
-}
-"""Dataset feature -> key of the observation, as LeRobot's `preprocess_observation` maps them back."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,12 +69,14 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     """One task: the robot acts until the task's strict conditions have held for 5 frames, or time is up.
 
     Observation (a dict): `agent_pos` (observation.state), `velocity`, `ee_pose`, with `privileged`
-    `environment_state`, with cameras `pixels` (camera name -> (H, W, 3) uint8): see `demorec.episode.features`.
+    `environment_state`, with `sensed` the features that it names without the prefix `observation.`, with cameras
+    `pixels` (camera name -> (H, W, 3) uint8): see `demorec.episode.features`.
     Action: float32 of one of the kinds of `demorec.episode.features.action_vectors`; float64 is taken as it is. Targets
     are held within the joint limits in position and velocity; a pose out of reach keeps the last target.
     Reward: 1 at the step that completes a success, else 0, as `next.reward` of the datasets.
     `info["is_success"]` says that the conditions have held for so long (the datasets' `next.success` is how an episode
-    ended); `info["episode_index"]` names the scene.
+    ended); `info["episode_index"]` names the scene; after a step, `info["command"]` is what the motors were sent in it,
+    the row of the datasets' `command` of the frame before.
 
     `reset(seed=N)` gives the scene of episode N of the split, the same whatever was done before; without a seed, a
     random one. `reset(options={"scene": scene})` gives a scene of a recording.
@@ -97,6 +91,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         cameras: Names of `demorec list cameras`.
         privileged: Whether to give `environment_state`; None: only without cameras, and only for a task whose scenes
             all have as many numbers to tell, since a space has one length.
+        sensed: Features that datasets have only when named (`export --features`), as "observation.wrench".
         state: What `agent_pos` holds.
         action: What an action means.
         episode_length: Time limit in frames; None: 15 s for each object to be moved.
@@ -126,6 +121,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         height: int = 224,
         renderer: str | None = None,
         privileged: bool | None = None,
+        sensed: Collection[str] = (),
         state: StateKind = "joint",
         action: ActionKind = "joint",
         episode_length: int | None = None,
@@ -152,21 +148,21 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         config.validate()
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)
+        self._sensed = tuple(check_choice("sensed", name, tuple(SENSED)) for name in sensed)
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
         self.config, self.render_mode = config, render_mode
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
-        self._render_size = (render_width, render_height)
-        self._render_camera = render_camera
+        self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
         info = self.episode.info
         self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * max(1, len(info.scene.goals)))
         self.privileged = self._is_privileged() if privileged is None else privileged
-        self._vector_lengths = _lengths(info, privileged=self.privileged, state=self._state_kind)
+        self._vector_lengths = self._lengths(info)
         self.observation_space = _observation_space(info, self._vector_lengths)
         low, high = action_bounds(info.robot, action, fps=config.fps)
         self.action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
-        self._workshop, self._viewers = Workshop(), WarmRenderer()
+        self._simulators, self._viewers = SimulatorCache(), WarmRenderer()
         self._viewer: Painter | None = None
         self._session: Session | None = None
         self._situation: Situation | None = None
@@ -176,7 +172,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     @property
     def keys(self) -> dict[str, str]:
         """Dataset feature -> key of the observation, pictures aside."""
-        return {name: _KEYS[name] for name in self._vector_lengths}
+        return {name: _key(name) for name in self._vector_lengths}
 
     @property
     def info(self) -> SimulatedInfo:
@@ -223,12 +219,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         index = int(self.np_random.integers(2**31)) if seed is None else seed
         self.episode = self._prepare(index, scene)
         info = self.info
-        if _lengths(info, privileged=self.privileged, state=self._state_kind) != self._vector_lengths:
+        if self._lengths(info) != self._vector_lengths:
             raise SceneError(
                 f"Episode {index} of {self.config.task!r} has other objects than episode 0, and an environment has one "
                 "observation space: leave privileged out and use cameras."
             )
-        world, renderer = self._workshop.equip(info)
+        world, renderer = self._simulators.acquire(info)
         session = Session.of_episode(world, self.episode, renderer, only_color=True)
         session.reset()
         self._session = session
@@ -259,7 +255,11 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._situation = self._look(session, frame)
         success = self._situation.is_success
         truncated = not success and session.frame_index >= self._max_episode_steps
-        information = {"is_success": success, "episode_index": self.episode.plan.episode_index}
+        information = {
+            "is_success": success,
+            "episode_index": self.episode.plan.episode_index,
+            "command": np.append(frame.command.joint_target, frame.command.gripper_target),
+        }
         return self._observation(self._situation), float(success), success, truncated, information
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -279,7 +279,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     def close(self) -> None:
         """Free the simulator and the renderers; harmless when called twice."""
         try:
-            self._workshop.close()
+            self._simulators.close()
         finally:
             self._viewers.close()
         self._viewer = self._session = self._situation = None
@@ -308,7 +308,15 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             return False
         infos = [self._prepare(index, None).info for index in range(PROBED_SCENES)]
         # A round object has no yaw, so that its vector is shorter.
-        return len({tuple(_lengths(info, privileged=True).values()) for info in infos}) == 1
+        names = (features.observation_names(info.robot, info.scene, privileged=True) for info in infos)
+        return len({len(of_scene[features.ENVIRONMENT_STATE]) for of_scene in names}) == 1
+
+    def _lengths(self, info: SimulatedInfo) -> dict[str, int]:
+        """Dataset feature -> how many numbers it has."""
+        names = features.observation_names(
+            info.robot, info.scene, privileged=self.privileged, state=self._state_kind, sensed=self._sensed
+        )
+        return {name: len(components) for name, components in names.items()}
 
     def _look(self, session: Session, last_frame: Frame | None) -> Situation:
         checks = session.checks()
@@ -329,21 +337,22 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             self.info.scene,
             privileged=self.privileged,
             state=self._state_kind,
+            sensed=self._sensed,
         )
-        observation: dict[str, Any] = {_KEYS[name]: rows[0] for name, rows in vectors.items()}
+        observation: dict[str, Any] = {_key(name): rows[0] for name, rows in vectors.items()}
         if situation.images:
             observation["pixels"] = {name: images.color for name, images in situation.images.items()}
         return observation
 
 
-def _lengths(info: SimulatedInfo, *, privileged: bool, state: StateKind = "joint") -> dict[str, int]:
-    names = features.observation_names(info.robot, info.scene, privileged=privileged, state=state)
-    return {name: len(components) for name, components in names.items()}
+def _key(feature: str) -> str:
+    """A dataset feature's key in the observation, as LeRobot's `preprocess_observation` maps it back."""
+    return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
 
 
 def _observation_space(info: SimulatedInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
     found: dict[str, spaces.Space[Any]] = {
-        _KEYS[name]: spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
+        _key(name): spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         for name, length in vector_lengths.items()
     }
     if info.scene.cameras:

@@ -1,4 +1,4 @@
-"""Where the things of a scene are in the pictures: pixels that show them, boxes, projected points.
+"""Where the things of a scene are in the images: pixels that show them, boxes, masks, projected points.
 
 Pixels are counted from 0, x to the right and y down; a point belongs to the pixel that contains it. Boxes are of what
 is visible: occluded parts are not in them.
@@ -6,14 +6,18 @@ is visible: occluded parts are not in them.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.geometry import Array
-from demorec.episode.scene import SceneCamera
+from demorec.annotate.situation import nouns_of
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import SimulatedColumns
+from demorec.episode.scene import SceneCamera, Shape
 from demorec.mcap import SimulatedRecording
 
 MIN_PIXELS = 10
@@ -120,3 +124,144 @@ def pixels_of(camera: SceneCamera, points: Array) -> tuple[NDArray[np.int64], ND
     # NaN is not inside either.
     inside: NDArray[np.bool_] = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return np.where(inside[..., np.newaxis], points, 0).astype(np.int64), inside
+
+
+_ROUND = 48
+"""Points on the rim of what is round."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenObject:
+    """What one picture shows of one thing, in COCO's terms.
+
+    Attributes:
+        row: Of the dataset's episode.
+        name: Of the body.
+        noun: Its kind, the category.
+        color: The word for its colour, or "".
+        box: (x, y, width, height) of the pixels that show it.
+        area: How many pixels show it.
+        visible_fraction: That number over the area, px, of its whole outline, hidden parts and those beyond the
+            picture's edge included; None for a shape whose outline is not known (meshes, URDFs), or behind the camera.
+        counts: Run lengths of the mask, column by column, the first of pixels that do not show it.
+    """
+
+    row: int
+    name: str
+    noun: str
+    color: str
+    box: tuple[int, int, int, int]
+    area: int
+    visible_fraction: float | None
+    counts: tuple[int, ...]
+
+
+def seen_objects(
+    recording: SimulatedRecording, columns: SimulatedColumns, rows: NDArray[np.intp], camera: SceneCamera
+) -> Iterator[SeenObject]:
+    """Everything that a camera with segmentation sees in the given frames, row by row.
+
+    Raises:
+        RecordingError: The recording is damaged.
+    """
+    row_of = {int(frame): row for row, frame in enumerate(rows.tolist())}
+    numbers = body_labels(recording)
+    bodies = {body.name: body for body in recording.info.scene.bodies}
+    for _, frame, labels in recording.segmentation_at([camera.name], row_of):
+        extrinsics = columns.world_from_camera[camera.name][frame]
+        for name, seen in seen_things(labels, numbers).items():
+            body = bodies[name]
+            pose = columns.object_poses[name][frame] if name in columns.object_poses else body.world_from_body.vector()
+            x_min, y_min, x_max, y_max = seen.box
+            whole = outline_area(camera, extrinsics, body.shape, pose)
+            yield SeenObject(
+                row=row_of[frame],
+                name=name,
+                noun=nouns_of(body)[0],
+                color=body.color_name,
+                box=(x_min, y_min, x_max - x_min + 1, y_max - y_min + 1),
+                area=seen.num_pixels,
+                visible_fraction=None if whole is None else round(min(1.0, seen.num_pixels / max(whole, 1e-9)), 4),
+                counts=run_lengths(_by_column(seen.pixels, labels.shape), labels.size),
+            )
+
+
+def _by_column(pixels: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """Pixels of a picture (height, width) that are counted row by row as COCO counts them, column by column."""
+    height, width = shape
+    rows, columns = np.divmod(pixels, width)
+    return np.sort(columns * height + rows)
+
+
+def run_lengths(pixels: NDArray[np.intp], size: int) -> tuple[int, ...]:
+    """Lengths of the runs of pixels that are not among the given ones, that are, that are not, and so on.
+
+    Args:
+        pixels: (N,) numbers in order, as COCO counts them.
+        size: How many pixels there are.
+    """
+    if not len(pixels):
+        return (size,)
+    gaps = np.flatnonzero(np.diff(pixels) > 1)
+    starts = np.concatenate([pixels[:1], pixels[gaps + 1]])
+    ends = np.concatenate([pixels[gaps], pixels[-1:]]) + 1
+    lengths = np.diff(np.stack([starts, ends], axis=1).ravel(), prepend=0).tolist()
+    return tuple([*lengths, size - int(ends[-1])] if ends[-1] < size else lengths)
+
+
+def outline_area(camera: SceneCamera, world_from_camera: Array, shape: Shape, world_from_body: Array) -> float | None:
+    """Area, px, of the whole outline of a convex body, as if nothing hid it and the picture went on for ever.
+
+    None for a mesh or a URDF, and for a body that is not wholly before the camera.
+    """
+    points = _rim(shape)
+    if points is None:
+        return None
+    pose = Pose(position=world_from_body[:3], quat_xyzw=world_from_body[3:])
+    seen = project(camera, world_from_camera, pose.apply(points))
+    if not bool(np.isfinite(seen).all()):
+        return None
+    return _area(_convex_hull([(float(x), float(y)) for x, y in seen]))
+
+
+def _rim(shape: Shape) -> Array | None:
+    """(N, 3) points on a body, in its own frame, whose convex hull it is."""
+    if shape.kind == "box":
+        signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        return np.asarray(signs * np.array(shape.size))
+    if shape.kind == "cylinder":
+        angles = np.arange(_ROUND) * 2 * math.pi / _ROUND
+        # As large as the circle, which a polygon within it is not.
+        radius, half = (
+            shape.size[0] * math.sqrt((2 * math.pi / _ROUND) / math.sin(2 * math.pi / _ROUND)),
+            shape.size[1] / 2,
+        )
+        rim = np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1)
+        ends = [np.column_stack([rim, np.full(_ROUND, z)]) for z in (-half, half)]
+        return np.asarray(np.concatenate(ends), dtype=np.float64)
+    return None
+
+
+def _convex_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The corners of the convex hull in order (Andrew's monotone chain)."""
+    ordered = sorted(set(points))
+
+    def half(part: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        chain: list[tuple[float, float]] = []
+        for point in part:
+            while len(chain) >= 2 and _turn(chain[-2], chain[-1], point) <= 0:
+                chain.pop()
+            chain.append(point)
+        return chain[:-1]
+
+    return half(ordered) + half(ordered[::-1])
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def _area(corners: Sequence[tuple[float, float]]) -> float:
+    """Of a polygon (shoelace formula)."""
+    following = [*corners[1:], *corners[:1]]
+    return abs(sum(x * v - u * y for (x, y), (u, v) in zip(corners, following, strict=True))) / 2

@@ -9,13 +9,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.annotate.interjections import interjection
 from demorec.annotate.kinds import KINDS, LanguageKind
 from demorec.annotate.questions import asked_rows, questions, traces
 from demorec.annotate.referring import phrase_for
 from demorec.annotate.situation import Situations, Surroundings
 from demorec.annotate.subtasks import GoalWords, goal_words, memories, plan, subtask, tcp_motion
-from demorec.annotate.tries import Story, story_of
+from demorec.annotate.tries import Story, interjection, story_of
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator

@@ -89,25 +89,25 @@ class Pretrain:
         from demorec.learn.training.command import training_config
 
         config = training_config(self.others)
-        from demorec.learn.training.pretrain import Teaching, pretrain
+        from demorec.learn.training.pretrain import PretrainConfig, pretrain
 
-        teaching = Teaching(
+        plan = PretrainConfig(
             updates=self.num_updates,
             batch_size=self.frames_per_update,
             learning_rate=self.learning_rate,
             seed=config.seed or 0,
         )
-        taught = pretrain(
+        result = pretrain(
             config,
-            teaching,
+            plan,
             self.out,
             frame_cache_bytes=self.frame_cache_mb << 20,
-            on_progress=lambda done, loss: tell(f"update {done:,} of {teaching.updates:,}, loss {loss:.3f}"),
+            on_progress=lambda done, loss: tell(f"update {done:,} of {plan.updates:,}, loss {loss:.3f}"),
         )
         say(
-            f"next keyframe {1000 * taught.median_m:.1f} mm off (median; 9 of 10 frames within "
-            f"{1000 * taught.most_m:.0f} mm) in {taught.episodes} episodes left out; unseen, it is "
-            f"{1000 * taught.blind_m:.0f} mm",
+            f"next keyframe {1000 * result.median_m:.1f} mm off (median; 9 of 10 frames within "
+            f"{1000 * result.most_m:.0f} mm) in {result.episodes} episodes left out; unseen, it is "
+            f"{1000 * result.baseline_m:.0f} mm",
             f"policy        {self.out}",
         )
         return 0

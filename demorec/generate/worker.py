@@ -20,7 +20,7 @@ from typing import Any
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.own_versions import version_differences
-from demorec.loop import ScriptAgent, Session, Workshop, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import SimulatedWriter
 from demorec.runs.run_file import (
     EPISODES,
@@ -47,7 +47,7 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
         DemorecError: No trustworthy recording could be made, for a reason that another attempt would not mend.
         OSError: The folder cannot be written to.
     """
-    clock = _Stopwatch(SIMULATION if _workshop.is_warm else STARTING)
+    clock = _Stopwatch(SIMULATION if _simulators.is_warm else STARTING)
     with _scratch_folder(folder) as scratch:
         path = scratch / recording_name(plan.episode_index, plan.attempt, success=False)
         try:
@@ -69,7 +69,7 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
 def _record(plan: EpisodePlan, path: Path, clock: _Stopwatch) -> None:
     episode = prepare(plan)
     _check_versions(plan, episode.info.versions)
-    world, renderer = _workshop.equip(episode.info)
+    world, renderer = _simulators.acquire(episode.info)
     timed: Any = _Timed(renderer, clock, RENDERING) if renderer else None
     session = Session.of_episode(world, episode, timed)
     with SimulatedWriter(path, episode.info, video=plan.config.video) as writer:
@@ -86,7 +86,7 @@ def _check_versions(plan: EpisodePlan, here: Mapping[str, str]) -> None:
         raise ConfigError(f"What decides the run's episodes is not what it was at its start: {'; '.join(different)}")
 
 
-_workshop = Workshop()
+_simulators = SimulatorCache()
 """Of this process."""
 
 

@@ -12,9 +12,8 @@ is a pure function of its plan: whatever ran before in the same world, on any wo
 """
 
 from demorec.loop.agents import Agent, Decision, ScriptAgent
-from demorec.loop.prepare import Episode, load_task, make_renderer, make_world, prepare
+from demorec.loop.prepare import Episode, SimulatorCache, load_task, make_renderer, make_world, prepare
 from demorec.loop.session import Session
-from demorec.loop.workshop import Workshop
 
 __all__ = [
     "Agent",
@@ -22,7 +21,7 @@ __all__ = [
     "Episode",
     "ScriptAgent",
     "Session",
-    "Workshop",
+    "SimulatorCache",
     "load_task",
     "make_renderer",
     "make_world",

@@ -20,6 +20,7 @@ from demorec.episode.episode import SimulatedInfo
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.render import Renderer
+from demorec.render.warm import WarmRenderer
 from demorec.robots.assets import allow_models, model_name
 from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
@@ -187,3 +188,39 @@ def make_renderer(info: SimulatedInfo) -> AbstractContextManager[Renderer | None
     if not info.scene.cameras:
         return nullcontext(None)
     return RENDERERS.load(str(info.config.get("renderer", "raster")))()
+
+
+class SimulatorCache:
+    """Makes world and renderer for the first episode, and others only for one that needs others; `close` frees both."""
+
+    def __init__(self) -> None:
+        self._world: World | None = None
+        self._renderers = WarmRenderer()
+        self._key: object = None
+
+    @property
+    def is_warm(self) -> bool:
+        """Whether an episode was simulated before."""
+        return self._world is not None
+
+    def acquire(self, info: SimulatedInfo) -> tuple[World, Renderer | None]:
+        """A world and a renderer (None without cameras) for episodes like this one; the present ones where they fit.
+
+        Raises:
+            ConfigError: An unknown renderer.
+            MissingDependencyError, RenderError: It cannot work on this machine.
+        """
+        key = (info.robot, info.fps, info.config.get("joint_rate"))
+        if self._world is None or key != self._key:
+            self.close()
+            self._world, self._key = make_world(info), key
+        name = str(info.config.get("renderer", "raster"))
+        renderer = self._renderers.of(name) if info.scene.cameras else None
+        return self._world, renderer
+
+    def close(self) -> None:
+        """Free both; harmless when called twice."""
+        self._renderers.close()
+        if self._world is not None:
+            self._world.close()
+        self._world = self._key = None

@@ -12,7 +12,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.files import make_folder
 from demorec.core.plain import from_plain
 from demorec.core.tables import TASKS
-from demorec.loop import Workshop
+from demorec.loop import SimulatorCache
 from demorec.mcap import SimulatedWriter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
 from demorec.replay.drive import ReplayReport, replay
@@ -38,20 +38,20 @@ def replay_all(
         NotAllowedError: A demonstration's task is of a module that `options` do not allow.
     """
     allow_models(options.allowed)
-    with closing(Workshop()) as workshop:
+    with closing(SimulatorCache()) as simulators:
         for demonstration in demonstrations:
             if not options.states:
                 TASKS.check_name(demonstration.info.task, options.allowed)  # before anything is made
             if out is not None:
-                yield record_replay(demonstration, workshop, options, out, overwrite=overwrite)
+                yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
                 continue
             blind = replace(demonstration.info.scene, cameras=())
-            world, _ = workshop.equip(replace(demonstration.info, fps=demonstration.fps, scene=blind, config={}))
+            world, _ = simulators.acquire(replace(demonstration.info, fps=demonstration.fps, scene=blind, config={}))
             yield replay(demonstration, world, options)[0], None
 
 
 def record_replay(
-    demonstration: Demonstration, workshop: Workshop, options: ReplayOptions, out: Path, *, overwrite: bool
+    demonstration: Demonstration, simulators: SimulatorCache, options: ReplayOptions, out: Path, *, overwrite: bool
 ) -> tuple[ReplayReport, tuple[Path, Path] | None]:
     """Replay and record it, with pictures of the recording's cameras, into a file of the same name in `out`.
 
@@ -70,7 +70,7 @@ def record_replay(
     behaviour = view_behaviour(d.info, view)
     info = replace(d.info, fps=d.fps, behaviour=behaviour, origin=f"replay of {d.digest[:16]}")
     video = from_plain(d.info.config.get("video", {}), VideoConfig)
-    world, renderer = workshop.equip(info)
+    world, renderer = simulators.acquire(info)
     painter = view_painter(renderer, view, d.info.config) if renderer else None
     with SimulatedWriter(path, info, video=video, overwrite=overwrite) as writer:
         report, outcome = replay(d, world, options, painter=painter, sink=writer.write)

@@ -13,7 +13,7 @@ from support.check import simulate_run
 from support.export import export, files_of, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
-from demorec.annotate.masks import outline_area, run_lengths
+from demorec.annotate.grounding import outline_area, run_lengths
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import rotation_from_quat
 from demorec.datasets.exported import exported

@@ -91,9 +91,9 @@ def test_what_it_tells_is_what_the_left_out_episode_shows(
     last = {number: np.flatnonzero(episode == number)[-1] for number in (0, 1, 2)}
     then = np.array([last[episode[i]] if k is None else k for i, k in enumerate(ahead)])
     offset = pose[then] - pose
-    blind = np.median(np.linalg.norm(offset[episode == 2] - offset[episode < 2].mean(0), axis=1))
-    found = json.loads((taught / "pretraining.json").read_text())["taught"]
-    assert found["blind_m"] == pytest.approx(blind, abs=2e-5)
+    baseline = np.median(np.linalg.norm(offset[episode == 2] - offset[episode < 2].mean(0), axis=1))
+    found = json.loads((taught / "pretraining.json").read_text())["result"]
+    assert found["baseline_m"] == pytest.approx(baseline, abs=2e-5)
     assert found["episodes"] == 1
     assert 0 < found["median_m"] <= found["most_m"] < 2
     before = {path: path.stat().st_mtime_ns for path in taught.glob("[!.]*")}
@@ -101,6 +101,19 @@ def test_what_it_tells_is_what_the_left_out_episode_shows(
     assert f"next keyframe {1000 * found['median_m']:.1f} mm off" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in taught.glob("[!.]*")} == before
     assert "unfinished.pt" not in {path.name for path in before}
+
+
+def test_what_older_versions_wrote_is_read(
+    settings: Path, taught: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = json.loads((taught / "pretraining.json").read_text())
+    result = written.pop("result")
+    result["blind_m"] = result.pop("baseline_m")
+    out = tmp_path / "old"
+    out.mkdir()
+    (out / "pretraining.json").write_text(json.dumps({**written, "taught": result}))
+    assert pretrain(settings, out) == 0
+    assert f"unseen, it is {1000 * result['blind_m']:.0f} mm" in capsys.readouterr().out
 
 
 def test_lerobot_loads_the_policy_and_its_encoder_sees_as_taught(settings: Path, taught: Path) -> None:
@@ -131,7 +144,8 @@ def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, taught: Path,
         "import sys; from demorec.learn.training import pretrain as p; "
         "from demorec.learn.training.command import training_config; "
         "from pathlib import Path; "
-        "p.pretrain(training_config([sys.argv[1]]), p.Teaching(updates=6, batch_size=4, seed=1000), Path(sys.argv[2]), "
+        "p.pretrain(training_config([sys.argv[1]]), p.PretrainConfig(updates=6, batch_size=4, seed=1000), "
+        "Path(sys.argv[2]), "
         "frame_cache_bytes=1 << 28, on_progress=lambda done, loss: print(done, flush=True), save_every=2)"
     )
     command = [sys.executable, "-c", program, f"--config_path={settings}", str(out)]
@@ -160,7 +174,7 @@ def test_bfloat16_teaches_nearly_the_same(settings: Path, taught: Path, tmp_path
         apart.append(np.linalg.norm(full[name] - half[name]) / np.linalg.norm(full[name]))
     assert np.max(apart) > 1e-4
     assert np.median(apart) < 0.05
-    told = [json.loads((folder / "pretraining.json").read_text())["taught"]["median_m"] for folder in (taught, out)]
+    told = [json.loads((folder / "pretraining.json").read_text())["result"]["median_m"] for folder in (taught, out)]
     assert told[0] != told[1]
     assert told[0] == pytest.approx(told[1], rel=0.2)
 

@@ -21,7 +21,7 @@ from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
 from demorec.generate.options import RunResult
-from demorec.loop import Workshop
+from demorec.loop import SimulatorCache
 from demorec.mcap import SimulatedRecording, recover
 from demorec.mcap.metadata import EPISODE, OUTCOME
 from demorec.mcap.ros2 import DEFINITIONS
@@ -34,8 +34,8 @@ FPS = 10
 
 
 @pytest.fixture(scope="module")
-def workshop() -> Iterator[Workshop]:
-    made = Workshop()
+def simulators() -> Iterator[SimulatorCache]:
+    made = SimulatorCache()
     yield made
     made.close()
 
@@ -60,26 +60,26 @@ def found(report: DeepReport) -> set[tuple[str, str, tuple[int, ...]]]:
     return {(d.stream, d.field, d.frames) for d in report.differences}
 
 
-def test_good_recordings_come_out_the_same(filmed: Path, blind: Path, workshop: Workshop) -> None:
+def test_good_recordings_come_out_the_same(filmed: Path, blind: Path, simulators: SimulatorCache) -> None:
     for path in (filmed, blind):
-        report = deep_check(path, workshop)
+        report = deep_check(path, simulators)
         assert (report.level, report.differences, report.versions, report.error) == ("pass", (), (), "")
         assert report.num_frames > 40
 
 
-def test_a_failed_attempt_comes_out_the_same(tmp_path: Path, workshop: Workshop) -> None:
+def test_a_failed_attempt_comes_out_the_same(tmp_path: Path, simulators: SimulatorCache) -> None:
     path = simulate(tmp_path / "failed.mcap", seed=7, fps=FPS, max_episode_seconds=2.0)
     with SimulatedRecording(path) as recording:
         assert recording.outcome is not None
         assert recording.outcome.failure_reason == "time_limit"
-    assert deep_check(path, workshop).level == "pass"
+    assert deep_check(path, simulators).level == "pass"
 
 
 @pytest.mark.slow
-def test_a_rendering_comes_out_the_same(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_a_rendering_comes_out_the_same(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     path = tmp_path / "rendered.mcap"
     rerender(blind, path, RerenderOptions(cameras=("front",), width=64, height=64, looks=3))
-    report = deep_check(path, workshop)
+    report = deep_check(path, simulators)
     assert (report.level, report.differences, report.is_derived) == ("pass", (), True)
 
 
@@ -114,7 +114,7 @@ def other(value: Any) -> Any:
     return value + 1
 
 
-def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     """One value of one message each, all in one file: every one is named with its frame, and nothing else is."""
     with SimulatedRecording(filmed) as recording:
         topics = recording.topics
@@ -140,7 +140,7 @@ def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, workshop: Work
 
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(rewritten(filmed, messages=spoil))
-    report = deep_check(spoilt, workshop)
+    report = deep_check(spoilt, simulators)
     named = {(d.stream, d.field) for d in report.differences}
     assert {(topic, name) for topic, name, _ in expected} == named
     assert {topic for topic, _, _ in expected} == topics.keys()
@@ -156,7 +156,7 @@ def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, workshop: Work
     assert firsts == sorted(firsts)
 
 
-def test_one_bit_of_one_number(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_one_bit_of_one_number(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     seen = 0
 
     def spoil(topic: str, data: bytes) -> bytes:
@@ -169,27 +169,27 @@ def test_one_bit_of_one_number(blind: Path, tmp_path: Path, workshop: Workshop) 
 
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(rewritten(blind, messages=spoil))
-    report = deep_check(spoilt, workshop)
+    report = deep_check(spoilt, simulators)
     assert found(report) == {("/ee_pose", "pose.position.x", (5,))}
     assert report.level == "fail"
     assert "to the bit" in report.replay  # the commands and joint states are sound
 
 
-def test_messages_that_are_missing_or_too_many(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_messages_that_are_missing_or_too_many(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     spoilt = tmp_path / "spoilt.mcap"
     gone = iter(range(10_000))
     rewrite_messages(
         blind, spoilt, lambda m: () if m[0] == "/action" and next(gone) == 7 else (m, m) if m[0] == "/phase" else (m,)
     )
-    named = found(deep_check(spoilt, workshop))
+    named = found(deep_check(spoilt, simulators))
     assert ("/action", "messages", (7,)) in named
     assert {field for stream, field, _ in named if stream == "/phase"} == {"messages"}
 
 
-def test_a_topic_that_no_recording_has(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_a_topic_that_no_recording_has(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     spoilt = tmp_path / "spoilt.mcap"
     rewrite_messages(blind, spoilt, lambda m: (m, ("/mine", *m[1:])) if m[0] == "/wrench" else (m,))
-    assert ("/mine", "messages", ()) in found(deep_check(spoilt, workshop))
+    assert ("/mine", "messages", ()) in found(deep_check(spoilt, simulators))
 
 
 # ----------------------------------------------------------------------------------------------------- the metadata
@@ -252,7 +252,7 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
     ],
 )
 def test_a_changed_description(
-    place: tuple[Any, ...], value: Any, named: str, blind: Path, tmp_path: Path, workshop: Workshop
+    place: tuple[Any, ...], value: Any, named: str, blind: Path, tmp_path: Path, simulators: SimulatorCache
 ) -> None:
     with SimulatedRecording(blind) as recording:
         info = to_plain(recording.info)
@@ -263,20 +263,20 @@ def test_a_changed_description(
     target[place[-1]] = value
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(rewritten(blind, change={EPISODE: {"info": json.dumps(info)}}))
-    report = deep_check(spoilt, workshop)
+    report = deep_check(spoilt, simulators)
     assert report.level == "fail"
     assert any(d.stream == f"metadata {EPISODE}" and d.field.startswith(named) for d in report.differences)
 
 
 def test_other_versions_are_said_first(
-    blind: Path, tmp_path: Path, workshop: Workshop, capsys: pytest.CaptureFixture[str]
+    blind: Path, tmp_path: Path, simulators: SimulatorCache, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with SimulatedRecording(blind) as recording:
         info = to_plain(recording.info)
     info["versions"]["pybullet"] = "3.2.5"
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(rewritten(blind, change={EPISODE: {"info": json.dumps(info)}}))
-    report = deep_check(spoilt, workshop)
+    report = deep_check(spoilt, simulators)
     assert report.level == "warn"
     assert any("pybullet is 3.2.5 there" in line for line in report.versions)
     with pytest.raises(SystemExit) as ended:
@@ -325,7 +325,7 @@ def channels_swapped(picture: Any) -> Any:
 
 
 @pytest.mark.slow
-def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     """All are coded a second time, as by a program that edits videos: only the spoilt ones show something else."""
     faults = {6: brighter, 11: torn, 16: blurred, 21: shifted, 26: green, 31: patched, 36: channels_swapped}
     swapped = {20: 24, 24: 20}
@@ -339,7 +339,7 @@ def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, workshop: Works
     assert labels is not None
     depth[30, 30] += 0.001
     labels[40, 40] = labels[40, 40] + 1
-    report = deep_check(spoilt.write(tmp_path / "spoilt.mcap"), workshop)
+    report = deep_check(spoilt.write(tmp_path / "spoilt.mcap"), simulators)
     shown = {d.stream: d.frames for d in report.differences if d.field == "picture"}
     assert shown == {
         "/camera/wrist/h264": tuple(faults),
@@ -356,7 +356,9 @@ def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, workshop: Works
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stream", [stream for stream in CODED if "image" not in stream])
-def test_a_coded_picture_of_another_frame(stream: str, filmed: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_a_coded_picture_of_another_frame(
+    stream: str, filmed: Path, tmp_path: Path, simulators: SimulatorCache
+) -> None:
     """The stamp is right, the bytes are whole, the picture is that of five frames before."""
     topic, pictures = f"/camera/front/{stream}", []
 
@@ -368,7 +370,7 @@ def test_a_coded_picture_of_another_frame(stream: str, filmed: Path, tmp_path: P
 
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(rewritten(filmed, messages=spoil))
-    report = deep_check(spoilt, workshop)
+    report = deep_check(spoilt, simulators)
     assert report.level == "fail"
     (difference,) = (d for d in report.differences if d.field == "picture")
     assert (difference.stream, difference.frames[0]) == (topic, 24)
@@ -398,7 +400,7 @@ def test_the_command(blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
             assert told.splitlines()[-1].endswith("2 made again, 1 not as recorded.")
 
 
-def test_a_damaged_file_among_good_ones(blind: Path, tmp_path: Path, workshop: Workshop) -> None:
+def test_a_damaged_file_among_good_ones(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(blind.read_bytes()[:-200])
     reports = list(deep_checks([damaged, blind]))
@@ -428,11 +430,11 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
 
 
 def test_a_recording_that_a_crash_cut_off_is_compared_as_far_as_it_goes(
-    filmed: Path, tmp_path: Path, workshop: Workshop
+    filmed: Path, tmp_path: Path, simulators: SimulatorCache
 ) -> None:
     part = tmp_path / "cut.mcap.part"
     part.write_bytes(filmed.read_bytes()[: int(0.7 * filmed.stat().st_size)])
     recover(part, tmp_path / "cut.mcap")
-    report = deep_check(tmp_path / "cut.mcap", workshop)
+    report = deep_check(tmp_path / "cut.mcap", simulators)
     assert (report.level, report.differences) == ("pass", ())
     assert report.num_frames > 5

@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from support.check import simulate
 from support.docs import run_examples
+from support.export import data_table
 from support.present import present
 from support.sim import episode
 from support.tasks import tasks_with_slow_ones
@@ -20,9 +21,11 @@ from support.tasks import tasks_with_slow_ones
 import demorec.gym_env
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.tables import TASKS
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
 from demorec.episode.episode import SimulatedColumns, SimulatedInfo
-from demorec.episode.sensed import ObservationRows
+from demorec.episode.sensed import SENSED, ObservationRows, SensedFeature
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
@@ -56,7 +59,7 @@ def test_gymnasium_accepts_the_environment(task: str) -> None:
 
 
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
-def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_path: Path) -> None:
+def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_path: Path) -> None:
     """The numbers of the exported features of a file on disk, against those that a policy would see."""
     with SimulatedRecording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, columns = recording.info, recording.columns()
@@ -75,6 +78,41 @@ def test_a_recordings_commands_give_its_observations_to_the_bit(task: str, tmp_p
         command = np.append(columns.command_joint_target[t], columns.command_gripper[t])
         observation, _, terminated, _, _ = env.step(command)
     assert terminated == (task == "pick_place")
+    env.close()
+
+
+def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> None:
+    """Every feature of `export --features`, row by row; the command is that of the step that leads to the next row."""
+    path = simulate(tmp_path / "e.mcap", episode_index=3)
+    export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False, features=(*SENSED, "command")))
+    table = data_table(tmp_path / "ds")
+    exported = {name: np.array(table.column(name).to_pylist(), np.float32) for name in (*SENSED, "command", "action")}
+    with SimulatedRecording(path) as recording:
+        columns = recording.columns()
+    env = make(split="all", sensed=tuple(SENSED))
+    observation, _ = env.reset(seed=3)
+    assert env.observation_space.contains(observation)
+    assert np.abs(exported["observation.contact_force"]).max() > 1.0
+    for t in range(columns.num_frames):
+        for name in SENSED:
+            expected = exported[name][t].reshape(-1)  # a column of one number is a column of scalars
+            assert np.array_equal(observation[name.removeprefix("observation.")], expected), (name, t)
+        command = np.append(columns.command_joint_target[t], columns.command_gripper[t])
+        observation, *_, found = env.step(command)
+        assert np.array_equal(found["command"].astype(np.float32), exported["command"][t])
+    env.close()
+
+
+def test_a_new_sensed_feature_needs_no_change_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    double = SensedFeature(
+        meaning="twice the opening (m)", names=lambda _: ("x",), values=lambda rows, _: 2 * rows.gripper_width
+    )
+    monkeypatch.setattr("demorec.episode.sensed.SENSED", {**SENSED, "observation.twice": double})
+    monkeypatch.setattr("demorec.episode.features.SENSED", {**SENSED, "observation.twice": double})
+    monkeypatch.setattr("demorec.gym_env.SENSED", {**SENSED, "observation.twice": double})
+    env = make(sensed=("observation.twice",))
+    observation, _ = env.reset(seed=0)
+    assert observation["twice"] == np.float32(2 * env.situation.observation.gripper_width)
     env.close()
 
 
@@ -171,6 +209,8 @@ def test_time_is_limited_and_nonsense_is_refused() -> None:
     env.close()
     with pytest.raises(ConfigError, match="Did you mean 'joint_increment'"):
         make(action="joint_increments")
+    with pytest.raises(ConfigError, match=r"Did you mean 'observation\.wrench'"):
+        make(sensed=("observation.wrenc",))
     with pytest.raises(ConfigError, match="render_mode"):
         DemorecEnv(render_mode="human")
     with pytest.raises(ConfigError, match="Did you mean 'stack'"):

@@ -136,11 +136,20 @@ def test_a_policy_tells_which_state_it_takes(length: int, kind: str, tmp_path: P
     assert settings_for(tmp_path, GenerateConfig(cameras=()), action="ee_delta").state == kind
 
 
+def test_a_policy_is_given_what_else_it_takes(tmp_path: Path) -> None:
+    inputs = {name: {"type": "STATE", "shape": [6]} for name in ("observation.wrench", STATE)}
+    (tmp_path / CONFIG_NAME).write_text(json.dumps({"type": "act", "input_features": inputs}))
+    assert settings_for(tmp_path, GenerateConfig(cameras=()), action="joint").sensed == ("observation.wrench",)
+
+
 def test_lerobot_is_told_of_the_state() -> None:
     from demorec.lerobot_env import DemorecEnvConfig
 
     assert DemorecEnvConfig(state="joint_ee").features["agent_pos"].shape == (15,)
-    assert DemorecEnvConfig().features["agent_pos"].shape == (8,)
+    plain = DemorecEnvConfig(sensed=["observation.wrench"])
+    assert plain.features["agent_pos"].shape == (8,)
+    assert plain.features["wrench"].shape == (6,)
+    assert plain.features_map["wrench"] == "observation.wrench"
     with pytest.raises(ConfigError, match="Unknown state 'joint_e'"):
         DemorecEnvConfig(state="joint_e")
 

@@ -14,7 +14,7 @@ from support.recording import make_episode
 
 from demorec.core.errors import ConfigError
 from demorec.datasets import episode
-from demorec.learn.training.stretches import INTERVENTION, Stretches
+from demorec.learn.training.reader import INTERVENTION, Stretches
 from demorec.mcap import SimulatedWriter
 
 

@@ -92,8 +92,7 @@ def test_lists_that_differ_between_chunks_are_left_to_lerobot() -> None:
 def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int], limit: int) -> None:
     import torch
 
-    from demorec.learn.training.pictures import FrameCache
-    from demorec.learn.training.video_file import DecodedFrame
+    from demorec.learn.training.pictures import DecodedFrame, FrameCache
 
     cache = FrameCache(limit)
     for number, size in enumerate(sizes):
@@ -108,8 +107,7 @@ def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int],
 def test_what_was_wanted_lately_is_kept() -> None:
     import torch
 
-    from demorec.learn.training.pictures import FrameCache
-    from demorec.learn.training.video_file import DecodedFrame
+    from demorec.learn.training.pictures import DecodedFrame, FrameCache
 
     cache = FrameCache(20)
     for number in (0, 1):
@@ -137,7 +135,7 @@ def write_video(path: Path, count: int, **options: str) -> list[NDArray[np.uint8
 
 @pytest.mark.parametrize("options", [{"g": "2", "bf": "0"}, {"g": "9", "bf": "3"}, {"g": "100"}], ids=str)
 def test_any_frames_in_any_order_are_those_of_a_straight_decoding(options: dict[str, str], tmp_path: Path) -> None:
-    from demorec.learn.training.video_file import VideoFile
+    from demorec.learn.training.pictures import VideoFile
 
     pictures = write_video(tmp_path / "v.mp4", 40, **options)
     with av.open(str(tmp_path / "v.mp4")) as container:
@@ -154,7 +152,7 @@ def test_any_frames_in_any_order_are_those_of_a_straight_decoding(options: dict[
 
 
 def test_frames_of_a_batch_are_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from demorec.learn.training.video_file import VideoFile
+    from demorec.learn.training.pictures import VideoFile
 
     write_video(tmp_path / "v.mp4", 40, g="10", bf="0")
     file = VideoFile(str(tmp_path / "v.mp4"), "rgb24")
@@ -176,7 +174,7 @@ def test_frames_of_a_batch_are_decoded_once(tmp_path: Path, monkeypatch: pytest.
 def test_a_video_without_frames_is_refused(tmp_path: Path) -> None:
     from lerobot.datasets.video_utils import FrameTimestampError
 
-    from demorec.learn.training.video_file import VideoFile
+    from demorec.learn.training.pictures import VideoFile
 
     path = tmp_path / "v.mp4"
     with av.open(str(path), "w") as container:

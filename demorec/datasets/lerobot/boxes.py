@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from demorec.annotate.masks import SeenObject
+from demorec.annotate.grounding import SeenObject
 from demorec.core.errors import ExportError, in_words
 from demorec.core.files import open_regular
 from demorec.core.plain import parse_json

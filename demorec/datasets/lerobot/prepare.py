@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.annotate.masks import seen_objects
+from demorec.annotate.grounding import seen_objects
 from demorec.annotate.narration import Statement, narrate
 from demorec.annotate.progress import dense_runs
 from demorec.annotate.tries import story_of

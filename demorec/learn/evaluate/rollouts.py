@@ -36,6 +36,7 @@ from demorec.core.replacing import (
 from demorec.core.tables import ROBOTS, camera_name
 from demorec.episode.episode import Outcome
 from demorec.episode.features import ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, ActionKind, StateKind, state_names
+from demorec.episode.sensed import SENSED
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
@@ -68,6 +69,7 @@ class Settings:
         action: What the policy's actions mean.
         action_steps: Actions executed before it looks again; None: as trained.
         privileged: Whether it sees observation.environment_state.
+        sensed: What else it sees of the features that datasets have only when named.
         state: What its observation.state holds.
         episode_length: Time limit; None: the environment's.
         takeover: When the expert takes over from the policy; None: never, as an evaluation of the policy wants it.
@@ -80,6 +82,7 @@ class Settings:
     action: ActionKind
     action_steps: int | None = None
     privileged: bool = False
+    sensed: tuple[str, ...] = ()
     state: StateKind = "joint"
     episode_length: int | None = None
     takeover: TakeOver | None = None
@@ -166,6 +169,7 @@ def settings_for(
         action=action,
         action_steps=action_steps,
         privileged=ENVIRONMENT_STATE in inputs,
+        sensed=tuple(name for name in SENSED if name in inputs),
         state=_state_kind(inputs, ROBOTS.load(config.robot)),
         episode_length=episode_length,
     )
@@ -285,6 +289,7 @@ def _stage(folder: Path) -> tuple[Settings, DemorecEnv, Policy, World | None]:
         config=settings.config,
         action=settings.action,
         privileged=settings.privileged,
+        sensed=settings.sensed,
         state=settings.state,
         episode_length=settings.episode_length,
     )

@@ -11,8 +11,7 @@ from demorec.learn.evaluate.correction import begin_correction, correcting_behav
 from demorec.learn.evaluate.moments import TakeOver
 from demorec.learn.evaluate.policy import Policy
 from demorec.learn.evaluate.watch import Watch
-from demorec.loop.agents import Decision
-from demorec.loop.noise import ActionNoise
+from demorec.loop.agents import ActionNoise, Decision
 from demorec.sim.world import World
 from demorec.tasks.recovery import TAKE_OVER
 from demorec.tasks.script import Step

@@ -99,7 +99,7 @@ def _reading_fast(
     """LeRobot's factory of datasets makes `FastDataset`s meanwhile."""
     from lerobot.datasets import factory
 
-    from demorec.learn.training.dataset import FastDataset
+    from demorec.learn.training.reader import FastDataset
 
     is_told = False
 

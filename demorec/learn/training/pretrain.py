@@ -28,9 +28,9 @@ from torch.utils.data import default_collate
 from demorec.core.errors import ConfigError, DemorecError, in_words
 from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
 from demorec.learn.training.columns import numbers
-from demorec.learn.training.dataset import FastDataset
 from demorec.learn.training.encoder import KeyframeEncoder, loss_of
 from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
+from demorec.learn.training.reader import FastDataset
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
 _STATE, _EE_POSE, _ACTION = "observation.state", "observation.ee_pose", "action"
@@ -44,7 +44,7 @@ Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Teaching:
+class PretrainConfig:
     """How an encoder is taught.
 
     Attributes:
@@ -61,39 +61,39 @@ class Teaching:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Taught:
+class PretrainResult:
     """What the encoder tells of the episodes that were left out, the last twentieth.
 
     Attributes:
         median_m, most_m: Error of the offset from the TCP to the next keyframe in metres: of half of the frames, and
             of nine tenths.
-        blind_m: Median error of always telling the mean offset.
+        baseline_m: Median error of always telling the mean offset.
         episodes: That were left out.
         cpu_seconds: Of the last call.
     """
 
     median_m: float
     most_m: float
-    blind_m: float
+    baseline_m: float
     episodes: int
     cpu_seconds: float
 
 
 def pretrain(
     config: Any,
-    teaching: Teaching,
+    plan: PretrainConfig,
     out: Path,
     *,
     frame_cache_bytes: int,
     on_progress: Callable[[int, float], None],
     save_every: int = 50,
-) -> Taught:
+) -> PretrainResult:
     """Teach the encoder that the ACT policy of a training will have, and save the policy; go on with what was begun.
 
     Args:
         config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count; with the policy's `use_amp`
             the network computes in bfloat16, while its weights and the loss stay in float32.
-        teaching: How.
+        plan: How.
         out: Folder of the policy.
         frame_cache_bytes: Limit of the decoded frames that are kept.
         on_progress: Is told the updates done and the loss, smoothed.
@@ -119,7 +119,7 @@ def pretrain(
     if not dataset.meta.camera_keys:
         raise ConfigError(f"The dataset has no pictures to learn from: {dataset.root}")
     settings = {
-        **asdict(teaching),
+        **asdict(plan),
         "dataset": _digest(dataset),
         "episodes": chosen.episodes,
         "policy": _deciding(config.policy),
@@ -129,12 +129,12 @@ def pretrain(
         done = _settle(out, settings)
         if done is not None:
             return done
-        lessons = _Lessons(config.policy, teaching, dataset, targets)
+        lessons = _Lessons(config.policy, plan, dataset, targets)
         started = time.process_time()
         lessons.go_on(out / UNFINISHED_NAME, on_progress, save_every)
         found = lessons.judge(time.process_time() - started)
         lessons.save(out)
-        replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "taught": asdict(found)}, indent=1))
+        replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "result": asdict(found)}, indent=1))
         (out / UNFINISHED_NAME).unlink(missing_ok=True)
         return found
 
@@ -163,9 +163,9 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
 class _Lessons:
     """The encoder, its optimizer, and how far they are."""
 
-    def __init__(self, policy: Any, teaching: Teaching, dataset: FastDataset, targets: KeyframeTargets) -> None:
-        self._teaching, self._dataset, self._targets = teaching, dataset, targets
-        torch.manual_seed(teaching.seed)
+    def __init__(self, policy: Any, plan: PretrainConfig, dataset: FastDataset, targets: KeyframeTargets) -> None:
+        self._plan, self._dataset, self._targets = plan, dataset, targets
+        torch.manual_seed(plan.seed)
         self._policy = make_policy(policy, ds_meta=dataset.meta)
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
@@ -181,7 +181,7 @@ class _Lessons:
             num_targets=len(targets.names),
         ).to(self._device)
         self._optimizer = torch.optim.AdamW(
-            self._network.parameters(), lr=teaching.learning_rate, weight_decay=_WEIGHT_DECAY
+            self._network.parameters(), lr=plan.learning_rate, weight_decay=_WEIGHT_DECAY
         )
         self._done, self._loss = 0, math.nan
 
@@ -190,32 +190,32 @@ class _Lessons:
         if unfinished.exists():
             self._load(unfinished)
         self._network.train()
-        while self._done < self._teaching.updates:
+        while self._done < self._plan.updates:
             loss = self._update()
             self._loss = loss if math.isnan(self._loss) else _SMOOTHING * self._loss + (1 - _SMOOTHING) * loss
             self._done += 1
-            if self._done % save_every == 0 or self._done == self._teaching.updates:
+            if self._done % save_every == 0 or self._done == self._plan.updates:
                 self._store(unfinished)
                 on_progress(self._done, self._loss)
 
-    def judge(self, cpu_seconds: float) -> Taught:
+    def judge(self, cpu_seconds: float) -> PretrainResult:
         """Of the episodes that were left out."""
         rows = self._held_out[:: max(1, len(self._held_out) // _JUDGED_FRAMES)]
         self._network.eval()
         told = []
         with torch.no_grad():
-            for start in range(0, len(rows), self._teaching.batch_size):
-                together, _ = self._tell(rows[start : start + self._teaching.batch_size])
+            for start in range(0, len(rows), self._plan.batch_size):
+                together, _ = self._tell(rows[start : start + self._plan.batch_size])
                 told.append(together.cpu().numpy())
         offsets = list(self._targets.offsets)
         spread = np.where(np.isinf(self._spread), 0, self._spread)
         found = (np.concatenate(told) * spread + self._mean)[:, offsets]
         true = self._targets.values[rows][:, offsets]
         error = np.linalg.norm(found - true, axis=1)
-        return Taught(
+        return PretrainResult(
             median_m=round(float(np.median(error)), 5),
             most_m=round(float(np.quantile(error, 0.9)), 5),
-            blind_m=round(float(np.median(np.linalg.norm(true - self._mean[offsets], axis=1))), 5),
+            baseline_m=round(float(np.median(np.linalg.norm(true - self._mean[offsets], axis=1))), 5),
             episodes=self._num_held_out,
             cpu_seconds=round(cpu_seconds, 1),
         )
@@ -227,13 +227,13 @@ class _Lessons:
             part.save_pretrained(out)
 
     def _update(self) -> float:
-        teaching = self._teaching
+        plan = self._plan
         # Which frames are seen follows from the seed and the update alone, so that a stopped call goes on as if not.
-        rows = np.random.default_rng([teaching.seed, self._done]).choice(self._learnt, teaching.batch_size)
+        rows = np.random.default_rng([plan.seed, self._done]).choice(self._learnt, plan.batch_size)
         wanted = (self._targets.values[rows] - self._mean) / self._spread
-        rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / teaching.updates))
+        rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / plan.updates))
         for group in self._optimizer.param_groups:
-            group["lr"] = teaching.learning_rate * rate
+            group["lr"] = plan.learning_rate * rate
         loss = loss_of(self._tell(rows), torch.from_numpy(wanted).to(self._device))
         self._optimizer.zero_grad()
         loss.backward()
@@ -287,7 +287,7 @@ def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
     return np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out), count
 
 
-def _settle(out: Path, settings: dict[str, Any]) -> Taught | None:
+def _settle(out: Path, settings: dict[str, Any]) -> PretrainResult | None:
     """Write down what decides, or compare it with what is written there; what came out, if it is done."""
     path = out / RESULT_NAME
     if not path.exists():
@@ -298,7 +298,7 @@ def _settle(out: Path, settings: dict[str, Any]) -> Taught | None:
     try:
         found = read_json_object(path)
         before = found["settings"]
-        taught = Taught(**found["taught"]) if "taught" in found else None
+        result = _read_result(found)
         others = sorted(name for name in settings if before.get(name) != settings[name])
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DemorecError(f"{RESULT_NAME} is damaged ({in_words(error)}): {path}") from error
@@ -307,7 +307,15 @@ def _settle(out: Path, settings: dict[str, Any]) -> Taught | None:
             f"Another encoder is taught in this folder (another {', another '.join(others)}), choose another --out: "
             f"{out}"
         )
-    return taught
+    return result
+
+
+def _read_result(found: dict[str, Any]) -> PretrainResult | None:
+    """What is written of a finished pretraining; older versions called it "taught", and its baseline "blind_m"."""
+    values = found.get("result") or found.get("taught")
+    if values is None:
+        return None
+    return PretrainResult(**{"baseline_m" if name == "blind_m" else name: value for name, value in values.items()})
 
 
 def _deciding(policy: Any) -> dict[str, Any]:

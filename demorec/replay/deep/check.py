@@ -15,7 +15,7 @@ from demorec.core.errors import DemorecError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.processes import in_turn
 from demorec.episode.episode import SimulatedInfo
-from demorec.loop import Workshop
+from demorec.loop import SimulatorCache
 from demorec.mcap import SimulatedRecording
 from demorec.replay.deep.contents import Contents, coded_topics, content_differences
 from demorec.replay.deep.difference import Difference
@@ -55,16 +55,16 @@ class DeepReport:
         return "warn" if self.versions or self.differences else "pass"
 
 
-_workshop = Workshop()
+_simulators = SimulatorCache()
 """Of this process."""
 
 
-def deep_check(path: Path, workshop: Workshop = _workshop, allowed: Sequence[str] = ()) -> DeepReport:
+def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Sequence[str] = ()) -> DeepReport:
     """Make a recording again and compare everything.
 
     Args:
         path: The recording.
-        workshop: Gives world and renderer; by default one that stays warm for as long as the process lives.
+        simulators: Gives world and renderer; by default one that stays warm for as long as the process lives.
         allowed: The user's own modules that may be imported for what the recording names.
 
     Raises:
@@ -77,10 +77,10 @@ def deep_check(path: Path, workshop: Workshop = _workshop, allowed: Sequence[str
             versions = version_differences(info.versions, versions_here(info, allowed))
             report = replace(report, versions=versions, num_frames=recording.num_frames, is_derived=bool(info.origin))
             again = Path(folder) / "again.mcap"
-            remake(recording, again, workshop, allowed)
-            differences = tuple(_differences(recording, again, workshop, allowed))
+            remake(recording, again, simulators, allowed)
+            differences = tuple(_differences(recording, again, simulators, allowed))
             if not report.is_derived and any(not d.is_coding and d.field != "picture" for d in differences):
-                report = replace(report, replay=_replayed(recording, workshop, allowed))
+                report = replace(report, replay=_replayed(recording, simulators, allowed))
             return replace(report, differences=differences)
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
@@ -96,7 +96,7 @@ def versions_here(info: SimulatedInfo, allowed: Sequence[str]) -> Mapping[str, s
 
 
 def _differences(
-    recording: SimulatedRecording, again: Path, workshop: Workshop, allowed: Sequence[str]
+    recording: SimulatedRecording, again: Path, simulators: SimulatorCache, allowed: Sequence[str]
 ) -> Iterator[Difference]:
     """Ordered by the first frame."""
     found, made = Contents.of(recording.path), Contents.of(again)
@@ -105,19 +105,19 @@ def _differences(
             made.cut_off(found)
         differences, pictures = content_differences(found, made, remade.info, recording.info.fps)
         if pictures:
-            painter = recorded_painter(remade.info, workshop.equip(remade.info)[1], allowed)
+            painter = recorded_painter(remade.info, simulators.acquire(remade.info)[1], allowed)
             assert painter is not None, "pictures were drawn"
             cameras = coded_topics(remade.info)
             differences += picture_differences(found, made, remade, painter, cameras, pictures)
     yield from sorted(differences, key=lambda difference: difference.first_frame)
 
 
-def _replayed(recording: SimulatedRecording, workshop: Workshop, allowed: Sequence[str]) -> str:
+def _replayed(recording: SimulatedRecording, simulators: SimulatorCache, allowed: Sequence[str]) -> str:
     """Whether the fault is in what was recorded, or in how it is made again: the commands alone, in the scene alone."""
     options = ReplayOptions(allowed=tuple(allowed))
     try:
         demonstration = open_demonstration(recording, options)
-        report, _ = replay(demonstration, workshop.equip(recording.info)[0], options)
+        report, _ = replay(demonstration, simulators.acquire(recording.info)[0], options)
     except DemorecError as error:
         return f"cannot be replayed ({error})"
     if report.first_difference is None:
@@ -129,8 +129,8 @@ def _replayed(recording: SimulatedRecording, workshop: Workshop, allowed: Sequen
 def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
     """One report for each recording, in order."""
     if workers == 1 or len(paths) < 2:
-        with closing(Workshop()) as workshop:
+        with closing(SimulatorCache()) as simulators:
             for path in paths:
-                yield deep_check(path, workshop, allowed)
+                yield deep_check(path, simulators, allowed)
         return
     yield from in_turn(partial(deep_check, allowed=tuple(allowed)), paths, workers)

@@ -13,7 +13,7 @@ from demorec.core.errors import ConfigError, DemorecError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.episode import SimulatedInfo
-from demorec.loop import Workshop
+from demorec.loop import SimulatorCache
 from demorec.replay.deep.check import DeepReport, versions_here
 from demorec.replay.deep.difference import Difference
 from demorec.replay.deep.remake import generate_again
@@ -25,7 +25,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
     Raises:
         ResourceError: This machine cannot do it, which says nothing about the dataset.
     """
-    dataset, workshop = Dataset(path), Workshop()
+    dataset, simulators = Dataset(path), SimulatorCache()
     try:
         if not dataset.sidecar:
             raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
@@ -34,13 +34,13 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
         infos = {each.number: each.info for each in dataset.described()}
         for episode in dataset_episodes(dataset):
             name = path / f"episode {episode.number}"
-            yield _report(name, episode, infos[episode.number], options, workshop, allowed)
+            yield _report(name, episode, infos[episode.number], options, simulators, allowed)
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
         yield DeepReport(path=path, error=str(error))
     finally:
-        workshop.close()
+        simulators.close()
 
 
 def _report(
@@ -48,7 +48,7 @@ def _report(
     episode: DatasetEpisode,
     info: SimulatedInfo,
     options: ExportOptions,
-    workshop: Workshop,
+    simulators: SimulatorCache,
     allowed: Sequence[str],
 ) -> DeepReport:
     versions = version_differences(info.versions, versions_here(info, allowed))
@@ -58,7 +58,7 @@ def _report(
             raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
         with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
             again = Path(folder) / "again.mcap"
-            generate_again(info, again, workshop, allowed)
+            generate_again(info, again, simulators, allowed)
             found = tuple(
                 Difference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")
                 for what, frames in episode_differences(again, options, episode)

@@ -11,7 +11,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.plain import digest, from_plain
 from demorec.core.tables import RENDERERS
 from demorec.episode.episode import SimulatedInfo
-from demorec.loop import ScriptAgent, Session, Workshop, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.render import Renderer
 from demorec.render.painter import Painter
@@ -34,7 +34,7 @@ def recorded_config(info: SimulatedInfo, allowed: Collection[str]) -> GenerateCo
     return config
 
 
-def remake(recording: SimulatedRecording, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
+def remake(recording: SimulatedRecording, path: Path, simulators: SimulatorCache, allowed: Sequence[str] = ()) -> None:
     """Make the episode of a recording again, as a recording of the same format version.
 
     A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
@@ -43,7 +43,7 @@ def remake(recording: SimulatedRecording, path: Path, workshop: Workshop, allowe
     Args:
         recording: The original.
         path: The file to be made.
-        workshop: Gives world and renderer.
+        simulators: Gives world and renderer.
         allowed: The user's own modules that may be imported for what the recording names.
 
     Raises:
@@ -51,17 +51,19 @@ def remake(recording: SimulatedRecording, path: Path, workshop: Workshop, allowe
         DemorecError: It cannot be simulated, drawn or written here.
     """
     if recording.info.origin:
-        _send_again(recording, path, workshop, allowed)
+        _send_again(recording, path, simulators, allowed)
     else:
-        generate_again(recording.info, path, workshop, allowed)
+        generate_again(recording.info, path, simulators, allowed)
 
 
-def generate_again(recorded: SimulatedInfo, path: Path, workshop: Workshop, allowed: Sequence[str] = ()) -> None:
+def generate_again(
+    recorded: SimulatedInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str] = ()
+) -> None:
     """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
     config = recorded_config(recorded, allowed)
     episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
     info = replace(episode.info, format_version=recorded.format_version)
-    world, renderer = workshop.equip(info)
+    world, renderer = simulators.acquire(info)
     session = Session.of_episode(world, episode, renderer)
     with SimulatedWriter(path, info, video=config.video) as writer:
         for frame in session.run(ScriptAgent(episode)):
@@ -69,13 +71,13 @@ def generate_again(recorded: SimulatedInfo, path: Path, workshop: Workshop, allo
         writer.finish(session.outcome)
 
 
-def _send_again(recording: SimulatedRecording, path: Path, workshop: Workshop, allowed: Sequence[str]) -> None:
+def _send_again(recording: SimulatedRecording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
     allow_models(allowed)
     options = ReplayOptions(allowed=tuple(allowed))
     demonstration = open_demonstration(recording, options)
     info = replace(recording.info, config_digest=digest(recording.info.config))
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
-    world, renderer = workshop.equip(info)
+    world, renderer = simulators.acquire(info)
     painter = recorded_painter(info, renderer, allowed)
     with SimulatedWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
