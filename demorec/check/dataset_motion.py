@@ -1,4 +1,4 @@
-"""Is what a LeRobot dataset shows possible and different: twins, coverage, kinematics, the actions' lag."""
+"""The lag between the actions and the states of a dataset, where its sidecar says what the actions are."""
 
 from __future__ import annotations
 
@@ -8,79 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.check.alignment import nearest_lag, servo_response
-from demorec.check.base import Found, Measurement, dataset_check, worst, worst_frame
-from demorec.check.coverage import twins, worst_gap
-from demorec.check.dataset import Dataset, Rows
-from demorec.check.rows import LinkMatrices, displacement, matrices
-from demorec.check.run import motion_vector
+from demorec.check.base import Found, Measurement, sidecar_check
+from demorec.check.dataset import Dataset
 from demorec.core.geometry import Array
-from demorec.episode.episode import SimulatedInfo
-from demorec.episode.features import ACTION, EE_POSE, STATE
-from demorec.robots.assets import asset_path
-from demorec.robots.urdf import Urdf
+from demorec.episode.features import ACTION, STATE
 
 
-@dataset_check(
-    measures="episodes that move like another",
-    reads=("observation.state",),
-)
-def dataset_duplicates(dataset: Dataset) -> Measurement | None:
-    """Every episode is there once: no two have the same motion (within 0.0001 rad)."""
-    if len(dataset.rows) < 2 or STATE not in dataset.info.features:
-        return None
-    motions = [motion_vector(rows[STATE]) for rows in dataset.rows]
-    return twins(motions, [f"episode {n}" for n in range(len(motions))], "motions")
-
-
-@dataset_check(
-    measures="largest gap in the range of a randomised quantity, share",
-    warn=0.35,
-    fail=0.6,
-    reads=("demorec/",),
-)
-def dataset_coverage(dataset: Dataset) -> Found:
-    """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
-    return worst_gap(dataset.infos)
-
-
-@dataset_check(
-    measures="EE pose against forward kinematics of the joints",
-    unit="m",
-    warn=1e-4,
-    fail=1e-3,
-    reads=(
-        "observation.state",
-        "observation.ee_pose",
-        "demorec/",
-    ),
-)
-def dataset_forward_kinematics(dataset: Dataset) -> Found:
-    """The TCP's pose is that of the joints, wherever the dataset has it (float32; 0.1 m per rad of rotation)."""
-    found = []
-    for each in dataset.described():
-        rows, info = each.rows, each.info
-        if not (told := _tcp_poses(dataset, info, rows)):
-            return None
-        if (model := dataset.robot_digests[each.number]) is not None:
-            urdf = dataset.robots[model].model
-        else:
-            urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)  # as of older datasets
-        joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
-        fk = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
-        for name, poses in told.items():
-            found.append(worst_frame(displacement(matrices(poses), fk), f"{name}, episode {each.number}"))
-    return worst(*found)
-
-
-def _tcp_poses(dataset: Dataset, info: SimulatedInfo, rows: Rows) -> dict[str, Array]:
-    """Feature -> the TCP's poses (T, 7) that it holds, base frame."""
-    told = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}
-    if dataset.state_kind(info) == "joint_ee":
-        told[STATE] = rows[STATE].astype(np.float64)[:, -7:]
-    return told
-
-
-@dataset_check(
+@sidecar_check(
     measures="lag between action and state, off the contract's, frames",
     reads=(
         "action",
@@ -105,7 +39,7 @@ def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
         is_joint = kind in ("joint", "joint_increment")
         if is_joint:
             reached = state[:, :arm]
-        elif poses := _tcp_poses(dataset, info, rows):
+        elif poses := dataset.tcp_poses(info, rows):
             reached = next(iter(poses.values()))[:, :3]
         else:
             continue

@@ -57,8 +57,8 @@ FAULTS: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
     "late actions": (ACTION, late, "state_follows_action"),
     "degrees": (STATE, np.degrees, "joint_limits"),
     "a dead encoder": (STATE, lambda rows: rows * (np.arange(rows.shape[1]) != 2), "elements_alive"),
-    "velocities of another joint": (VELOCITY, exchanged, "state_matches_velocity"),
-    "velocities in degrees": (VELOCITY, np.degrees, "state_matches_velocity"),
+    "velocities of another joint": (VELOCITY, exchanged, "velocity_matches_position"),
+    "velocities in degrees": (VELOCITY, np.degrees, "velocity_matches_position"),
 }
 
 
@@ -114,7 +114,7 @@ def test_what_robots_do_is_no_fault(strange: Path, kind: str, tmp_path: Path) ->
 def test_a_wrong_rate_is_found(strange: Path, tmp_path: Path) -> None:
     spoilt = copy(strange, tmp_path / "ds")
     edit_json(spoilt / "meta/info.json", slower)
-    assert level(spoilt, "state_matches_velocity") == "fail"
+    assert level(spoilt, "velocity_matches_position") == "fail"
     edit_json(spoilt / "meta/info.json", lambda data: data.update(fps=90))
     assert level(spoilt, "joint_speed") in ("warn", "fail")
 
@@ -180,6 +180,6 @@ def test_faults_in_a_dataset_that_lerobot_wrote(run: Path, tmp_path: Path) -> No
         assert level(spoilt, check) == "fail"
     spoilt = copy(clean, tmp_path / "rate")
     edit_json(spoilt / "meta/info.json", slower)
-    assert level(spoilt, "state_matches_velocity") == "fail"
+    assert level(spoilt, "velocity_matches_position") == "fail"
     frozen = make_by_lerobot(run, tmp_path / "frozen", frozen=range(20, 80))
     assert level(frozen, "dataset_frozen", pictures=True) == "fail"
