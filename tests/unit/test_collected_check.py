@@ -222,6 +222,18 @@ def test_a_run_of_other_files_is_a_failure(collected_run: Path, tmp_path: Path) 
     assert "episode_000000.mcap is missing" in told.detail
 
 
+def test_an_episode_twice_in_a_run(tmp_path: Path) -> None:
+    with open_external_run(tmp_path / "run") as opened:
+        for index in range(2):
+            opened.add(write_external(opened.path_of(index), replace(steady(num_frames=20), info=numbered(index))))
+    report = check_subject(Subject(path=tmp_path / "run", kind="run"), CheckOptions(only=("duplicates",)))
+    assert [result.level for result in report.results] == ["fail"]
+
+
+def numbered(index: int) -> Any:
+    return replace(steady(num_frames=20).info, episode_index=index)
+
+
 @pytest.mark.parametrize("command", ["replay", "render", "reproduce"])
 def test_what_needs_a_scene_says_so(collected_run: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
     out = [] if command == "replay" else ["--out", collected_run.parent / "x"]
