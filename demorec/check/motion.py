@@ -66,6 +66,8 @@ _FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1
 EVERYWHERE: tuple[Form, ...] = ("simulated", "external", "dataset")
 
 motion_check = partial(check, group="physics", on=EVERYWHERE)
+target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
+"""Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
 _TOPICS = ("/{feature}", "/joint_states", "/action", "/command")
 
 
@@ -226,12 +228,11 @@ def velocity_matches_position(subject: Moving) -> Found:
     return Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
 
 
-@motion_check(
+@target_check(
     measures="frames by which the state is too early for its action, or too late",
     warn=0.75,
     fail=1.5,
     group="alignment",
-    needs=ACTIONS,
     reads=(STATE, ACTION, *_TOPICS),
 )
 def state_follows_action(subject: Moving) -> Found:
@@ -259,10 +260,9 @@ def state_follows_action(subject: Moving) -> Found:
     return Measurement(value=max(1 - lag, late, 0.0), detail=f"the state follows by {lag:+.2f} frames")
 
 
-@motion_check(
+@target_check(
     measures="elements of the state that follow the action of another one",
     group="alignment",
-    needs=ACTIONS,
     reads=(STATE, ACTION, *_TOPICS),
 )
 def actions_in_order(subject: Moving) -> Found:
@@ -279,12 +279,12 @@ def actions_in_order(subject: Moving) -> Found:
     return Measurement(value=len(wrong), detail="; ".join(told[:3]))
 
 
-@motion_check(
+@target_check(
+    group="physics",
     measures="distance at which a joint always stays from its action",
     unit="rad, m",
     warn=0.1,
     fail=0.3,
-    needs=ACTIONS,
     reads=(STATE, ACTION, *_TOPICS),
 )
 def state_reaches_action(subject: Moving) -> Found:

@@ -29,11 +29,6 @@ _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 _WORTH_PROCESSES = {"with pictures": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
 SubjectKind = Literal["recording", "run", "dataset"]
-_FORMS: dict[SubjectKind, tuple[Form, ...]] = {
-    "recording": ("simulated", "external"),
-    "run": ("run", "external run"),
-    "dataset": ("dataset",),
-}
 RENAMED = {
     "collected_opens": "opens",
     "collected_checksums": "checksums",
@@ -198,7 +193,9 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
     allow_models(options.allowed)
     infos: Sequence[SimulatedInfo] = ()
+    scene: tuple[Form, ...] = ()  # what is asked of others that have a scene
     if subject.kind == "recording" and is_external(subject.path):
+        scene = ("simulated",)
         with CheckedRecording(subject.path, options.urdf) as recording:
             found = _run(options, recording, ("opens", "readable"), lambda: recording.columns)
     elif subject.kind == "recording":
@@ -207,6 +204,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
             if any(result.needs_allow for result in found):
                 infos = [episode.info]
     elif subject.kind == "run" and is_external_run(subject.path):
+        scene = ("run",)
         found = _run(options, ExternalRun(subject.path), (), lambda: None)
     elif subject.kind == "run":
         found = _run(options, CheckedRun(subject.path), (), lambda: None)
@@ -215,10 +213,12 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         found = _run(options, dataset, ("dataset_readable",), lambda: dataset.rows)
         if any(result.needs_allow for result in found):
             infos = [info for info in dataset.infos if info]
-    also = options.checks(*_FORMS[subject.kind])
     known = {result.check for result in found}
-    found += [check.not_applicable() for check in also if check.name not in known
-              and (options.pictures or not check.needs_pictures)]  # fmt: skip
+    found += [
+        check.not_applicable()
+        for check in options.checks(*scene)
+        if check.name not in known and (options.pictures or not check.needs_pictures)
+    ]
     models = [name for info in infos for name in (info.robot.urdf, *(body.shape.file for body in info.scene.bodies))]
     modules = tuple(name for name in modules_of_models(models) if not is_allowed(name, options.allowed))
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)

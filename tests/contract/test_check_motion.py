@@ -249,10 +249,12 @@ def test_a_description_that_the_user_names_makes_laws_applicable(
 
     other = copy(strange, tmp_path / "ds")
     names = [*(f"axis_{n}" for n in range(1, 8)), "gripper.width"]
-    edit_json(
-        other / "meta/info.json",
-        lambda d: [d["features"][key].update(names=names) for key in (STATE, ACTION, VELOCITY)],
-    )
+
+    def renamed(data: dict[str, Any]) -> None:
+        for key in (STATE, ACTION, VELOCITY):
+            data["features"][key].update(names=names)
+
+    edit_json(other / "meta/info.json", renamed)
     code, text = told()
     assert "1 needs a robot whose URDF is known (--urdf FILE)" in text
     description = tmp_path / "arm.urdf"
