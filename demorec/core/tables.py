@@ -118,7 +118,7 @@ CHECKS: Registry[Check] = Registry(
         ("dataset_pictures", "dataset_picture_lag", "dataset_frozen"),
         ("motion", "state_follows_action", "actions_in_order", "state_reaches_action"),
         ("run", "duplicates", "coverage"),
-        ("dataset_motion", "dataset_action_lag"),
+        ("alignment", "dataset_action_lag"),
         ("dataset_files", "dataset_sidecar"),
         ("dataset_facts", "dataset_robots", "dataset_facts", "dataset_progress"),
         ("dataset_language", "dataset_language", "dataset_language_truth"),
