@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
-from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
+from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.robots.urdf import Urdf
 
 if TYPE_CHECKING:
@@ -255,14 +255,18 @@ def _motion(
         urdf=arm.urdf if any(arm.joints) else None,
         model=arm.model,
         ee_pose=_poses(features, names),
-        sensors={
-            name: values
-            for name, values in features.items()
-            if name.startswith("observation.")
-            and name in names
-            and name not in (STATE, "observation.environment_state")
-        },
+        sensors=_sensors(features, names),
     )
+
+
+def _sensors(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> dict[str, NDArray[Any]]:
+    """What is observed beside the state, and is no truth of the simulator's."""
+    others = (STATE, ENVIRONMENT_STATE)
+    return {
+        name: values
+        for name, values in features.items()
+        if name.startswith("observation.") and name in names and name not in others
+    }
 
 
 def _poses(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> Array | None:
