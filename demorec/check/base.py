@@ -22,11 +22,25 @@ from demorec.core.errors import DemorecError, MissingDependencyError, NotAllowed
 from demorec.core.geometry import Array
 
 Level = Literal["pass", "warn", "fail", "skip"]
-Scope = Literal["recording", "collected", "run", "collected_run", "dataset", "motion"]
+Form = Literal["simulated", "external", "run", "external run", "dataset"]
+"""What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
 Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures", "outcome", "run", "dataset"]
 
 _BLOCKED = "it needs what is damaged"
+_NOT_APPLICABLE = "not applicable: it needs "
 _NEEDS_ALLOW = "not measured without --allow: "
+
+SCENE = "a simulated scene"
+URDF = "a robot whose URDF is known"
+ACTIONS = "actions that are targets of the state's elements"
+VELOCITIES = "velocities of the state's elements"
+EFFORTS = "efforts of the joints, and their robot's masses"
+EE_POSES = "EE poses, and a robot whose URDF is known"
+GRIPPER = "the opening of a gripper, and its action"
+STATE_ALONE = "observation.state"
+IMAGES = "colour images"
+SIDECAR = "what demorec keeps beside its datasets"
+"""What checks need, as `Check.needs` has it."""
 
 COLOR_TOPICS = ("/camera/{camera}/h264", "/camera/{camera}/video", "/camera/{camera}/image/compressed")
 """Where a camera's coded colour pictures are, whatever the codec; for `Check.reads`."""
@@ -63,7 +77,18 @@ class NotMeasured:
     why: str
 
 
-Found = Measurement | NotMeasured | None
+@dataclass(frozen=True, kw_only=True)
+class Lacking:
+    """That the subject lacks what the check needs.
+
+    Attributes:
+        need: "a URDF", in the words of `Check.needs`.
+    """
+
+    need: str
+
+
+Found = Measurement | NotMeasured | Lacking | None
 """What a check returns; None where the thing does not exist (no cameras, no depth)."""
 
 
@@ -74,11 +99,12 @@ class Check:
     Attributes:
         name: Its row in `demorec.core.tables.CHECKS`.
         group: What it is about.
-        scope: What it looks at: a recording of a simulated or of a collected episode, a run (its folder), a dataset, or
-            the motions of any of them whose robot is not one of our simulation (`demorec.check.motion`).
+        on: What it can look at, whatever else it needs.
+        needs: What it needs, in few words.
         measures: What the value is, in words.
         unit: Of the value and the limits; "" for counts and ratios.
         warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.
+        simulated: (warn, fail) of recordings that demorec simulated, where these are exact and others are not.
         needs_pictures: Whether pictures have to be decoded.
         reads: What it looks at, of all that `demorec.check.reads` lists: topics, fields, columns.
         measure: The function.
@@ -86,11 +112,13 @@ class Check:
 
     name: str
     group: Group
-    scope: Scope
+    on: tuple[Form, ...]
+    needs: str
     measures: str
     unit: str
     warn: float
     fail: float
+    simulated: tuple[float, float]
     needs_pictures: bool
     reads: tuple[str, ...]
     measure: Callable[[Any], Found]
@@ -98,10 +126,16 @@ class Check:
     @property
     def summary(self) -> str:
         """One line for `demorec list checks`."""
+        general, simulated = self._words(self.warn, self.fail), self._words(*self.simulated)
+        limits = (
+            general if general == simulated or "simulated" not in self.on else f"{general} (simulated: {simulated})"
+        )
+        return f"{self.group}, needs {self.needs}: {self.measures}; {limits}"
+
+    def _words(self, warn: float, fail: float) -> str:
         unit = f" {self.unit}" if self.unit else ""
-        warn = "" if self.warn == self.fail else f"warns above {self.warn:g}{unit}, "
-        fail = "never fails" if math.isinf(self.fail) else f"fails above {self.fail:g}{unit}"
-        return f"{self.scope}, {self.group}: {self.measures}; {warn}{fail}"
+        warns = "" if warn == fail else f"warns above {warn:g}{unit}, "
+        return warns + ("never fails" if math.isinf(fail) else f"fails above {fail:g}{unit}")
 
     def run(self, subject: object) -> Result:
         """Measure and judge; an error while reading or computing is a failure of this check, a missing package is none.
@@ -119,16 +153,27 @@ class Check:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
             if isinstance(error, DemorecError):
-                return self._result("fail", Measurement(value=math.nan, detail=str(error)))
+                return self._result("fail", Measurement(value=math.nan, detail=str(error)), subject)
             # What is broken in a way that nobody foresaw must not take the other checks' findings with it.
             logging.getLogger(__name__).debug("check %s", self.name, exc_info=True)
             odd = Measurement(value=math.nan, detail="the data are such that this check cannot be computed on them")
-            return self._result("fail", odd)
+            return self._result("fail", odd, subject)
         if found is None:
             return self.skipped("nothing to measure")
+        if isinstance(found, Lacking):
+            return self.not_applicable(found.need)
         if isinstance(found, NotMeasured):
             return self.skipped(f"not measured: {found.why}")
-        return self._result(self.judge(found.value), found)
+        warn, fail = self._limits(subject)
+        level: Level = "pass" if found.value <= warn else "warn" if found.value <= fail else "fail"
+        return self._result(level, found, subject)
+
+    def _limits(self, subject: object) -> tuple[float, float]:
+        return self.simulated if getattr(subject, "form", "") == "simulated" else (self.warn, self.fail)
+
+    def not_applicable(self, need: str = "") -> Result:
+        """The result of a check that the subject lacks something for: by default all that it `needs`."""
+        return self.skipped(f"{_NOT_APPLICABLE}{need or self.needs}")
 
     def blocked(self) -> Result:
         """The result of a check that needs what another one has found to be damaged."""
@@ -138,21 +183,16 @@ class Check:
         """The result of a check that could not be run."""
         return self._result("skip", Measurement(value=math.nan, detail=why))
 
-    def judge(self, value: float) -> Level:
-        """The level of a value; what is no number fails."""
-        if value <= self.warn:
-            return "pass"
-        return "warn" if value <= self.fail else "fail"
-
-    def _result(self, level: Level, found: Measurement) -> Result:
+    def _result(self, level: Level, found: Measurement, subject: object = None) -> Result:
+        warn, fail = self._limits(subject)
         return Result(
             check=self.name,
             group=self.group,
             level=level,
             value=float(found.value) if math.isfinite(found.value) else None,
             unit=self.unit,
-            warn=self.warn,
-            fail=self.fail,
+            warn=warn,
+            fail=fail,
             frame=found.frame,
             detail=found.detail,
         )
@@ -190,6 +230,12 @@ class Result:
         return self.level == "skip" and self.detail == _BLOCKED
 
     @property
+    def lacks(self) -> str:
+        """What the subject lacks for it, "" where it could be measured."""
+        is_lacking = self.level == "skip" and self.detail.startswith(_NOT_APPLICABLE)
+        return self.detail.removeprefix(_NOT_APPLICABLE) if is_lacking else ""
+
+    @property
     def needs_allow(self) -> bool:
         """Whether nothing was measured since the user has not allowed a module that it needs a file of."""
         return self.level == "skip" and self.detail.startswith(_NEEDS_ALLOW)
@@ -201,15 +247,17 @@ def check(
     measures: str,
     warn: float = 0,
     fail: float | None = None,
+    simulated: tuple[float, float] | None = None,
     unit: str = "",
-    scope: Scope = "recording",
+    on: tuple[Form, ...] = ("simulated",),
+    needs: str = SCENE,
     needs_pictures: bool = False,
     reads: tuple[str, ...] = (),
 ) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
     """Make a `Check` of a function; its name is the function's. Of a generator the `worst` that it yields is judged.
 
-    A check that stands in `demorec.check.limits` has the limits of there, whatever it is given here. Without `fail`
-    there are no warnings, and without any limit nothing above zero passes.
+    Recordings that demorec simulated have the limits of `demorec.check.limits`, where the check stands in there, or
+    those of `simulated`. Without `fail` there are no warnings, and without any limit nothing above zero passes.
     """
 
     def wrap(function: Callable[[Any], Found | Iterator[Found]]) -> Check:
@@ -219,15 +267,19 @@ def check(
             return worst(*found) if isinstance(found, Iterator) else found
 
         name = function.__name__
-        limits = limit_table().checks.get(name)
+        table, general = limit_table().checks.get(name), (warn, warn if fail is None else fail)
+        exact = (table.warn, table.fail) if table else simulated or general
+        limits = exact if on == ("simulated",) else general
         return Check(
             name=name,
             group=group,
-            scope=scope,
+            on=on,
+            needs=needs,
             measures=measures,
             unit=unit,
-            warn=limits.warn if limits else warn,
-            fail=limits.fail if limits else warn if fail is None else fail,
+            warn=limits[0],
+            fail=limits[1],
+            simulated=exact,
             needs_pictures=needs_pictures,
             reads=reads,
             measure=measure,
@@ -243,9 +295,10 @@ alignment_check = partial(check, group="alignment")
 calibration_check = partial(check, group="calibration")
 picture_check = partial(check, group="pictures", needs_pictures=True)
 outcome_check = partial(check, group="outcome")
-external_check = partial(check, scope="collected")
-run_check = partial(check, group="run", scope="run")
-dataset_check = partial(check, group="dataset", scope="dataset")
+external_check = partial(check, on=("external",), needs="stamps of its own for each sample")
+run_check = partial(check, group="run", on=("run",), needs="a run of simulated episodes")
+dataset_check = partial(check, group="dataset", on=("dataset",), needs="a LeRobot dataset")
+sidecar_check = partial(check, group="dataset", on=("dataset",), needs=SIDECAR)
 
 
 def worst(*found: Found) -> Found:
@@ -254,9 +307,11 @@ def worst(*found: Found) -> Found:
     Where nothing was measured: why not, or None when there is nothing.
     """
     known = [measurement for measurement in found if isinstance(measurement, Measurement)]
-    reasons = [row.why for row in found if isinstance(row, NotMeasured)]
+    reasons = list(dict.fromkeys(row.why for row in found if isinstance(row, NotMeasured)))
+    if not known and not reasons:
+        return next((row for row in found if isinstance(row, Lacking)), None)
     if not known:
-        return NotMeasured(why="; ".join(reasons)) if reasons else None
+        return NotMeasured(why="; ".join(reasons))
     largest = max(known, key=lambda m: math.inf if math.isnan(m.value) else m.value)
     if not reasons:
         return largest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -121,3 +122,12 @@ def cell_counts(width: int, height: int) -> tuple[int, int]:
 def cell_side(width: int, height: int, counts: tuple[int, int]) -> int:
     """Pixels along the side of each cell of a grid with so many columns and rows."""
     return min(width // counts[0], height // counts[1])
+
+
+def correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Of two tables of the same shape; 0 where one does not change."""
+    x, y = (np.asarray(values, dtype=np.float32).reshape(-1) for values in (a, b))
+    x, y = x - x.mean(), y - y.mean()
+    # No BLAS: its threads wait for each other on a busy machine.
+    size = math.sqrt(float(np.einsum("i,i->", x, x)) * float(np.einsum("i,i->", y, y)))
+    return float(np.einsum("i,i->", x, y)) / size if size > 0 else 0.0

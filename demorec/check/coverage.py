@@ -139,6 +139,14 @@ def twins(rows: Sequence[Array], names: Sequence[str], what: str) -> Measurement
     return Measurement(value=count, detail=first or f"{len(rows)} different {what}")
 
 
+def motion_vector(joint_position: Array) -> Array:
+    """A motion as one row of fixed length: joint positions at 32 moments, evenly spread."""
+    if not len(joint_position):
+        return np.zeros(32)
+    moments = np.linspace(0, len(joint_position) - 1, 32).round().astype(int)
+    return np.asarray(joint_position[moments], dtype=np.float64).reshape(-1)
+
+
 def draw_coverage(infos: Sequence[SimulatedInfo], path: Path) -> None:
     """A PNG file: starts (dots, in the object's colour) and goals (rings) from above, and a histogram per quantity.
 

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.check.base import NotMeasured
-from demorec.check.cells import Cells
+from demorec.check.base import Form, NotMeasured
+from demorec.check.cells import Cells, correlation
+from demorec.check.coverage import motion_vector
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw, frames_to_draw
+from demorec.check.dynamics import Dynamics
 from demorec.check.episode_drawn import drawable_scene
+from demorec.check.evidence import Motion, motions_of_dataset
+from demorec.check.motion import Motions, point_masses
+from demorec.check.rows import LinkMatrices
 from demorec.core.errors import ConfigError, ExportError, in_words
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import open_table, read_table
@@ -29,6 +35,7 @@ from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import (
     ACTION,
+    EE_POSE,
     IMAGE_PREFIX,
     STATE,
     STATE_KINDS,
@@ -39,6 +46,8 @@ from demorec.episode.features import (
 )
 from demorec.episode.validity import read_episode_info
 from demorec.render.recorded import RecordedWorld
+from demorec.robots.assets import asset_path
+from demorec.robots.urdf import Urdf
 
 Rows = Mapping[str, NDArray[Any]]
 
@@ -78,10 +87,13 @@ class Dataset:
 
     Args:
         path: Its folder.
+        urdf: Text of its robot's description that the user names, "" for none.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    form: ClassVar[Form] = "dataset"
+
+    def __init__(self, path: Path, urdf: str = "") -> None:
+        self.path, self.urdf = path, urdf
         self._pictures: dict[str, list[EpisodePictures]] = {}
 
     @cached_property
@@ -121,6 +133,21 @@ class Dataset:
                     f"Episode {place.episode_index} has no number in {name}[{component}] at frame {frame}: {self.path}"
                 )
         return rows
+
+    @cached_property
+    def motions(self) -> Motions:
+        """Those of its episodes."""
+        return Motions(lambda: list(motions_of_dataset(self)))
+
+    def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
+        """The torques that a motion needs."""
+        return point_masses(motion)
+
+    def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
+        """(two cameras, correlation of their images in an episode), the first three episodes alone."""
+        for one, other in combinations(self.colour_keys, 2):
+            for number, (a, b) in enumerate(zip(self.pictures(one)[:3], self.pictures(other)[:3], strict=True)):
+                yield f"{one} and {other}, episode {number}", correlation(a.cells, b.cells)
 
     @property
     def colour_keys(self) -> list[str]:
@@ -190,6 +217,37 @@ class Dataset:
             return [read_episode_info(row["episode_info"]) for row in self.sidecar if row["episode_info"] is not None]
         except (ValueError, KeyError, TypeError) as error:
             raise ExportError(f"The sidecar's episode_info cannot be used ({in_words(error)}): {self.path}") from error
+
+    @property
+    def successes(self) -> list[SimulatedInfo]:
+        """What was known of each simulated episode."""
+        return self.infos
+
+    def courses(self) -> tuple[list[str], list[Array], list[Array]]:
+        """Names of the episodes and their motions; their starts are in these."""
+        motions = [motion_vector(rows[STATE]) for rows in self.rows] if STATE in self.info.features else []
+        return [f"episode {number}" for number in range(len(motions))], motions, []
+
+    def tcp_poses(self, info: SimulatedInfo, rows: Rows) -> dict[str, Array]:
+        """Feature -> the TCP's poses (T, 7) that it holds, base frame."""
+        told = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}
+        if self.state_kind(info) == "joint_ee":
+            told[STATE] = rows[STATE].astype(np.float64)[:, -7:]
+        return told
+
+    def hand_poses(self) -> Iterator[tuple[str, Array, Array]]:
+        """(where, poses (T, 7), base_from_tcp (T, 4, 4) by the joints) of every simulated episode."""
+        for each in self.described():
+            rows, info = each.rows, each.info
+            if not (told := self.tcp_poses(info, rows)):
+                return
+            if (model := self.robot_digests[each.number]) is not None:
+                urdf = self.robots[model].model
+            else:
+                urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)  # as of older datasets
+            joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
+            hand = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
+            yield from ((f"{name}, episode {each.number}", poses, hand) for name, poses in told.items())
 
     def check_simulated(self) -> None:
         """Raise ConfigError for a dataset of collected episodes, which no simulator can make or replay."""

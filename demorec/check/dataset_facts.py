@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, dataset_check
+from demorec.check.base import Measurement, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, without_path
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, STAGE_COLUMNS, facts_of, progress_table, read_progress
@@ -14,7 +14,7 @@ from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.robots import read_robot
 
 
-@dataset_check(
+@sidecar_check(
     measures="descriptions of robots that are missing, changed or of another robot",
     reads=("demorec/",),
 )
@@ -47,7 +47,7 @@ def dataset_robots(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(used)} robot{'s' * (len(used) > 1)}")
 
 
-@dataset_check(
+@sidecar_check(
     measures="columns of the table of episodes that the sidecar contradicts",
     reads=("meta/episodes", "demorec/"),
 )

@@ -13,7 +13,7 @@ import tempfile
 
 import numpy as np
 
-from demorec.check.base import Measurement, dataset_check
+from demorec.check.base import Measurement, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
@@ -108,7 +108,7 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
 
 
-@dataset_check(
+@sidecar_check(
     measures="episodes on which dataset and sidecar disagree",
     reads=("demorec/",),
 )

@@ -19,7 +19,7 @@ from demorec.annotate.kinds import STATES
 from demorec.annotate.questions import ANSWERS
 from demorec.annotate.referring import references
 from demorec.annotate.situation import COLOR_WORDS, Surroundings, place_of, situation
-from demorec.check.base import Found, Measurement, NotMeasured, dataset_check
+from demorec.check.base import Found, Measurement, NotMeasured, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode
@@ -122,7 +122,7 @@ def _points(answer: Row) -> Iterator[tuple[float, float]]:
         yield (float(point[0]), float(point[1])) if numbers else (math.nan, math.nan)
 
 
-@dataset_check(
+@sidecar_check(
     measures="statements that the phases, the scene or the boxes beside the dataset contradict",
     reads=(*COLUMNS, "demorec/"),
 )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, NotMeasured, dataset_check
+from demorec.check.base import Found, Measurement, NotMeasured, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.check.dataset_statistics import episode_column, numbers_of, read_statistics
 from demorec.check.drawn import judge_lag, judge_unlike
@@ -115,7 +115,7 @@ def _off_colour(said: Any, mean: Array, detail: str) -> Measurement:
 
 
 drawn_check = partial(
-    dataset_check,
+    sidecar_check,
     needs_pictures=True,
     reads=("observation.images.{camera}", "observation.state", "demorec/"),
 )

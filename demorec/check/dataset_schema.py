@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from demorec.check.base import Measurement, dataset_check
+from demorec.check.base import Measurement, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, in_words
 from demorec.core.tables import ROBOTS
@@ -141,7 +141,7 @@ def _splits(dataset: Dataset) -> Iterator[str]:
         yield f"the splits have {len(used)} of {dataset.info.total_episodes} episodes"
 
 
-@dataset_check(
+@sidecar_check(
     measures="statements of info.json that the episodes' own descriptions contradict",
     reads=(
         "meta/info.json",

@@ -7,14 +7,15 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
+from itertools import combinations
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Found, NotMeasured
-from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells
+from demorec.check.base import Form, Found, NotMeasured
+from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells, correlation
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode
 from demorec.check.rows import LinkMatrices, matrices
@@ -26,6 +27,11 @@ from demorec.mcap import SimulatedRecording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
+
+if TYPE_CHECKING:
+    from demorec.check.dynamics import Dynamics
+    from demorec.check.evidence import Motion
+    from demorec.check.motion import Motions
 
 _STAMP_FIRST = {
     "sensor_msgs/msg/JointState",
@@ -65,6 +71,8 @@ class CheckedEpisode(ExitStack):
     Args:
         path: The recording.
     """
+
+    form: ClassVar[Form] = "simulated"
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -151,7 +159,31 @@ class CheckedEpisode(ExitStack):
         """The file's messages and metadata as they are."""
         return self.enter_context(closing(Container(self.path)))
 
+    @property
+    def message_counts(self) -> dict[str, int]:
+        """Topic -> messages that are there."""
+        return {topic: len(scan.time_ns) for topic, scan in self.scan.items()}
+
+    @property
+    def num_words(self) -> int:
+        """How many events there are."""
+        return len(self.events)
+
     # ------------------------------------------------------------------------------------------- the robot
+
+    @cached_property
+    def motions(self) -> Motions:
+        """The one of its robot."""
+        from demorec.check.evidence import motion_of_simulated
+        from demorec.check.motion import Motions
+
+        return Motions(lambda: [motion_of_simulated(self)] if self.num_frames else [])
+
+    def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
+        """The torques that its motion needs."""
+        from demorec.check.dynamics import dynamics_of
+
+        return self.shared(dynamics_of)
 
     @property
     def num_arm(self) -> int:
@@ -189,6 +221,16 @@ class CheckedEpisode(ExitStack):
             return (kinematics or self.recorded_kinematics)[link]
         except KeyError as error:
             raise RecordingError(f"The recorded URDF has no link {link!r}: {self.path}") from error
+
+    def hand_poses(self) -> Iterator[tuple[str, Array, Array]]:
+        """(where, poses (T, 7), base_from_tcp (T, 4, 4) by the joints): observed, wanted and commanded."""
+        c, link = self.columns, self.info.robot.tcp_link
+        yield "observed", c.base_from_tcp, self.base_from_link(link)
+        for name, poses, joints in (
+            ("action", c.action_base_from_tcp, c.action_joint_target),
+            ("command", c.command_base_from_tcp, c.command_joint_target),
+        ):
+            yield name, poses, self.base_from_link(link, self.kinematics(joints))
 
     @cached_property
     def world_from_base(self) -> Array:
@@ -233,6 +275,16 @@ class CheckedEpisode(ExitStack):
         if (camera.name, kind) not in self._pictures:
             self._pictures[camera.name, kind] = summarise(self.recording, camera, kind)
         return self._pictures[camera.name, kind]
+
+    def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
+        """(two cameras in different places, correlation of their images)."""
+        poses = self.columns.world_from_camera
+        for camera, other in combinations(self.cameras, 2):
+            first, second = self.pictures(camera).cells, self.pictures(other).cells
+            count = min(len(first), len(second))
+            is_near = np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3
+            if first.shape[1:] == second.shape[1:] and count >= 2 and not is_near:
+                yield f"{camera.name} and {other.name}", correlation(first[:count], second[:count])
 
     @cached_property
     def _drawn(self) -> DrawnEpisode | NotMeasured:

@@ -6,28 +6,32 @@ from collections.abc import Iterator
 
 from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
-from demorec.episode.episode import FORMAT_VERSION
-from demorec.mcap import Recording, channels, messages
+from demorec.check.external import CheckedRecording
+from demorec.mcap import channels, messages
+from demorec.mcap.external.streams import SUBTASK
 from demorec.mcap.streams import frame_streams
 
 
 @file_check(
     measures="recordings that cannot be opened (index, metadata, format version)",
-    reads=("info.format_version",),
+    on=("simulated", "external"),
+    needs="a recording",
+    reads=("info.format_version", "metadata demorec.collected"),
 )
-def opens(episode: CheckedEpisode) -> Measurement:
+def opens(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
-    version = episode.recording.info.format_version
-    return Measurement(value=0, detail=f"format version {version} of {FORMAT_VERSION}")
+    return Measurement(value=0, detail=f"format version {episode.recording.info.format_version}")
 
 
 @file_check(
     measures="topics whose message count differs from the index; every chunk passes its CRC",
-    reads=("metadata demorec.episode",),
+    on=("simulated", "external"),
+    needs="a recording",
+    reads=("metadata demorec.episode", "metadata demorec.collected"),
 )
-def checksums(episode: CheckedEpisode) -> Measurement:
+def checksums(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     """Every byte that holds a message or an attachment passes its checksum, and the index counts them right."""
-    counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
+    counts = episode.message_counts
     wrong = [
         f"{topic}: {counts[topic]}, index says {count}"
         for topic, (_, count) in episode.recording.topics.items()
@@ -86,25 +90,23 @@ def _picture_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str
 
 @file_check(
     measures="streams that do not decode into numbers",
-    reads=(
-        "/events",
-        "/phase",
-        "/deliberate_miss",
-    ),
+    on=("simulated", "external"),
+    needs="a recording",
+    reads=("/events", "/phase", "/deliberate_miss", "/frames", "/{feature}", SUBTASK),
 )
-def readable(episode: CheckedEpisode) -> Measurement:
-    """Every message has the layout that the metadata promises."""
-    num_frames = episode.columns.num_frames
-    num_events = len(episode.events)
-    return Measurement(value=0, detail=f"{num_frames} frames, {num_events} events")
+def readable(episode: CheckedEpisode | CheckedRecording) -> Measurement:
+    """Every message has the layout that the metadata promises, at its frame's time."""
+    return Measurement(value=0, detail=f"{episode.columns.num_frames} frames, {episode.num_words} events and subtasks")
 
 
 @file_check(
     measures="recordings that a crash cut off (recovered, without an outcome)",
     fail=1,
+    on=("simulated", "external"),
+    needs="a recording",
     reads=("metadata demorec.recovered",),
 )
-def complete(episode: CheckedEpisode | Recording) -> Measurement:
+def complete(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     """The episode was recorded to its end."""
-    cut = episode.outcome is None
+    cut = episode.recording.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")

@@ -11,8 +11,6 @@ from demorec.check.episode import CheckedEpisode
 from demorec.check.objects import SOLID
 from demorec.episode.scene import Body
 
-SETTLE_SECONDS = 0.6
-"""After a new command the fingers need so long to arrive; they close at 0.2 m/s from an opening of 0.1 m."""
 CARRIED_HEIGHT = 0.03
 """Metres above its start from which on an object counts as carried."""
 
@@ -28,31 +26,6 @@ def gripper_label(episode: CheckedEpisode) -> Measurement | None:
     """Exploration noise is on the arm alone: the label asks for the opening that was sent."""
     c = episode.columns
     return worst_frame(np.abs(c.action_gripper - c.command_gripper))
-
-
-@physics_check(
-    measures="gripper opening against a command that it has had the time to follow",
-    unit="m",
-    reads=("/gripper", "/command", "/joint_states"),
-)
-def gripper_follows(episode: CheckedEpisode) -> Found:
-    """The fingers stand where they were told to, or further apart where something is between them.
-
-    Catches openings and commands that are inverted, halved or frozen.
-    """
-    c, fps = episode.columns, episode.info.fps
-    wait = math.ceil(SETTLE_SECONDS * fps)
-    if c.num_frames <= wait:
-        return NotMeasured(why=f"the episode is shorter than {SETTLE_SECONDS} s")
-    steady = np.ones(c.num_frames, dtype=bool)
-    for back in range(1, wait + 1):
-        steady[back:] &= np.abs(c.command_gripper[back:] - c.command_gripper[:-back]) < 1e-6
-    steady[:wait] = False
-    if not steady.any():
-        return NotMeasured(why="the gripper's command never lasts")
-    gap = c.gripper_width - c.command_gripper
-    off = np.where(c.contact_force > 0, np.maximum(-gap, 0.0), np.abs(gap))
-    return worst_frame(np.where(steady, off, 0.0), f"{int(steady.sum())} frames after the motion")
 
 
 @physics_check(

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from demorec.check.base import Found, Measurement, check
+from demorec.check.run import ExternalRun
 
 if TYPE_CHECKING:
     from demorec.sources.import_file import ImportFile
@@ -22,57 +22,59 @@ _TIMES = frozenset(
 _PICTURES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
 _MOST_TOLD = 5
 
-import_check = partial(check, scope="collected_run", fail=math.inf, reads=("import.json",))
+import_check = partial(
+    check, on=("external run",), needs="a run that was imported", fail=math.inf, reads=("import.json",)
+)
 
 
 @import_check(
     group="time",
     measures="findings about times in the bags that were imported: clocks, losses, gaps, repeats, jitter, order",
 )
-def import_times(folder: Path) -> Found:
+def import_times(run: ExternalRun) -> Found:
     """The streams of the bags were whole, in order and on one clock."""
-    return _found(folder, lambda kind: kind in _TIMES)
+    return _found(run, lambda kind: kind in _TIMES)
 
 
 @import_check(
     group="pictures",
     measures="findings about cameras in the bags that were imported: frozen, swapped, of several sizes",
 )
-def import_pictures(folder: Path) -> Found:
+def import_pictures(run: ExternalRun) -> Found:
     """Each camera showed its own pictures, of one size and kind."""
-    return _found(folder, lambda kind: kind in _PICTURES)
+    return _found(run, lambda kind: kind in _PICTURES)
 
 
 @import_check(
     group="physics",
     measures="findings about numbers in the bags that were imported: NaN, stuck sensors, spikes, units",
 )
-def import_numbers(folder: Path) -> Found:
+def import_numbers(run: ExternalRun) -> Found:
     """The numbers of the bags were such as robots have."""
-    return _found(folder, lambda kind: kind not in _TIMES | _PICTURES)
+    return _found(run, lambda kind: kind not in _TIMES | _PICTURES)
 
 
 @import_check(
     group="run",
     measures="episodes that an import dropped, since something was missing or too old, and bags that it skipped",
 )
-def import_dropped(folder: Path) -> Found:
+def import_dropped(run: ExternalRun) -> Found:
     """Every episode that the bags hold is in the run, but those that a marker discards."""
-    if (found := _import(folder)) is None:
+    if (found := _import(run)) is None:
         return None
     rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
     dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
     return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_TOLD]))
 
 
-def _import(folder: Path) -> ImportFile | None:
+def _import(run: ExternalRun) -> ImportFile | None:
     from demorec.sources.import_file import load_import_file
 
-    return load_import_file(folder)
+    return load_import_file(run.path)
 
 
-def _found(folder: Path, is_mine: Callable[[str], bool]) -> Found:
-    if (found := _import(folder)) is None:
+def _found(run: ExternalRun, is_mine: Callable[[str], bool]) -> Found:
+    if (found := _import(run)) is None:
         return None
     told = [
         f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")

@@ -1,30 +1,42 @@
-"""Laws of motion that hold for any robot, on every episode that has the features they need, whoever recorded it.
+"""Laws of motion that hold for any robot, on every episode that has what they need, whoever recorded it.
 
-What is known of the elements of `observation.state` comes from the recording or the sidecar, or from the robot whose
-joints their names are. An action is compared with the state where its elements are targets of the same joints.
+An action is compared with the state where its elements are targets of the same joints.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from demorec.check.base import Found, Measurement, NotMeasured, check, worst_entry
-from demorec.check.dataset import Dataset
-from demorec.check.rows import finest_lag
+from demorec.check.base import (
+    ACTIONS,
+    EE_POSES,
+    EFFORTS,
+    GRIPPER,
+    STATE_ALONE,
+    URDF,
+    VELOCITIES,
+    Form,
+    Found,
+    Lacking,
+    Measurement,
+    NotMeasured,
+    check,
+    worst_entry,
+    worst_frame,
+)
+from demorec.check.dynamics import Dynamics, masses_of
+from demorec.check.evidence import Flags, Motion
+from demorec.check.rows import LinkMatrices, displacement, finest_lag, longest_run, matrices
+from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX, recognised_robot
-from demorec.episode.features import ACTION, STATE, VELOCITY
-from demorec.mcap import Recording
+from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.robots.urdf import Urdf
 
-GRIPPER = "gripper.width"
-"""The element that is the opening of a simulated gripper, metres."""
 _REACH_S = 1.0
 """How far apart in time an action and the state that follows it are looked for, seconds."""
 _LATEST_S = 0.35
@@ -44,53 +56,35 @@ _VELOCITY_S = 0.3
 """Over which velocities are added up: filters of drivers are 20 to 100 ms late, which cancels over longer times."""
 _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
+_SETTLE_S = 0.6
+"""After a new command the fingers need so long to arrive; they close at 0.2 m/s from an opening of 0.1 m."""
+_STILL_FRAMES = 19
+"""Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
+_FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1
+"""By which fixed mounts are found, and metres at which a turn counts beside a distance."""
 
-Flags = NDArray[np.bool_]
+EVERYWHERE: tuple[Form, ...] = ("simulated", "external", "dataset")
 
-motion_check = partial(check, group="physics", scope="motion", reads=(STATE, ACTION, VELOCITY, "/{feature}"))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Motion:
-    """How a robot moves in one episode; elements are those of observation.state.
-
-    Attributes:
-        where: "episode 3", or "" where there is only one.
-        fps: Frames per second.
-        steps_s: (T - 1,) time from each frame to the next, seconds.
-        names: Of the D elements.
-        state: (T, D) rad or m where the joint is known, else as it came.
-        velocity, action: (T, D) of the same elements and units, NaN where an element has none; None for no element.
-        lower, upper: (D,) limits; infinite where they are not known.
-        speed: (D,) largest speed, rad/s or m/s; infinite where it is not known.
-    """
-
-    where: str
-    fps: float
-    steps_s: Array
-    names: tuple[str, ...]
-    state: Array
-    velocity: Array | None
-    action: Array | None
-    lower: Array
-    upper: Array
-    speed: Array
+motion_check = partial(check, group="physics", on=EVERYWHERE)
+target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
+"""Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
+_TOPICS = ("/{feature}", "/joint_states", "/action", "/command")
 
 
 class Motions:
     """All motions of a dataset, or the one of a recording.
 
     Args:
-        subject: It, open.
+        read: Gives them.
     """
 
-    def __init__(self, subject: Dataset | Recording) -> None:
-        self._subject = subject
+    def __init__(self, read: Callable[[], Sequence[Motion]]) -> None:
+        self._read = read
 
     @cached_property
     def all(self) -> Sequence[Motion]:
         """Of every episode that has a state."""
-        return list(_of_dataset(self._subject) if isinstance(self._subject, Dataset) else _of_recording(self._subject))
+        return self._read()
 
     @cached_property
     def targets(self) -> list[tuple[Array, Array]]:
@@ -134,133 +128,83 @@ def _correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
     return np.asarray(state.T @ action / np.maximum(size, 1e-12))
 
 
-# ------------------------------------------------------------------------------------------------------ what is known
+class Moving(Protocol):
+    """What the laws are about: it has motions."""
 
+    @property
+    def motions(self) -> Motions:
+        """Of its episodes."""
+        ...
 
-def _motion(
-    where: str,
-    fps: float,
-    features: Mapping[str, Array],
-    names: Mapping[str, Sequence[str]],
-    joints: Sequence[str],
-    units: Mapping[str, Sequence[str]],
-    urdf: Urdf | None,
-    *,
-    opening: float = math.inf,
-    time_ns: NDArray[np.int64] | None = None,
-) -> Motion:
-    state, elements = features[STATE].astype(np.float64), names[STATE]
-    known = {} if urdf is None else {joint.name: joint for joint in urdf.joints}
-    found = [known.get(joint) for joint in joints] or [None] * len(elements)
-    lower = np.array([-math.inf if joint is None else joint.lower for joint in found])
-    upper = np.array([math.inf if joint is None else joint.upper for joint in found])
-    if opening < math.inf and GRIPPER in elements:
-        place = list(elements).index(GRIPPER)
-        lower[place], upper[place] = 0.0, opening
-
-    def factor(feature: str) -> Array:
-        """(D,) from the feature's own units: a leader may tell degrees of an arm that tells rad."""
-        degrees = [math.radians(1) if unit in ("deg", "degree") else 1.0 for unit in units.get(feature, ())]
-        return np.array(degrees if len(degrees) == len(names[feature]) else [1.0] * len(names[feature]))
-
-    def alike(feature: str) -> Array | None:
-        """The elements of another feature that have the names of the state's, or all of as many without names."""
-        if feature not in features:
-            return None
-        values, theirs = features[feature].astype(np.float64) * factor(feature), names[feature]
-        places = {ELEMENT_SUFFIX.sub("", name): index for index, name in enumerate(theirs)}
-        columns = [places.get(ELEMENT_SUFFIX.sub("", name)) for name in elements]
-        if all(column is None for column in columns):
-            return None
-        missing = np.full(len(state), np.nan)
-        return np.stack([missing if column is None else values[:, column] for column in columns], axis=1)
-
-    velocity, action = alike(VELOCITY), alike(ACTION)
-    return Motion(
-        where=where,
-        fps=fps,
-        steps_s=np.full(len(state) - 1, 1 / fps) if time_ns is None else np.maximum(np.diff(time_ns) / 1e9, 0.5 / fps),
-        names=tuple(elements),
-        state=state * factor(STATE),
-        velocity=velocity,
-        action=action,
-        lower=lower,
-        upper=upper,
-        speed=np.array([math.inf if joint is None else joint.max_speed for joint in found]),
-    )
-
-
-def _of_recording(recording: Recording) -> Iterator[Motion]:
-    info, columns = recording.info, recording.columns()
-    described = {feature.name: feature for feature in info.features}
-    if STATE not in described or not columns.num_frames:
-        return
-    state = described[STATE]
-    names = {name: feature.names for name, feature in described.items()}
-    joints, urdf = state.joints, Urdf.parse(info.urdf) if info.urdf else None
-    if urdf is None and (robot := recognised_robot(state.names)) is not None:
-        joints, urdf = robot.record.joints[STATE], robot.model
-    units = {name: feature.units for name, feature in described.items()}
-    yield _motion("", info.fps, columns.features, names, joints, units, urdf, time_ns=columns.time_ns)
-
-
-def _of_dataset(dataset: Dataset) -> Iterator[Motion]:
-    features = dataset.info.features
-    if STATE not in features or features[STATE].dtype not in ("float32", "float64"):
-        return
-    names = {
-        name: features[name].names or tuple(map(str, range(features[name].shape[0])))
-        for name in (STATE, VELOCITY, ACTION)
-        if name in features
-    }
-    stranger = recognised_robot(tuple(names[STATE]))
-    for number, rows in enumerate(dataset.rows):
-        digest = dataset.robot_digests.get(number)
-        robot = stranger if digest is None else dataset.robots[digest]
-        joints: Sequence[str] = ()
-        units: Mapping[str, Sequence[str]] = {}
-        urdf, opening = None, math.inf
-        if robot is not None:
-            joints, units = robot.record.joints.get(STATE, ()), robot.record.units
-            urdf, spec = robot.model, robot.record.spec
-            opening = math.inf if spec is None else spec.gripper.max_width
-        yield _motion(f"episode {number}", dataset.info.fps, rows, names, joints, units, urdf, opening=opening)
+    def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
+        """The torques that a motion needs; None where the robot's model is not known."""
+        ...
 
 
 # -------------------------------------------------------------------------------------------------------------- laws
 
 
-@motion_check(measures="how far joints are beyond their limits", unit="rad, m", warn=0.01, fail=0.2)
-def joint_limits(motions: Motions) -> Iterator[Found]:
-    """Observed joints are within the limits of the robot's URDF: catches degrees for radians, and offsets."""
-    for motion in motions.all:
+@motion_check(
+    measures="how far the state, and what is sent to it, is beyond the limits of its joints",
+    unit="rad, m",
+    warn=0.01,
+    fail=0.2,
+    simulated=(0.005, 0.05),
+    needs=URDF,
+    reads=(STATE, *_TOPICS, "info.robot.position_lower", "info.robot.position_upper"),
+)
+def joint_limits(subject: Moving) -> Iterator[Found]:
+    """Joints are within the limits of the robot's URDF: catches degrees for radians, and offsets."""
+    for motion in subject.motions.all:
         known = np.isfinite(motion.lower) | np.isfinite(motion.upper)
         if not known.any():
-            yield NotMeasured(why="no element of the state is known to be the position of a joint with limits")
+            yield Lacking(need=URDF)
             return
-        beyond = np.maximum(np.maximum(motion.lower - motion.state, motion.state - motion.upper), 0.0)
-        yield worst_entry(beyond[:, known], _labels(motion, known))
+        for name, table in (("", motion.state), *motion.commands.items()):
+            beyond = np.maximum(np.maximum(motion.lower - table, table - motion.upper), 0.0)
+            labels = [f"{label} of the {name}" if name else label for label in motion.labels(known)]
+            yield worst_entry(beyond[:, known], labels)
 
 
-@motion_check(measures="speed of joints against the limit of their URDF, ratio", warn=1.2, fail=3)
-def joint_speed(motions: Motions) -> Iterator[Found]:
-    """No joint is faster than its motor: catches wrong rates, spikes, and episodes glued together."""
-    for motion in motions.all:
+@motion_check(
+    measures="largest speed of a joint in units of its limit",
+    warn=1.2,
+    fail=3,
+    simulated=(1.1, 1.5),
+    needs=URDF,
+    reads=(STATE, *_TOPICS, "info.robot.velocity_limit"),
+)
+def joint_speed(subject: Moving) -> Iterator[Found]:
+    """No joint is faster than its motor: catches wrong rates, spikes, and episodes glued together.
+
+    By the recorded velocities too where these are known to be those of the joints.
+    """
+    for motion in subject.motions.all:
         known = np.isfinite(motion.speed) & (motion.speed > 0)
         if not known.any():
-            yield NotMeasured(why="no element of the state is known to be the position of a joint with a speed limit")
+            yield Lacking(need=URDF)
             return
-        speed = np.abs(np.diff(motion.state[:, known], axis=0)) / motion.steps_s[:, None] / motion.speed[known]
-        yield worst_entry(speed, _labels(motion, known), first=1)
+        labels, limit = motion.labels(known), motion.speed[known]
+        if motion.commands and motion.velocity is not None:
+            yield worst_entry(np.abs(motion.velocity[:, known]) / limit, labels)
+        for table in (motion.state, *motion.commands.values()):
+            speed = np.abs(np.diff(table[:, known], axis=0)) / motion.steps_s[:, None] / limit
+            yield worst_entry(speed, labels, first=1)
 
 
-@motion_check(measures="ratio of state differences to velocities, off 1", warn=0.1, fail=0.16)
-def state_matches_velocity(motions: Motions) -> Found:
+@motion_check(
+    measures="ratio of state differences to velocities, off 1",
+    warn=0.1,
+    fail=0.16,
+    needs=VELOCITIES,
+    reads=(STATE, VELOCITY, "/{feature}", "/joint_states", "info.fps"),
+)
+def velocity_matches_position(subject: Moving) -> Found:
     """States change by velocity over time, each joint by itself, all episodes together: catches a wrong rate,
     other units, and other joints' velocities."""
-    pairs = [motion for motion in motions.all if motion.velocity is not None and len(motion.state) > 1]
+    pairs = [motion for motion in subject.motions.all if motion.velocity is not None and len(motion.state) > 1]
     if not pairs:
-        return None
+        return Lacking(need=VELOCITIES)
     sums = np.zeros((3, len(pairs[0].names)))
     for motion in pairs:
         assert motion.velocity is not None
@@ -284,18 +228,19 @@ def state_matches_velocity(motions: Motions) -> Found:
     return Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
 
 
-@motion_check(
+@target_check(
     measures="frames by which the state is too early for its action, or too late",
     warn=0.75,
     fail=1.5,
     group="alignment",
+    reads=(STATE, ACTION, *_TOPICS),
 )
-def state_follows_action(motions: Motions) -> Found:
+def state_follows_action(subject: Moving) -> Found:
     """The state follows the action by about a frame or more, and by less than a third of a second: catches actions that
     were recorded late or early, or that are the state itself, from which a policy learns to stand still."""
-    if not (targets := motions.targets):
+    if not (targets := subject.motions.targets):
         return NotMeasured(why=_NO_TARGETS)
-    reach = max(2, round(_REACH_S * motions.all[0].fps))
+    reach = max(2, round(_REACH_S * subject.motions.all[0].fps))
     lags = range(-reach, reach + 1)
     long = [(state, action) for state, action in targets if len(state) > 3 * reach]
     if not long:
@@ -311,18 +256,22 @@ def state_follows_action(motions: Motions) -> Found:
         return NotMeasured(why="state and action move too little to tell which of them is first")
     # The middle one: a gripper is slower than the arm, and stops at what it holds.
     lag = float(np.median([finest_lag(lags, off[:, element].tolist()) for element in told]))
-    late = lag - _LATEST_S * motions.all[0].fps
+    late = lag - _LATEST_S * subject.motions.all[0].fps
     return Measurement(value=max(1 - lag, late, 0.0), detail=f"the state follows by {lag:+.2f} frames")
 
 
-@motion_check(measures="elements of the state that follow the action of another one", group="alignment")
-def actions_in_order(motions: Motions) -> Found:
+@target_check(
+    measures="elements of the state that follow the action of another one",
+    group="alignment",
+    reads=(STATE, ACTION, *_TOPICS),
+)
+def actions_in_order(subject: Moving) -> Found:
     """Every element of the state follows its own action: catches joints exchanged in one of the two."""
-    if not (targets := motions.targets):
+    if not (targets := subject.motions.targets):
         return NotMeasured(why=_NO_TARGETS)
     table = _correlations(targets)
     count = len(table)
-    names = [name for name, moves in zip(motions.all[0].names, motions.moving, strict=True) if moves]
+    names = [name for name, moves in zip(subject.motions.all[0].names, subject.motions.moving, strict=True) if moves]
     best = table.argmax(axis=1)
     # Two joints of one motion may go alike; an exchange shows where an element hardly follows its own action at all.
     wrong = [i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3]
@@ -330,20 +279,27 @@ def actions_in_order(motions: Motions) -> Found:
     return Measurement(value=len(wrong), detail="; ".join(told[:3]))
 
 
-@motion_check(measures="distance at which a joint always stays from its action", unit="rad, m", warn=0.1, fail=0.3)
-def state_reaches_action(motions: Motions) -> Found:
+@target_check(
+    group="physics",
+    measures="distance at which a joint always stays from its action",
+    unit="rad, m",
+    warn=0.1,
+    fail=0.3,
+    reads=(STATE, ACTION, *_TOPICS),
+)
+def state_reaches_action(subject: Moving) -> Found:
     """A joint that is held comes to where it was sent, at least at some time: catches a zero that is off.
 
     Weight and friction keep an arm off by a few hundredths of a rad, and what a gripper holds keeps its fingers apart;
     only a false zero does so always. Velocities, increments and shares of a range are no places to be at.
     """
-    if not (targets := motions.targets):
+    if not (targets := subject.motions.targets):
         return NotMeasured(why=_NO_TARGETS)
     spread = float(np.median([np.nanmedian(action.std(axis=0)) for _, action in targets]))
     if not 1 / _ALIKE < spread < _ALIKE:
         return NotMeasured(why=f"actions move {spread:.3g} times as far as the state, so they are in another unit")
     offsets: dict[str, list[Array]] = {}
-    for motion in motions.all:
+    for motion in subject.motions.all:
         if motion.action is None:
             continue
         still = max(2, round(_HELD_S * motion.fps))
@@ -359,24 +315,191 @@ def state_reaches_action(motions: Motions) -> Found:
     return Measurement(value=least[name], detail=name)
 
 
-@motion_check(measures="elements of the state that never change while their action does")
-def elements_alive(motions: Motions) -> Found:
+@motion_check(
+    measures="elements of the state that never change while their action does",
+    needs=ACTIONS,
+    reads=(STATE, ACTION, *_TOPICS),
+)
+def elements_alive(subject: Moving) -> Found:
     """Encoders are alive: no element stays at one value in all episodes while what it is sent changes."""
-    pairs = [motion for motion in motions.all if motion.action is not None and len(motion.state) >= _FEWEST]
+    pairs = [motion for motion in subject.motions.all if motion.action is not None and len(motion.state) >= _FEWEST]
     if not pairs:
-        return NotMeasured(why="no element of the state has an action of its own")
+        return Lacking(need=ACTIONS)
     stands = np.all([np.ptp(motion.state, axis=0) == 0 for motion in pairs], axis=0)
     sent = np.any([np.ptp(_action(motion), axis=0) > 50 * _MOVES for motion in pairs], axis=0)
     dead = [name for name, is_dead in zip(pairs[0].names, stands & sent, strict=True) if is_dead]
     return Measurement(value=len(dead), detail=", ".join(dead))
 
 
+@motion_check(
+    measures="longest run of frames in which a sensor stands still to the last bit while the arm moves",
+    warn=_STILL_FRAMES,
+    fail=math.inf,
+    simulated=(2, 4),
+    needs=STATE_ALONE,
+    reads=(STATE, VELOCITY, EE_POSE, "/{feature}", "/joint_states", "/ee_pose", "/wrench"),
+)
+def stuck_sensors(subject: Moving) -> Iterator[Found]:
+    """What is measured changes, if ever so little, while the arm moves.
+
+    Of other robots than simulated ones a sensor is reported that never changes in an episode.
+    """
+    for motion in subject.motions.all:
+        moves = np.abs(np.diff(motion.state, axis=0)).max(axis=1, initial=0.0) > 1e-5
+        if motion.contact is not None:
+            moves = np.abs(np.diff(motion.state[:, :-1], axis=0)).max(axis=1, initial=0.0) > 1e-5
+        for name, table in motion.sensors.items():
+            same = (table[1:] == table[:-1]).all(axis=1) & moves
+            length, start = longest_run(same)
+            if motion.contact is None:  # sensors slower than the frames hold a value, and contacts come and go
+                length, start = int(same.sum() * (np.ptp(table, axis=0) == 0).all()), 0
+            label = f"{name}, {motion.where}" if motion.where else name
+            yield Measurement(value=length, frame=start + 1 if length else None, detail=label)
+
+
+@motion_check(
+    measures="how far the EE pose strays from the joints' forward kinematics, between fixed mounts, nine tenths of it",
+    unit="m",
+    warn=0.02,
+    fail=0.05,
+    needs=EE_POSES,
+    reads=(STATE, EE_POSE, "/{feature}", "/joint_states", "/ee_pose"),
+)
+def pose_follows_joints(subject: Moving) -> Iterator[Found]:
+    """The hand goes where the joints take it, whatever its frame and the base's are: catches exchanged joints,
+    zeros that are off, other orders of a quaternion. 0.1 m are added for each rad of rotation."""
+    motions = subject.motions.all
+    for motion in motions[:: max(1, len(motions) // _FITTED_EPISODES)]:
+        if motion.ee_pose is None or motion.urdf is None:
+            yield Lacking(need=EE_POSES)
+            return
+        if len(motion.state) < _FEWEST:
+            yield NotMeasured(why=f"an episode has fewer than {_FEWEST} frames")
+            continue
+        links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
+        last = [joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]
+        off = _mounted(links[last], matrices(motion.ee_pose))
+        frame = int(np.argmax(off))
+        yield Measurement(value=float(np.quantile(off, 0.9)), frame=frame, detail=motion.where)
+
+
+def _mounted(links: Array, poses: Array) -> Array:
+    """(T,) metres by which poses (T, 4, 4) are off X @ links @ Y, for the fixed X and Y that fit best."""
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    def fixed(numbers: Array) -> Array:
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:]
+        return out
+
+    rows = np.unique(np.linspace(0, len(links) - 1, _FITTED_FRAMES).astype(int))
+
+    def residual(numbers: Array) -> Array:
+        off = fixed(numbers[:6]) @ links[rows] @ fixed(numbers[6:]) - poses[rows]
+        return np.asarray((off[:, :3] * [_LEVER, _LEVER, _LEVER, 1.0]).reshape(-1))
+
+    best = None
+    for yaw in np.arange(4) * (math.pi / 2):  # bases that are turned may be far from each other's fit
+        start = np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0])
+        mount = np.linalg.inv(fixed(start) @ links[0]) @ poses[0]
+        guess = np.concatenate([start, Rotation.from_matrix(mount[:3, :3]).as_rotvec(), mount[:3, 3]])
+        found = least_squares(residual, guess)
+        best = found if best is None or found.cost < best.cost else best
+        if best.cost < 1e-3 * _LEVER * len(rows):
+            break
+    assert best is not None
+    return displacement(fixed(best.x[:6]) @ links @ fixed(best.x[6:]), poses)
+
+
+@motion_check(
+    measures="gripper opening against a command that it has had the time to follow, as a share of what is commanded",
+    warn=0.25,
+    fail=0.5,
+    needs=GRIPPER,
+    reads=(STATE, ACTION, "/{feature}", "/gripper", "/command", "/joint_states"),
+)
+def gripper_follows(subject: Moving) -> Iterator[Found]:
+    """The fingers stand where they were told to, or further apart where something is between them.
+
+    Catches openings and commands that are inverted, halved or frozen. Whether something is between the fingers says
+    the force on them; where nobody measures it, they may be kept open by it whenever they were told to close.
+    """
+    for motion in subject.motions.all:
+        place = motion.gripper
+        if place is None or motion.action is None or not np.isfinite(motion.action[:, place]).all():
+            yield Lacking(need=GRIPPER)
+            return
+        yield _followed(motion, place, motion.commands.get("command", motion.action)[:, place])
+
+
+def _followed(motion: Motion, place: int, command: Array) -> Found:
+    opening, wait = motion.state[:, place], math.ceil(_SETTLE_S * motion.fps)
+    span = float(motion.upper[place] - motion.lower[place])
+    reach = span if math.isfinite(span) else float(np.ptp(command))
+    if len(command) <= wait:
+        return NotMeasured(why=f"an episode is shorter than {_SETTLE_S} s")
+    # Of increments and speeds nothing is told: they are small beside the opening, and come back to 0.
+    if reach < 0.2 * float(np.ptp(opening)) or reach < 1e-4:
+        return NotMeasured(why="the gripper's command is none of its opening, or never changes")
+    steady = np.ones(len(command), dtype=np.bool_)
+    for back in range(1, wait + 1):
+        steady[back:] &= np.abs(command[back:] - command[:-back]) < 1e-3 * reach
+    steady[:wait] = False
+    if not steady.any():
+        return NotMeasured(why="the gripper's command never lasts")
+    gap = opening - command
+    is_open = command > command.min() + 0.5 * reach
+    holds = ~is_open if motion.contact is None else motion.contact > 0
+    off = np.where(holds, np.maximum(-gap, 0.0), np.abs(gap)) / reach
+    where = f", {motion.where}" if motion.where else ""
+    return worst_frame(np.where(steady, off, 0.0), f"{int(steady.sum())} frames after the motion{where}")
+
+
+@motion_check(
+    measures="torques of the arm against inverse dynamics, median difference of the load",
+    warn=0.6,
+    fail=math.inf,
+    needs=EFFORTS,
+    reads=(
+        "/joint_states",
+        "info.scene.physics.gravity",
+        "info.scene.bodies.mass",
+        "/robot_description",
+        "/{feature}",
+    ),
+)
+def effort_matches_dynamics(subject: Moving) -> Iterator[Found]:
+    """The motors of the joints that bear the arm give the torques that its weight and motion need.
+
+    Catches torques of other joints, of another sign or unit, halved or frozen. Of other robots than simulated ones the
+    load in the hand and the friction are not known, and some drivers leave out the weight: they are only warned of.
+    """
+    for motion in subject.motions.all:
+        dynamics = subject.dynamics_of(motion)
+        if motion.effort is None or dynamics is None:
+            yield Lacking(need=EFFORTS)
+            return
+        yield dynamics if isinstance(dynamics, NotMeasured) else dynamics.compare(motion.joints, motion.effort)
+
+
+def point_masses(motion: Motion) -> Dynamics | NotMeasured | None:
+    """Inverse dynamics of an arm that stands upright and carries nothing; None where its model is not known."""
+    if motion.urdf is None or not motion.model:
+        return None
+    try:
+        masses = masses_of(motion.model)
+    except SceneError as error:
+        return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
+    links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
+    masses = {link: mass for link, mass in masses.items() if link == motion.urdf.root or link in _children(motion.urdf)}
+    tip = [joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]
+    down = np.array([0.0, 0.0, -9.81])
+    return Dynamics(links.__getitem__, motion.urdf, masses, gravity=down, fps=motion.fps, tip=tip)
+
+
+def _children(urdf: Urdf) -> set[str]:
+    return {joint.child for joint in urdf.joints}
+
+
 _NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
-
-
-def _labels(motion: Motion, known: Flags) -> list[str]:
-    return [
-        f"{name}, {motion.where}" if motion.where else name
-        for name, is_known in zip(motion.names, known, strict=True)
-        if is_known
-    ]

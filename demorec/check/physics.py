@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Protocol
 
 import numpy as np
 
-from demorec.check.base import EE_TOPICS, Found, Measurement, physics_check, worst_entry, worst_frame
+from demorec.check.base import EE_TOPICS, Found, Lacking, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
+from demorec.core.geometry import Array
+from demorec.episode.features import EE_POSE, STATE
 
 
 @physics_check(
@@ -47,47 +50,6 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
 
 
 @physics_check(
-    measures="joint positions beyond the robot's limits",
-    unit="rad",
-    warn=0.005,
-    fail=0.05,
-    reads=(
-        "/joint_states",
-        "/action",
-        "/command",
-        "info.robot.position_lower",
-        "info.robot.position_upper",
-    ),
-)
-def joint_position(episode: CheckedEpisode) -> Iterator[Found]:
-    """Measured and commanded arm joints stay within the limits."""
-    robot, c = episode.info.robot, episode.columns
-    low, high = np.array(robot.position_lower), np.array(robot.position_upper)
-    for table in (c.joint_position[:, : episode.num_arm], c.command_joint_target, c.action_joint_target):
-        yield worst_entry(np.maximum(np.maximum(low - table, table - high), 0.0), robot.arm_joints)
-
-
-@physics_check(
-    measures="largest joint velocity in units of its limit",
-    warn=1.1,
-    fail=1.5,
-    reads=(
-        "/joint_states",
-        "/action",
-        "/command",
-        "info.robot.velocity_limit",
-    ),
-)
-def joint_velocity(episode: CheckedEpisode) -> Iterator[Found]:
-    """Velocities, as recorded and as differences of measured and commanded positions."""
-    n, fps, c, joints = episode.num_arm, episode.info.fps, episode.columns, episode.info.robot.arm_joints
-    limit = np.array(episode.info.robot.velocity_limit)
-    yield worst_entry(np.abs(c.joint_velocity[:, :n]) / limit, joints)
-    for table in (c.joint_position[:, :n], c.command_joint_target, c.action_joint_target):
-        yield worst_entry(np.abs(np.diff(table, axis=0)) * fps / limit, joints, first=1)
-
-
-@physics_check(
     measures="largest acceleration of the wanted motion in units of its limit",
     reads=(
         "/action",
@@ -121,56 +83,33 @@ def joint_acceleration(episode: CheckedEpisode) -> Measurement | None:
     return worst_entry(acceleration / np.array(robot.acceleration_limit), robot.arm_joints, first=1)
 
 
-@physics_check(
-    measures="ratio of position differences to recorded velocities, off 1",
-    reads=(
-        "/joint_states",
-        "info.fps",
-    ),
-)
-def velocity_matches_position(episode: CheckedEpisode) -> Measurement | None:
-    """Differences of joint positions over the frame's time equal the mean of the velocities at both ends.
+class Handed(Protocol):
+    """What has poses of a hand whose link is known."""
 
-    Catches a wrong frame rate, degrees for radians, and velocities of other joints. The ratio is that of least
-    squares, per joint; 0 where the two have nothing to do with each other.
-    """
-    n, fps, c = episode.num_arm, episode.info.fps, episode.columns
-    difference = np.diff(c.joint_position[:, :n], axis=0) * fps
-    mean = (c.joint_velocity[1:, :n] + c.joint_velocity[:-1, :n]) / 2
-    moving = np.sqrt((difference**2).mean(axis=0)) > 0.05 if len(difference) else np.zeros(n, dtype=bool)
-    if not moving.any():
-        return None
-    ratio = (difference * mean).sum(axis=0) / np.maximum((mean * mean).sum(axis=0), 1e-12)
-    # At few frames a second the mean of two velocities says less about the way between them.
-    off = np.where(moving, np.abs(ratio - 1.0), 0.0) * min(1.0, fps / 20)
-    joint = int(np.argmax(off))
-    return Measurement(value=float(off[joint]), detail=f"{episode.info.robot.arm_joints[joint]}: {ratio[joint]:.3f}")
+    def hand_poses(self) -> Iterator[tuple[str, Array, Array]]:
+        """(where, poses (T, 7), base_from_tcp (T, 4, 4) by the joints)."""
+        ...
 
 
 @physics_check(
     measures="EE pose against forward kinematics of the joints",
     unit="m",
-    warn=1e-6,
-    fail=1e-4,
-    reads=(
-        *EE_TOPICS,
-        "/joint_states",
-        "/action",
-        "/command",
-        "/robot_description",
-        "info.robot.tcp_link",
-    ),
-)
-def forward_kinematics(episode: CheckedEpisode) -> Iterator[Found]:
+    warn=1e-4,
+    fail=1e-3,
+    simulated=(1e-6, 1e-4),
+    on=("simulated", "dataset"),
+    needs="EE poses, and the robot and TCP link that demorec recorded",
+    reads=(*EE_TOPICS, "/joint_states", "/action", "/command", "/robot_description", "info.robot.tcp_link", STATE,
+           EE_POSE, "demorec/"),
+)  # fmt: skip
+def forward_kinematics(subject: Handed) -> Iterator[Found]:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
-    c, link = episode.columns, episode.info.robot.tcp_link
-    rows = (
-        ("observed", c.base_from_tcp, episode.recorded_kinematics),
-        ("action", c.action_base_from_tcp, episode.kinematics(c.action_joint_target)),
-        ("command", c.command_base_from_tcp, episode.kinematics(c.command_joint_target)),
-    )
-    for name, poses, kinematics in rows:
-        yield worst_frame(displacement(matrices(poses), episode.base_from_link(link, kinematics)), name)
+    is_known = False
+    for where, poses, hand in subject.hand_poses():
+        is_known = True
+        yield worst_frame(displacement(matrices(poses), hand), where)
+    if not is_known:
+        yield Lacking(need="EE poses, and the robot and TCP link that demorec recorded")
 
 
 @physics_check(

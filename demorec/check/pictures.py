@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from demorec.check.base import (
     MOTION_TOPICS,
     PICTURE_TOPICS,
     Found,
+    Lacking,
     Measurement,
     NotMeasured,
     picture_check,
@@ -151,34 +153,26 @@ def _stale_frames(camera: SceneCamera, compared: PictureComparison, count: int, 
 
 
 @picture_check(
-    measures="likeness of two cameras' pictures (correlation over time)",
-    reads=COLOR_TOPICS,
+    measures="likeness of two cameras' images (correlation over time)",
+    warn=0.9999,
+    on=("simulated", "external", "dataset"),
+    needs="two cameras",
+    reads=(*COLOR_TOPICS, "observation.images.{camera}"),
 )
-def distinct_cameras(episode: CheckedEpisode) -> Iterator[Found]:
-    """Two cameras in different places do not show the same pictures."""
-    for number, camera in enumerate(episode.cameras):
-        for other in episode.cameras[number + 1 :]:
-            first, second = episode.pictures(camera).cells, episode.pictures(other).cells
-            count = min(len(first), len(second))
-            if first.shape[1:] != second.shape[1:] or count < 2 or _same_place(episode, camera, other):
-                continue
-            value = _correlation(first[:count], second[:count])
-            yield Measurement(value=value, detail=f"cameras {camera.name} and {other.name}")
+def distinct_cameras(subject: Filmed) -> Iterator[Found]:
+    """Two cameras in different places do not show the same images, as when one is plugged in under two names."""
+    pairs = list(subject.likeness_of_cameras())
+    if not pairs:
+        yield Lacking(need="two cameras")
+    yield from (Measurement(value=value, detail=names) for names, value in pairs)
 
 
-def _same_place(episode: CheckedEpisode, camera: SceneCamera, other: SceneCamera) -> bool:
-    poses = episode.columns.world_from_camera
-    return bool(np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3)
+class Filmed(Protocol):
+    """What has cameras."""
 
-
-def _correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    x, y = (a - a.mean()).reshape(-1), (b - b.mean()).reshape(-1)
-    size = math.sqrt(_dot(x, x) * _dot(y, y))
-    return _dot(x, y) / size if size > 0 else 0.0
-
-
-def _dot(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
-    return float(np.einsum("i,i->", x, y))  # no BLAS: its threads wait for each other on a busy machine
+    def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
+        """(two cameras, correlation of their images)."""
+        ...
 
 
 @picture_check(

@@ -6,19 +6,18 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
-from demorec.check.base import Check, Group, Level, Result, Scope
-from demorec.check.collected import NOT_APPLICABLE
+from demorec.check.base import Check, Form, Group, Level, Result
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
-from demorec.check.motion import Motions
-from demorec.check.run import CheckedRun
-from demorec.core.errors import check_option, resource_error
+from demorec.check.external import CheckedRecording
+from demorec.check.run import CheckedRun, ExternalRun
+from demorec.core.errors import OptionError, check_option, resource_error
 from demorec.core.processes import SPAWN
 from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
 from demorec.episode.episode import SimulatedInfo
-from demorec.mcap import Recording
 from demorec.mcap.opening import is_external
 from demorec.robots.assets import allow_models, modules_of_models
 from demorec.runs.external import is_external_run
@@ -29,6 +28,33 @@ _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 """Groups of the checks that look at the file itself, not at what was recorded."""
 _WORTH_PROCESSES = {"with pictures": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
+SubjectKind = Literal["recording", "run", "dataset"]
+RENAMED = {
+    "collected_opens": "opens",
+    "collected_checksums": "checksums",
+    "collected_readable": "readable",
+    "collected_complete": "complete",
+    "collected_drops": "drops",
+    "collected_rate": "rate",
+    "collected_gaps": "gaps",
+    "collected_sample_age": "sample_age",
+    "collected_picture_age": "image_age",
+    "collected_missing_pictures": "missing_images",
+    "collected_pictures": "images_show_something",
+    "collected_distinct_cameras": "distinct_cameras",
+    "collected_stuck": "stuck_sensors",
+    "collected_run_files": "run_files",
+    "joint_position": "joint_limits",
+    "joint_velocity": "joint_speed",
+    "state_matches_velocity": "velocity_matches_position",
+    "dataset_forward_kinematics": "forward_kinematics",
+    "run_duplicates": "duplicates",
+    "dataset_duplicates": "duplicates",
+    "run_coverage": "coverage",
+    "dataset_coverage": "coverage",
+    "effort_bears_the_arm": "effort_matches_dynamics",
+}
+"""Names of checks up to version 0.20 -> the check that has the law now."""
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
 
@@ -41,23 +67,27 @@ class CheckOptions:
         only: Names of checks; empty for all.
         workers: Processes; 1 works in this one.
         allowed: The user's own modules beside which models of robots may be read.
+        urdf: Text of the description of the robot, for recordings and datasets that do not have one; "" for none.
     """
 
     pictures: bool = True
     only: tuple[str, ...] = ()
     workers: int = 1
     allowed: tuple[str, ...] = ()
+    urdf: str = ""
 
     def validate(self) -> None:
         """Raise ConfigError for unknown names or impossible numbers."""
         for name in self.only:
+            if name in RENAMED:
+                raise OptionError("only", f"names {name}, which is now {RENAMED[name]}.")
             CHECKS.check_name(name)
         check_option("workers", self.workers, 1, 1024)
 
-    def checks(self, scope: Scope) -> list[Check]:
-        """Those of a scope, in the order of the table."""
+    def checks(self, *forms: Form) -> list[Check]:
+        """Those of some forms, in the order of the table."""
         loaded = [CHECKS.load(name) for name in CHECKS.names() if not self.only or name in self.only]
-        return [check for check in loaded if check.scope == scope and (self.pictures or not check.needs_pictures)]
+        return [check for check in loaded if set(forms) & set(check.on)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +102,7 @@ class Subject:
     """
 
     path: Path
-    kind: Scope
+    kind: SubjectKind
     is_failed_attempt: bool = False
 
 
@@ -163,33 +193,39 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
     allow_models(options.allowed)
     infos: Sequence[SimulatedInfo] = ()
-    checks = options.checks(subject.kind)
+    scene: tuple[Form, ...] = ()  # what is asked of others that have a scene
     if subject.kind == "recording" and is_external(subject.path):
-        with Recording(subject.path) as recording:
-            gates = ("collected_opens", "collected_readable")
-            found = _run(options.checks("collected"), recording, gates, recording.columns)
-            found += _run(options.checks("motion"), Motions(recording), (), recording.columns)
-        found += [check.skipped(NOT_APPLICABLE) for check in checks]
+        scene = ("simulated",)
+        with CheckedRecording(subject.path, options.urdf) as recording:
+            found = _run(options, recording, ("opens", "readable"), lambda: recording.columns)
     elif subject.kind == "recording":
         with CheckedEpisode(subject.path) as episode:
-            found = _run(checks, episode, ("opens", "readable"), lambda: episode.columns)
+            found = _run(options, episode, ("opens", "readable"), lambda: episode.columns)
             if any(result.needs_allow for result in found):
                 infos = [episode.info]
     elif subject.kind == "run" and is_external_run(subject.path):
-        found = [check.run(subject.path) for check in options.checks("collected_run")]
-        found += [check.skipped(NOT_APPLICABLE) for check in checks]
+        scene = ("run",)
+        found = _run(options, ExternalRun(subject.path), (), lambda: None)
     elif subject.kind == "run":
-        found = _run(checks, CheckedRun(subject.path), (), lambda: None)
+        found = _run(options, CheckedRun(subject.path), (), lambda: None)
     else:
-        dataset = Dataset(subject.path)
-        found = _run(checks, dataset, ("dataset_readable",), lambda: dataset.rows)
-        found += _run(options.checks("motion"), Motions(dataset), (), lambda: dataset.rows)
+        dataset = Dataset(subject.path, options.urdf)
+        found = _run(options, dataset, ("dataset_readable",), lambda: dataset.rows)
         if any(result.needs_allow for result in found):
             infos = [info for info in dataset.infos if info]
+    known = {result.check for result in found}
+    found += [
+        check.not_applicable()
+        for check in options.checks(*scene)
+        if check.name not in known and (options.pictures or not check.needs_pictures)
+    ]
     models = [name for info in infos for name in (info.robot.urdf, *(body.shape.file for body in info.scene.bodies))]
     modules = tuple(name for name in modules_of_models(models) if not is_allowed(name, options.allowed))
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
     return SubjectReport(**vars(subject), results=results, needs_allow=modules)
+
+
+Checked = CheckedEpisode | CheckedRecording | Dataset | CheckedRun | ExternalRun
 
 
 def _within(path: Path, detail: str) -> str:
@@ -197,11 +233,12 @@ def _within(path: Path, detail: str) -> str:
     return detail.removesuffix(f": {path}").replace(f"{path}/", "")
 
 
-def _run(checks: Sequence[Check], subject: object, gates: tuple[str, ...], read: Callable[[], object]) -> list[Result]:
-    """Run checks in order; what needs something damaged is skipped rather than failing in the words of the first one.
+def _run(options: CheckOptions, subject: Checked, gates: tuple[str, ...], read: Callable[[], object]) -> list[Result]:
+    """Run the checks of a subject in order; what needs something damaged is skipped, not failed once more.
 
     The checks of file and time look at the file itself and are run as far as it can be opened.
     """
+    checks = [check for check in options.checks(subject.form) if options.pictures or not check.needs_pictures]
     results: list[Result] = []
     told: set[str] = set()
     unreadable = ""

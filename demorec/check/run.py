@@ -7,19 +7,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-import numpy as np
-
-from demorec.check.base import Found, Measurement, NotMeasured, run_check, worst
-from demorec.check.coverage import start_vector, twins, worst_gap
+from demorec.check.base import SCENE, Form, Found, Lacking, Measurement, NotMeasured, run_check, worst
+from demorec.check.coverage import MIN_EPISODES, motion_vector, start_vector, twins, worst_gap
+from demorec.check.dataset import Dataset
 from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
 from demorec.core.files import open_regular, read_json_limited
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.episode import Outcome, SimulatedInfo
-from demorec.mcap import SimulatedRecording
+from demorec.episode.features import STATE
+from demorec.mcap import Recording, SimulatedRecording
+from demorec.runs.external import load_external_run
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 
 _MAX_JSON_BYTES = 2 << 30
@@ -51,6 +52,8 @@ class CheckedRun:
     Args:
         path: The folder with run.json.
     """
+
+    form: ClassVar[Form] = "run"
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -103,6 +106,21 @@ class CheckedRun:
         return found
 
     @property
+    def listed(self) -> dict[str, str]:
+        """File -> SHA-256 (hex), as run.json has them."""
+        return {line["file"]: line["sha256"] for line in self.lines}
+
+    @property
+    def hint(self) -> str:
+        """What becomes of a recording that run.json does not list."""
+        return "" if self.run.get("complete", True) else " yet; the command that began the run takes it in and goes on"
+
+    def courses(self) -> tuple[list[str], list[Array], list[Array]]:
+        """Files of the successes, their motions and their starts."""
+        told = {file: told for file, told in self.told.items() if file.startswith("episodes/")}
+        return list(told), [t.motion for t in told.values()], [start_vector(t.info.scene) for t in told.values()]
+
+    @property
     def successes(self) -> list[SimulatedInfo]:
         """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
         asked = self.run["num_episodes"]
@@ -110,25 +128,58 @@ class CheckedRun:
         return [info for info in infos if info.episode_index < asked]
 
 
+class ExternalRun:
+    """A run of recordings that demorec did not simulate.
+
+    Args:
+        path: The folder with run.json.
+    """
+
+    form: ClassVar[Form] = "external run"
+    hint = ""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @cached_property
+    def listed(self) -> dict[str, str]:
+        """File -> SHA-256 (hex), as run.json has them."""
+        return {line.file: line.sha256 for line in load_external_run(self.path).episodes}
+
+    @property
+    def recordings(self) -> list[Path]:
+        """Every recording there is."""
+        return sorted((self.path / EPISODES).glob("*.mcap"))
+
+    def courses(self) -> tuple[list[str], list[Array], list[Array]]:
+        """Files that can be read and have a state, and their motions; nothing is known of starts."""
+        found: dict[str, Array] = {}
+        for path in self.recordings:
+            try:
+                with Recording(path) as recording:
+                    if STATE in (features := recording.columns().features):
+                        found[path.name] = motion_vector(features[STATE])
+            except (RecordingError, OSError):
+                continue  # check `opens` or `readable` of that recording says so
+        return list(found), list(found.values()), []
+
+
 @run_check(
     measures="files missing, changed since they were made, or not in run.json",
-    reads=(
-        "run.attempts.file",
-        "run.attempts.sha256",
-    ),
+    on=("run", "external run"),
+    needs="a run",
+    reads=("run.attempts.file", "run.attempts.sha256", "metadata demorec.collected"),
 )
-def run_files(run: CheckedRun) -> Measurement:
+def run_files(run: CheckedRun | ExternalRun) -> Measurement:
     """The recordings are exactly those that run.json lists, with the same SHA-256."""
-    wrong = []
-    listed = {line["file"]: line for line in run.lines}
+    listed = run.listed
     there = {str(path.relative_to(run.path)) for path in run.recordings}
-    wrong += [f"{file} is missing" for file in sorted(listed.keys() - there)]
-    hint = "" if run.run.get("complete", True) else " yet; the command that began the run takes it in and goes on"
-    wrong += [f"{file} is not in run.json{hint}" for file in sorted(there - listed.keys())]
+    wrong = [f"{file} is missing" for file in sorted(listed.keys() - there)]
+    wrong += [f"{file} is not in run.json{run.hint}" for file in sorted(there - listed.keys())]
     for file in sorted(there & listed.keys()):
         try:
             with open_regular(run.path / file) as stream:
-                if hashlib.file_digest(stream, "sha256").hexdigest() != listed[file]["sha256"]:
+                if hashlib.file_digest(stream, "sha256").hexdigest() != listed[file]:
                     wrong.append(f"{file} has changed")
         except OSError as error:
             if (lack := resource_error(error, run.path / file)) is not None:
@@ -202,49 +253,37 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
 
 @run_check(
     measures="episodes that have the start or the motion of another",
+    on=("run", "external run", "dataset"),
+    needs="two episodes",
     reads=(
-        "info.scene.bodies.world_from_body",
-        "info.scene.bodies.shape",
-        "info.scene.robot.joint_position",
-        "/joint_states",
+        "info.scene.bodies.world_from_body", "info.scene.bodies.shape", "info.scene.robot.joint_position",
+        "/joint_states", STATE, "/{feature}",
     ),
-)
-def run_duplicates(run: CheckedRun) -> Found:
+)  # fmt: skip
+def duplicates(subject: CheckedRun | ExternalRun | Dataset) -> Found:
     """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
-    files = [file for file in run.told if file.startswith("episodes/")]
-    if len(files) < 2:
-        return None
-    config = run.run.get("config", {})
-    if config.get("fixed"):
+    names, motions, starts = subject.courses()
+    if len(names) < 2:
+        return Lacking(need="two episodes")
+    if isinstance(subject, CheckedRun) and subject.run.get("config", {}).get("fixed"):
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
-    return worst(
-        twins([start_vector(run.told[file].info.scene) for file in files], files, "starts"),
-        twins([run.told[file].motion for file in files], files, "motions"),
-    )
-
-
-def motion_vector(joint_position: Array) -> Array:
-    """A motion as one row of fixed length: joint positions at 32 moments, evenly spread."""
-    if not len(joint_position):
-        return np.zeros(32)
-    moments = np.linspace(0, len(joint_position) - 1, 32).round().astype(int)
-    return np.asarray(joint_position[moments], dtype=np.float64).reshape(-1)
+    return worst(*([twins(starts, names, "starts")] if starts else []), twins(motions, names, "motions"))
 
 
 @run_check(
     measures="largest gap in the range of a randomised quantity, share",
     warn=0.35,
     fail=0.6,
+    on=("run", "dataset"),
+    needs=f"{SCENE} of each of {MIN_EPISODES} episodes",
     reads=(
-        "info.scene.bodies.world_from_body",
-        "info.scene.bodies.shape",
-        "info.scene.goals.onto",
-        "info.scene.goals.onto_from_goal",
+        "info.scene.bodies.world_from_body", "info.scene.bodies.shape", "info.scene.goals.onto",
+        "info.scene.goals.onto_from_goal", "demorec/",
     ),
-)
-def run_coverage(run: CheckedRun) -> Found:
+)  # fmt: skip
+def coverage(subject: CheckedRun | Dataset) -> Found:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
-    return worst_gap(run.successes)
+    return worst_gap(subject.successes)
 
 
 @run_check(

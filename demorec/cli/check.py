@@ -17,7 +17,7 @@ from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths, places_read, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.reading import reading
-from demorec.core.errors import ConfigError, OptionError
+from demorec.core.errors import ConfigError, OptionError, in_words
 from demorec.core.replacing import PICTURE, check_replaceable
 
 if TYPE_CHECKING:
@@ -58,6 +58,9 @@ class Check:
     """Decode all pictures; without, a recording is checked at about 50 times real time."""
     only: tuple[str, ...] = ()
     """Names of the checks to run; default: all."""
+    urdf: Path | None = None
+    """The robot's description, for recordings and datasets that lack one: its joints are the state's elements by
+    their names, or by their order."""
     strict: bool = False
     """Warnings count as failures."""
     replay: int = 0
@@ -101,7 +104,9 @@ class Check:
         workers = self.workers
         if workers is None:
             workers = useful_workers(subjects, pictures=self.pictures, cores=available_cores())
-        options = CheckOptions(pictures=self.pictures, only=self.only, workers=workers, allowed=allowed)
+        options = CheckOptions(
+            pictures=self.pictures, only=self.only, workers=workers, allowed=allowed, urdf=self._description()
+        )
         options.validate()
         reports, replays = [], []
         with ProgressBar("checking", total=len(subjects), unit="item", at_once=workers) as bar:
@@ -131,6 +136,20 @@ class Check:
             say(summary + deep_summary(remade, different), *_lacking(reports))
         tell_unfinished(self.paths)
         return 1 if failed or diverged or different else 0
+
+    def _description(self) -> str:
+        """Text of the URDF that the user names, "" for none; ConfigError for what is none."""
+        if self.urdf is None:
+            return ""
+        from demorec.core.files import read_text_limited
+        from demorec.robots.urdf import MAX_BYTES, Urdf
+
+        try:
+            text = read_text_limited(self.urdf, MAX_BYTES)
+            Urdf.parse(text)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"--urdf is no robot's description ({in_words(error)}): {self.urdf}") from error
+        return text
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
         from demorec.replay.deep import deep_checks, deep_dataset_checks
@@ -194,18 +213,42 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
     )
     blocked = sum(result.is_blocked for result in report.results)
     lacking = sum(result.needs_allow for result in report.results)
-    numbers = {level: report.count(level) - (blocked + lacking if level == "skip" else 0) for level, _ in words}
+    absent = sum(bool(result.lacks) for result in report.results)
+    apart = blocked + lacking + absent
+    numbers = {level: report.count(level) - (apart if level == "skip" else 0) for level, _ in words}
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
     if lacking:
         counts += f", {lacking} {'needs' if lacking == 1 else 'need'} --allow"
+    if absent and counts:
+        counts += f", {absent} not applicable"
     counts = counts or f"none of the chosen checks is about a {report.kind}"
     kind = "failed attempt" if report.is_failed_attempt else report.kind
     yield f"{report.level:<4}  {kind} {report.path}: {counts}"
     for result in report.results:
         if result.level in ("warn", "fail") or (verbose and not result.is_blocked):
             yield f"      {_result(result)}"
+    if counts and not verbose:
+        yield from _not_applicable([report])
     if blocked:
         yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
+
+
+_FLAGS = {
+    "a robot whose URDF is known": "--urdf FILE",
+    "EE poses, and a robot whose URDF is known": "--urdf FILE",
+    "efforts of the joints, and their robot's masses": "--urdf FILE",
+}
+"""What a check needs -> the flag that may give it."""
+
+
+def _not_applicable(reports: Sequence[SubjectReport]) -> Iterator[str]:
+    """How many checks were not applicable, for lack of what, and what would change it."""
+    needs = Counter(result.lacks for report in reports for result in report.results if result.lacks)
+    if not needs:
+        return
+    reasons = [f"{count} {'needs' if count == 1 else 'need'} {need}" + (f" ({_FLAGS[need]})" if need in _FLAGS else "")
+               for need, count in needs.most_common()]  # fmt: skip
+    yield f"      Not applicable: {'; '.join(reasons)}."
 
 
 def _lacking(reports: Sequence[SubjectReport]) -> Iterator[str]:
@@ -225,9 +268,12 @@ def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
         return
     kinds = Counter("failed attempt" if report.is_failed_attempt else report.kind for report in reports)
     passed, skipped = (sum(report.count(level) for report in reports) for level in ("pass", "skip"))
-    unmeasured = f", {skipped} not measured" if skipped else ""
+    absent = sum(bool(result.lacks) for report in reports for result in report.results)
+    unmeasured = f", {skipped - absent} not measured" if skipped - absent else ""
+    unmeasured += f", {absent} not applicable" if absent else ""
     things = ", ".join(counted(number, kind) for kind, number in kinds.items())
     yield f"pass  {things}: {passed} checks passed{unmeasured}"
+    yield from _not_applicable(reports)
 
 
 def _result(result: Result) -> str:

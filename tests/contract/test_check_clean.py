@@ -87,7 +87,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     cases = [
         ((path,), 0),
         ((path, "--strict", "--json"), 0),
-        ((path, "--only", "opens", "joint_velocity"), 0),
+        ((path, "--only", "opens", "joint_speed"), 0),
         ((path, "--only", "joint_velocty"), 2),
         ((tmp_path / "nothing",), 2),
         ((), 2),

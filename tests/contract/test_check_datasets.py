@@ -59,7 +59,7 @@ def test_the_good_ones_pass_without_a_warning(run: Path, dataset: Path, filmed_d
 def test_an_episode_twice(run: Path, tmp_path: Path) -> None:
     spoilt = copy(run, tmp_path / "run")
     shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000007.mcap")
-    assert level_of(spoilt, "run_duplicates", "run") == "fail"
+    assert level_of(spoilt, "duplicates", "run") == "fail"
     assert level_of(spoilt, "run_files", "run") == "fail"
 
 
@@ -175,7 +175,7 @@ def test_shifted_actions_of_every_kind(action: str, run: Path, tmp_path: Path) -
 def test_swapped_joints(dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(dataset, tmp_path / "ds")
     edit_column(spoilt, "observation.state", lambda rows: rows[:, [1, 0, *range(2, rows.shape[1])]])
-    assert level_of(spoilt, "dataset_forward_kinematics", "dataset") == "fail"
+    assert level_of(spoilt, "forward_kinematics", "dataset") == "fail"
 
 
 def test_degrees(dataset: Path, tmp_path: Path) -> None:
@@ -187,13 +187,13 @@ def test_degrees(dataset: Path, tmp_path: Path) -> None:
 def test_quaternions_scalar_first(dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(dataset, tmp_path / "ds")
     edit_column(spoilt, "observation.ee_pose", lambda rows: rows[:, [0, 1, 2, 6, 3, 4, 5]])
-    assert level_of(spoilt, "dataset_forward_kinematics", "dataset") == "fail"
+    assert level_of(spoilt, "forward_kinematics", "dataset") == "fail"
 
 
 def test_wrong_fps(dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(dataset, tmp_path / "ds")
     edit_json(spoilt / "meta/info.json", lambda data: data.update(fps=20))
-    assert level_of(spoilt, "state_matches_velocity", "dataset") == "fail"
+    assert level_of(spoilt, "velocity_matches_position", "dataset") == "fail"
     assert level_of(spoilt, "dataset_counts", "dataset") == "fail"
 
 
@@ -290,7 +290,7 @@ def test_an_episode_twice_in_a_dataset(run: Path, tmp_path: Path) -> None:
     spoilt = copy(run, tmp_path / "run")
     shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000009.mcap")
     export_lerobot([spoilt], tmp_path / "ds", ExportOptions(verify=False))
-    assert level_of(tmp_path / "ds", "dataset_duplicates", "dataset") == "fail"
+    assert level_of(tmp_path / "ds", "duplicates", "dataset") == "fail"
 
 
 def test_a_missing_table(dataset: Path, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_recordings_exchanged(run: Path) -> None:
 
 def test_a_fixed_layout_is_no_twin(tmp_path: Path) -> None:
     run = simulate_run(tmp_path / "run", 2, seed=3, task="tutorial", fixed=True, variation="none")
-    result = next(r for r in checked(run, "run").results if r.check == "run_duplicates")
+    result = next(r for r in checked(run, "run").results if r.check == "duplicates")
     assert result.level == "skip"
     assert "--fixed" in result.detail
 

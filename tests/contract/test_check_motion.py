@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from support.check import checked, copy, edit_column, edit_json, simulate_run
 
+from demorec.cli import main
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.mcap import SimulatedRecording
+from demorec.mcap.description import robot_description
+from demorec.robots.panda import PANDA
 
+EE_POSE = "observation.ee_pose"
 STATE, ACTION, VELOCITY, FRONT = "observation.state", "action", "observation.velocity", "observation.images.front"
 Rows = NDArray[Any]
 
@@ -57,8 +62,8 @@ FAULTS: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
     "late actions": (ACTION, late, "state_follows_action"),
     "degrees": (STATE, np.degrees, "joint_limits"),
     "a dead encoder": (STATE, lambda rows: rows * (np.arange(rows.shape[1]) != 2), "elements_alive"),
-    "velocities of another joint": (VELOCITY, exchanged, "state_matches_velocity"),
-    "velocities in degrees": (VELOCITY, np.degrees, "state_matches_velocity"),
+    "velocities of another joint": (VELOCITY, exchanged, "velocity_matches_position"),
+    "velocities in degrees": (VELOCITY, np.degrees, "velocity_matches_position"),
 }
 
 
@@ -114,7 +119,7 @@ def test_what_robots_do_is_no_fault(strange: Path, kind: str, tmp_path: Path) ->
 def test_a_wrong_rate_is_found(strange: Path, tmp_path: Path) -> None:
     spoilt = copy(strange, tmp_path / "ds")
     edit_json(spoilt / "meta/info.json", slower)
-    assert level(spoilt, "state_matches_velocity") == "fail"
+    assert level(spoilt, "velocity_matches_position") == "fail"
     edit_json(spoilt / "meta/info.json", lambda data: data.update(fps=90))
     assert level(spoilt, "joint_speed") in ("warn", "fail")
 
@@ -180,6 +185,95 @@ def test_faults_in_a_dataset_that_lerobot_wrote(run: Path, tmp_path: Path) -> No
         assert level(spoilt, check) == "fail"
     spoilt = copy(clean, tmp_path / "rate")
     edit_json(spoilt / "meta/info.json", slower)
-    assert level(spoilt, "state_matches_velocity") == "fail"
+    assert level(spoilt, "velocity_matches_position") == "fail"
     frozen = make_by_lerobot(run, tmp_path / "frozen", frozen=range(20, 80))
     assert level(frozen, "dataset_frozen", pictures=True) == "fail"
+
+
+LAWS = ("joint_limits", "joint_speed", "velocity_matches_position", "pose_follows_joints", "gripper_follows")
+
+
+def test_every_law_runs_where_its_needs_are(strange: Path) -> None:
+    """The same laws judge our recording and a dataset that says nothing of its robot but the names of its joints."""
+    recording = next((strange.parent / "run" / "episodes").glob("*.mcap"))
+    for path, kind in ((recording, "recording"), (strange, "dataset")):
+        report = checked(path, kind, pictures=False, only=LAWS)
+        assert {result.check: result.level for result in report.results} == dict.fromkeys(LAWS, "pass"), kind
+
+
+HAND: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
+    "joints exchanged": (STATE, lambda rows: rows[:, [1, 0, *range(2, rows.shape[1])]], "pose_follows_joints"),
+    "a quaternion that begins with w": (EE_POSE, lambda rows: rows[:, [0, 1, 2, 6, 3, 4, 5]], "pose_follows_joints"),
+    "millimetres": (EE_POSE, lambda rows: rows * [1000, 1000, 1000, 1, 1, 1, 1], "pose_follows_joints"),
+    "an opening that is inverted": (STATE, lambda rows: of_gripper(rows, lambda w: w.max() - w), "gripper_follows"),
+    "an opening that stands still": (STATE, lambda rows: of_gripper(rows, lambda w: w * 0), "gripper_follows"),
+}
+
+
+def of_gripper(rows: Rows, change: Callable[[Rows], Rows]) -> Rows:
+    return np.concatenate([rows[:, :-1], change(rows[:, -1:])], axis=1)
+
+
+@pytest.mark.parametrize("fault", HAND)
+def test_a_fault_of_a_strangers_hand_is_found(strange: Path, fault: str, tmp_path: Path) -> None:
+    feature, change, check = HAND[fault]
+    spoilt = copy(strange, tmp_path / "ds")
+    edit_column(spoilt, feature, change)
+    assert level(spoilt, check) == "fail"
+
+
+def test_a_hand_in_the_frame_of_another_base_is_no_fault(strange: Path, tmp_path: Path) -> None:
+    """As when the base is mounted upside down, and poses are those of a table's corner."""
+
+    def from_elsewhere(rows: Rows) -> Rows:
+        turned = rows.copy()  # half a turn about x: y and z change their sign, and q becomes (1, 0, 0, 0) * q
+        turned[:, :3] = rows[:, :3] * [1, -1, -1] + [0.3, 0.2, 1.5]
+        x, y, z, w = rows[:, 3:].T
+        turned[:, 3:] = np.stack([w, -z, y, -x], axis=1)
+        return turned
+
+    other = copy(strange, tmp_path / "ds")
+    edit_column(other, EE_POSE, from_elsewhere)
+    assert level(other, "pose_follows_joints") == "pass"
+
+
+def test_a_description_that_the_user_names_makes_laws_applicable(
+    strange: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Elements of other names are those of the description's joints in their order."""
+
+    def told(*flags: str) -> tuple[object, str]:
+        with pytest.raises(SystemExit) as ended:
+            main(["check", str(other), "--no-pictures", "--only", "joint_limits", "pose_follows_joints", *flags])
+        return ended.value.code, capsys.readouterr().out
+
+    other = copy(strange, tmp_path / "ds")
+    names = [*(f"axis_{n}" for n in range(1, 8)), "gripper.width"]
+
+    def renamed(data: dict[str, Any]) -> None:
+        for key in (STATE, ACTION, VELOCITY):
+            data["features"][key].update(names=names)
+
+    edit_json(other / "meta/info.json", renamed)
+    code, text = told()
+    assert "1 needs a robot whose URDF is known (--urdf FILE)" in text
+    description = tmp_path / "arm.urdf"
+    joints = robot_description(PANDA.urdf, 1.0)
+    description.write_text(re.sub(r'<joint name="panda_finger_joint\d" type="prismatic"', _fixed, joints))
+    code, text = told("--urdf", str(description))
+    assert (code, "2 checks passed" in text or "2 passed" in text) == (0, True), text
+    edit_column(other, STATE, np.degrees)
+    assert told("--urdf", str(description))[0] == 1
+    description.write_text("<robot")
+    assert told("--urdf", str(description))[0] == 2
+
+
+def _fixed(match: re.Match[str]) -> str:
+    return match[0].replace("prismatic", "fixed")
+
+
+def test_an_old_name_of_a_check_names_the_new_one(strange: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["check", str(strange), "--only", "collected_gaps"])
+    assert ended.value.code == 2
+    assert "names collected_gaps, which is now gaps" in capsys.readouterr().err

@@ -120,7 +120,7 @@ def test_check_says_what_it_skips_for_lack_of_the_model_and_names_the_flag(
     (report,) = json.loads(capsys.readouterr().out)
     assert "my_robots" not in sys.modules  # nothing of it has run
     skipped = {result["check"] for result in report["results"] if "--allow" in result["detail"]}
-    assert "effort_bears_the_arm" in skipped
+    assert "effort_matches_dynamics" in skipped
     assert f", {len(skipped)} need --allow" in told
     assert told.endswith("if you trust it, add --allow my_robots.\n")
     assert f"\n{len(skipped)} checks skipped" in told

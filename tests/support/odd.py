@@ -215,8 +215,8 @@ class Odd:
     def _on_dataset(self, rng: random.Random, path: Path, place: Path, source: Path) -> list[Any]:
         origin = self.plain if source == self.dataset else self.filmed
         checks = ["dataset_readable", "dataset_counts", "dataset_videos", "dataset_statistics", "dataset_sidecar",
-                  "dataset_picture_statistics", "dataset_duplicates", "dataset_coverage", "joint_limits",
-                  "state_matches_velocity", "dataset_forward_kinematics", "dataset_action_lag"]  # fmt: skip
+                  "dataset_picture_statistics", "duplicates", "coverage", "joint_limits",
+                  "velocity_matches_position", "forward_kinematics", "dataset_action_lag"]  # fmt: skip
         return rng.choice(
             (
                 ["info", path], ["info", path, "--json"], ["check", path, "--only", *checks],

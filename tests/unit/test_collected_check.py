@@ -83,19 +83,19 @@ def older(name: str, by: int) -> Callable[[Episode], Episode]:
 
 
 FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
-    "a gap": (moved(lambda i: 6 * 10**7 if i >= 20 else 0), "collected_gaps", "warn"),
-    "another rate": (moved(lambda i: i * 5_000_000), "collected_rate", "warn"),
-    "half the rate": (moved(lambda i: i * 40_000_000), "collected_rate", "fail"),
-    "a late sensor": (older("observation.force", 2 * 10**8), "collected_sample_age", "warn"),
-    "a clock offset": (older("action", 3 * 10**9), "collected_sample_age", "fail"),
+    "a gap": (moved(lambda i: 6 * 10**7 if i >= 20 else 0), "gaps", "warn"),
+    "another rate": (moved(lambda i: i * 5_000_000), "rate", "warn"),
+    "half the rate": (moved(lambda i: i * 40_000_000), "rate", "fail"),
+    "a late sensor": (older("observation.force", 2 * 10**8), "sample_age", "warn"),
+    "a clock offset": (older("action", 3 * 10**9), "sample_age", "fail"),
     "late pictures": (
         lambda e: replace(e, pictures={**e.pictures, "top": [(s - 3 * 10**8, p) for s, p in e.pictures["top"]]}),
-        "collected_picture_age",
+        "image_age",
         "warn",
     ),
     "a missing picture": (
         each(lambda i, f: replace(f, pictures={"top": f.pictures["top"]}) if i == 9 else f),
-        "collected_missing_pictures",
+        "missing_images",
         "warn",
     ),
     "a joint beyond its limit": (
@@ -105,20 +105,20 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
     ),
     "a stuck sensor": (
         each(lambda i, f: replace(f, samples={**f.samples, "observation.force": held(f, "observation.force")})),
-        "collected_stuck",
+        "stuck_sensors",
         "warn",
     ),
     "a dead encoder": (state(lambda i, v: [0.1, *v[1:]]), "elements_alive", "fail"),
     "a joint too fast": (state(lambda i, v: [v[0] + 0.9 * (i % 2), *v[1:]]), "joint_speed", "fail"),
-    "drops": (lambda e: replace(e, outcome=replace(e.outcome, drops={"frames": 3})), "collected_drops", "warn"),
+    "drops": (lambda e: replace(e, outcome=replace(e.outcome, drops={"frames": 3})), "drops", "warn"),
     "a covered camera": (
         lambda e: replace(e, pictures={**e.pictures, "side": [(s, p * 0) for s, p in e.pictures["side"]]}),
-        "collected_pictures",
+        "images_show_something",
         "fail",
     ),
     "one camera twice": (
         lambda e: replace(e, pictures={**e.pictures, "side": e.pictures["top"]}),
-        "collected_distinct_cameras",
+        "distinct_cameras",
         "fail",
     ),
 }
@@ -131,7 +131,8 @@ def levels(path: Path) -> dict[str, str]:
 
 def test_a_good_episode_passes(tmp_path: Path) -> None:
     found = levels(write_external(tmp_path / "a.mcap", steady()))
-    assert {level for check, level in found.items() if check.startswith("collected_")} == {"pass"}
+    clocks = {"opens", "checksums", "readable", "complete", "drops", "rate", "gaps", "sample_age", "image_age"}
+    assert {found[check] for check in (*clocks, "missing_images", "distinct_cameras", "stuck_sensors")} == {"pass"}
     assert (found["joint_limits"], found["joint_speed"]) == ("pass", "pass")
     assert "fail" not in found.values()
     assert "warn" not in found.values()
@@ -142,8 +143,8 @@ def test_cameras_that_are_the_same_are_named_together(tmp_path: Path) -> None:
     episode = steady()
     twice = replace(episode, pictures={**episode.pictures, "side": episode.pictures["top"]})
     report = check_subject(Subject(path=write_external(tmp_path / "a.mcap", twice), kind="recording"), CheckOptions())
-    (found,) = [result for result in report.results if result.check == "collected_distinct_cameras"]
-    assert (found.value, found.detail) == (1, "top and side")
+    (found,) = [result for result in report.results if result.check == "distinct_cameras"]
+    assert (found.value, found.detail) == (1, "side and top")
 
 
 def test_a_label_that_never_changes_is_no_stuck_sensor(tmp_path: Path) -> None:
@@ -157,7 +158,7 @@ def test_a_label_that_never_changes_is_no_stuck_sensor(tmp_path: Path) -> None:
         samples["intervention"] = replace(force, vector=np.zeros(3))
         frames.append(replace(frame, samples=samples))
     episode = replace(episode, info=replace(episode.info, features=features), frames=frames)
-    assert levels(write_external(tmp_path / "a.mcap", episode))["collected_stuck"] == "pass"
+    assert levels(write_external(tmp_path / "a.mcap", episode))["stuck_sensors"] == "skip"
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -180,9 +181,7 @@ def test_a_recovered_file_is_a_warning(tmp_path: Path) -> None:
     (tmp_path / "b.mcap").write_bytes(data[: len(data) * 3 // 4])
     recover(tmp_path / "b.mcap", tmp_path / "c.mcap")
     found = levels(tmp_path / "c.mcap")
-    assert {name: level for name, level in found.items() if level not in ("pass", "skip")} == {
-        "collected_complete": "warn"
-    }
+    assert {name: level for name, level in found.items() if level not in ("pass", "skip")} == {"complete": "warn"}
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, str]:
@@ -218,9 +217,21 @@ def test_a_run_of_other_files_is_a_failure(collected_run: Path, tmp_path: Path) 
     (tmp_path / "run.json").write_bytes((collected_run / "run.json").read_bytes())
     write_external(tmp_path / "episodes" / "episode_000001.mcap", steady(num_frames=9, episode_index=1))
     report = check_subject(Subject(path=tmp_path, kind="run"), CheckOptions())
-    told = next(result for result in report.results if result.check == "collected_run_files")
+    told = next(result for result in report.results if result.check == "run_files")
     assert (told.level, told.value) == ("fail", 2)
     assert "episode_000000.mcap is missing" in told.detail
+
+
+def test_an_episode_twice_in_a_run(tmp_path: Path) -> None:
+    with open_external_run(tmp_path / "run") as opened:
+        for index in range(2):
+            opened.add(write_external(opened.path_of(index), replace(steady(num_frames=20), info=numbered(index))))
+    report = check_subject(Subject(path=tmp_path / "run", kind="run"), CheckOptions(only=("duplicates",)))
+    assert [result.level for result in report.results] == ["fail"]
+
+
+def numbered(index: int) -> Any:
+    return replace(steady(num_frames=20).info, episode_index=index)
 
 
 @pytest.mark.parametrize("command", ["replay", "render", "reproduce"])

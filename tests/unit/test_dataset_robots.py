@@ -175,7 +175,7 @@ def test_another_arm_is_found_though_all_digests_fit(dataset: Path) -> None:
     changed = replace(record, urdf_sha256=sha256)
     rename(dataset, record_file, urdf_file, changed)
     assert level_of(dataset, "dataset_robots", "dataset") == "pass"
-    assert level_of(dataset, "dataset_forward_kinematics", "dataset") == "fail"
+    assert level_of(dataset, "forward_kinematics", "dataset") == "fail"
     record_file, urdf_file = files_of(dataset)
     assert changed.spec is not None
     rename(dataset, record_file, urdf_file, replace(changed, spec=replace(changed.spec, tcp_link="panda_hand")))
@@ -200,7 +200,7 @@ def test_a_dataset_of_before_is_as_good_as_it_was(dataset: Path) -> None:
     pq.write_table(pq.read_table(path).drop_columns(["robot_digest"]), path)
     shutil.rmtree(dataset / "demorec" / "robots")
     assert level_of(dataset, "dataset_robots", "dataset") == "skip"
-    assert level_of(dataset, "dataset_forward_kinematics", "dataset") == "pass"
+    assert level_of(dataset, "forward_kinematics", "dataset") == "pass"
     with open_dataset_episode(dataset, 0) as episode:
         assert isinstance(episode, PlayedEpisode)
         assert episode.robot_description is None

@@ -1,0 +1,278 @@
+"""How a robot moves in each episode of whatever is checked: the one form in which the laws of motion see it.
+
+What is known of the elements of `observation.state` comes from the recording, from the sidecar, from the URDF that the
+user names, or from the robot whose joints their names are. What is not known is absent.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.core.tables import ROBOTS
+from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
+from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
+from demorec.robots.urdf import Urdf
+
+if TYPE_CHECKING:
+    from demorec.check.dataset import Dataset
+    from demorec.check.episode import CheckedEpisode
+    from demorec.check.external import CheckedRecording
+
+EFFORT = "observation.effort"
+GRIPPER = "gripper.width"
+"""The element that is the opening of a simulated gripper, metres."""
+_GRIPPER_WORDS = ("gripper", "finger")
+_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
+"""What of the name of an element is not that of its joint."""
+_QUATERNION = ("qx", "qy", "qz", "qw")
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """How a robot moves in one episode; elements are those of observation.state.
+
+    Attributes:
+        where: "episode 3", or "" where there is only one.
+        fps: Frames per second.
+        steps_s: (T - 1,) time from each frame to the next, seconds.
+        names: Of the D elements.
+        state: (T, D) rad or m where the joint is known, else as it came.
+        velocity, action, effort: (T, D) of the same elements and units, NaN where an element has none; None for no
+            element.
+        lower, upper: (D,) limits; infinite where they are not known.
+        speed: (D,) largest speed, rad/s or m/s; infinite where it is not known.
+        joints: (D,) of the URDF, "" where it is not known.
+        urdf: The joint tree, None where it is not known.
+        model: Text of a URDF with masses, or its name as by `asset_path`.
+        commands: Name -> (T, D) of what else is known to be sent to the same elements, in the same units.
+        ee_pose: (T, 7) of the hand, if there.
+        sensors: Name -> (T, n) of what is measured.
+        contact: (T,) N, force on the fingers; None where nobody measures it.
+    """
+
+    where: str
+    fps: float
+    steps_s: Array
+    names: tuple[str, ...]
+    state: Array
+    velocity: Array | None = None
+    action: Array | None = None
+    effort: Array | None = None
+    lower: Array
+    upper: Array
+    speed: Array
+    joints: tuple[str, ...] = ()
+    urdf: Urdf | None = None
+    model: str = ""
+    commands: Mapping[str, Array] = field(default_factory=dict)
+    ee_pose: Array | None = None
+    sensors: Mapping[str, Array] = field(default_factory=dict)
+    contact: Array | None = None
+
+    @property
+    def gripper(self) -> int | None:
+        """The element that is the opening of a gripper, if one is."""
+        found = [i for i, name in enumerate(self.names) if any(word in name.lower() for word in _GRIPPER_WORDS)]
+        return found[0] if len(found) == 1 else None
+
+    @property
+    def joint_position(self) -> dict[str, Array]:
+        """Joint of the URDF -> (T,)."""
+        return {joint: column for joint, column in zip(self.joints, self.state.T, strict=False) if joint}
+
+    def labels(self, known: Flags) -> list[str]:
+        """Names of some elements, with the episode."""
+        where = f", {self.where}" if self.where else ""
+        return [f"{name}{where}" for name, is_known in zip(self.names, known, strict=True) if is_known]
+
+
+def motion_of_simulated(episode: CheckedEpisode) -> Motion:
+    """Of a recording that demorec simulated: all is known."""
+    robot, c = episode.info.robot, episode.columns
+    n = len(robot.arm_joints)
+    nothing, inf = np.full((c.num_frames, 1), np.nan), (math.inf,)
+    sensors = {"velocities": c.joint_velocity, "efforts": c.joint_effort[:, :n], "EE pose": c.base_from_tcp}
+    if c.wrench is not None:
+        sensors["wrench"] = c.wrench
+    return Motion(
+        where="",
+        fps=episode.info.fps,
+        steps_s=np.full(max(c.num_frames - 1, 0), 1 / episode.info.fps),
+        names=(*robot.arm_joints, GRIPPER),
+        state=np.column_stack([c.joint_position[:, :n], c.gripper_width]),
+        velocity=np.column_stack([c.joint_velocity[:, :n], nothing]),
+        action=np.column_stack([c.action_joint_target, c.action_gripper]),
+        effort=np.column_stack([c.joint_effort[:, :n], nothing]),
+        lower=np.array([*robot.position_lower, -1e-3]),  # fingers have mass, and overshoot by a millimetre
+        upper=np.array([*robot.position_upper, robot.gripper.max_width + 1e-3]),
+        speed=np.array([*robot.velocity_limit, *inf]),
+        joints=(*robot.arm_joints, ""),
+        urdf=episode.urdf,
+        commands={
+            "action": np.column_stack([c.action_joint_target, c.action_gripper]),
+            "command": np.column_stack([c.command_joint_target, c.command_gripper]),
+        },
+        ee_pose=c.base_from_tcp,
+        sensors=sensors,
+        contact=c.contact_force,
+    )
+
+
+def motion_of_recording(subject: CheckedRecording) -> Motion | None:
+    """Of a recording that somebody else made; None without a state."""
+    info, columns = subject.recording.info, subject.recording.columns()
+    described = {feature.name: feature for feature in info.features}
+    if STATE not in described or not columns.num_frames:
+        return None
+    state = described[STATE]
+    return _motion(
+        "",
+        info.fps,
+        columns.features,
+        {name: feature.names for name, feature in described.items()},
+        units={name: feature.units for name, feature in described.items()},
+        arm=_arm(state.names, subject.urdf or info.urdf, state.joints),
+        time_ns=columns.time_ns,
+    )
+
+
+def motions_of_dataset(dataset: Dataset) -> Iterator[Motion]:
+    """Of every episode of a dataset that has a state."""
+    features = dataset.info.features
+    if STATE not in features or features[STATE].dtype not in ("float32", "float64"):
+        return
+    names = {
+        name: feature.names or tuple(map(str, range(feature.shape[0])))
+        for name, feature in features.items()
+        if feature.is_numeric and len(feature.shape) == 1
+    }
+    stranger = _arm(names[STATE], dataset.urdf)
+    for number, rows in enumerate(dataset.rows):
+        digest = dataset.robot_digests.get(number)
+        robot = None if digest is None else dataset.robots[digest]
+        where = f"episode {number}"
+        if robot is None:
+            yield _motion(where, dataset.info.fps, rows, names, arm=stranger)
+            continue
+        spec, arm = robot.record.spec, _Arm.of(robot)
+        opening = math.inf if spec is None else spec.gripper.max_width
+        yield _motion(where, dataset.info.fps, rows, names, units=robot.record.units, arm=arm, opening=opening)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Arm:
+    """What is known of the robot: its joint tree, the joints of the state's elements, a model with its masses."""
+
+    urdf: Urdf | None = None
+    joints: Sequence[str] = ()
+    model: str = ""
+
+    @classmethod
+    def of(cls, robot: DatasetRobot) -> _Arm:
+        """Of a dataset's robot, whose own URDF has no masses."""
+        record = robot.record
+        model = record.spec.urdf if record.spec else ROBOTS.load(record.name).urdf if record.name in ROBOTS.rows else ""
+        return cls(urdf=robot.model, joints=record.joints.get(STATE, ()), model=model)
+
+
+def _arm(names: Sequence[str], urdf: str, joints: Sequence[str] = ()) -> _Arm:
+    """By a URDF (its text, "" for none), whose joints the elements are named after or follow, or by their names."""
+    if urdf:
+        tree = Urdf.parse(urdf)
+        movable = [joint.name for joint in tree.depth_first() if joint.kind != "fixed"]
+        stems = [_SUFFIX.sub("", name) for name in names]
+        if not any(joints):
+            joints = [stem if stem in movable else "" for stem in stems]
+        if not any(joints) and len(movable) >= len(names) - 1 and len(movable) - len(names) in (-1, 0):
+            joints = [*movable, ""][: len(names)]  # in the order of the tree; what is left is a gripper
+        return _Arm(urdf=tree, joints=joints, model=urdf)
+    if (robot := recognised_robot(tuple(names))) is None:
+        return _Arm()
+    return _Arm.of(robot)
+
+
+def _motion(
+    where: str,
+    fps: float,
+    features: Mapping[str, NDArray[Any]],
+    names: Mapping[str, Sequence[str]],
+    *,
+    arm: _Arm,
+    units: Mapping[str, Sequence[str]] | None = None,
+    opening: float = math.inf,
+    time_ns: NDArray[np.int64] | None = None,
+) -> Motion:
+    state, elements = features[STATE].astype(np.float64), names[STATE]
+    tree = {} if arm.urdf is None else {joint.name: joint for joint in arm.urdf.joints}
+    found = [tree.get(joint) for joint in arm.joints] or [None] * len(elements)
+    lower = np.array([-math.inf if joint is None else joint.lower for joint in found])
+    upper = np.array([math.inf if joint is None else joint.upper for joint in found])
+    if opening < math.inf and GRIPPER in elements:
+        place = list(elements).index(GRIPPER)
+        lower[place], upper[place] = 0.0, opening
+
+    def factor(feature: str) -> Array:
+        """(D,) from the feature's own units: a leader may tell degrees of an arm that tells rad."""
+        known = (units or {}).get(feature, ())
+        degrees = [math.radians(1) if unit in ("deg", "degree") else 1.0 for unit in known]
+        return np.array(degrees if len(degrees) == len(names[feature]) else [1.0] * len(names[feature]))
+
+    def alike(feature: str) -> Array | None:
+        """The elements of another feature that have the names of the state's, or all of as many without names."""
+        if feature not in features or feature not in names:
+            return None
+        values, theirs = features[feature].astype(np.float64) * factor(feature), names[feature]
+        places = {_SUFFIX.sub("", name): index for index, name in enumerate(theirs)}
+        columns = [places.get(_SUFFIX.sub("", name)) for name in elements]
+        if all(column is None for column in columns):
+            return None
+        missing = np.full(len(state), np.nan)
+        return np.stack([missing if column is None else values[:, column] for column in columns], axis=1)
+
+    return Motion(
+        where=where,
+        fps=fps,
+        steps_s=np.full(len(state) - 1, 1 / fps) if time_ns is None else np.maximum(np.diff(time_ns) / 1e9, 0.5 / fps),
+        names=tuple(elements),
+        state=state * factor(STATE),
+        velocity=alike(VELOCITY),
+        action=alike(ACTION),
+        effort=alike(EFFORT),
+        lower=lower,
+        upper=upper,
+        speed=np.array([math.inf if joint is None else joint.max_speed for joint in found]),
+        joints=tuple(arm.joints),
+        urdf=arm.urdf if any(arm.joints) else None,
+        model=arm.model,
+        ee_pose=_poses(features, names),
+        sensors=_sensors(features, names),
+    )
+
+
+def _sensors(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> dict[str, NDArray[Any]]:
+    """What is observed beside the state, and is no truth of the simulator's."""
+    others = (STATE, ENVIRONMENT_STATE)
+    return {
+        name: values
+        for name, values in features.items()
+        if name.startswith("observation.") and name in names and name not in others
+    }
+
+
+def _poses(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> Array | None:
+    """(T, 7) position and quaternion xyzw of the EE pose, whose names may say that it has another order."""
+    if EE_POSE not in features or features[EE_POSE].shape[1:] != (7,):
+        return None
+    last = [name.rpartition(".")[2].rpartition("_")[2] for name in names[EE_POSE]]
+    order = [last.index(word) for word in _QUATERNION] if set(_QUATERNION) <= set(last) else [3, 4, 5, 6]
+    return np.asarray(features[EE_POSE].astype(np.float64)[:, [0, 1, 2, *order]])
