@@ -12,7 +12,7 @@ from typing import cast
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose, quat_from_rotation
+from demorec.core.geometry import Array, Pose, quat_from_rotation, wrap_angle
 from demorec.robots.kinematics_kernels import forward, inverse, straight_path, tilt_and_roll
 from demorec.robots.urdf import Urdf
 
@@ -35,7 +35,7 @@ class Freedom:
 
 
 WHOLE_POSE = Freedom()
-FIVE_JOINTS = Freedom(cone=math.radians(12.0), roll=math.radians(2.0))
+FIVE_JOINTS = Freedom(cone=math.radians(15.0), roll=math.radians(2.0))
 """What an arm of fewer than six joints needs where nothing else is said: it cannot tilt its hand to every side."""
 
 
@@ -106,6 +106,17 @@ class ArmKinematics:
         """n."""
         return len(self.origins)
 
+    def turned_towards(self, joint_position: Array, point: Array) -> Array:
+        """A configuration (n,) of an arm that stands upright, its first joint turned so that the hand is at the azimuth
+        of a point (3,), metres, of the base frame; azimuths are seen from that joint's axis."""
+        x, y = self.origins[0][:2]
+        hand = self.forward(joint_position).position
+        turn = wrap_angle(math.atan2(point[1] - y, point[0] - x) - math.atan2(hand[1] - y, hand[0] - x))
+        turned = np.array(joint_position)
+        upwards = float(self.rotations[0][2] @ self.axes[0])
+        turned[0] += math.copysign(turn, upwards * turn)
+        return turned
+
     def forward(self, joint_position: Array) -> Pose:
         """`base_from_tcp` at (n,) joint positions, rad."""
         q = np.ascontiguousarray(joint_position, dtype=np.float64)
@@ -141,10 +152,9 @@ class ArmKinematics:
         if self.inverse(base_from_tcp, start=start, rest=rest, freedom=freedom) is not None:
             return ""
         asked = (Freedom(cone=math.pi, roll=math.pi), replace(freedom, roll=math.pi), freedom)
-        for step, relaxed in enumerate(asked):
-            q, reached = self._seek(base_from_tcp, start, rest, 0.1, relaxed)
-            if not reached:
-                break
+        tries = [self._seek(base_from_tcp, start, rest, 0.1, relaxed) for relaxed in asked]
+        step = next((number for number, (_, reached) in enumerate(tries) if not reached), 0)
+        q, _ = tries[step]
         found = self.forward(q)
         tilt_x, tilt_y, roll = tilt_and_roll(base_from_tcp.rotation, found.rotation)
         short, tilt = math.dist(base_from_tcp.position, found.position), math.hypot(tilt_x, tilt_y)

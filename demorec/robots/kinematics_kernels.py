@@ -153,7 +153,7 @@ def _damped_solve(jacobian, damping, rhs):  # type: ignore[no-untyped-def]
 
 @_njit
 def tilt_and_roll(wanted, found):  # type: ignore[no-untyped-def]
-    """Rotation (3,), along the axes of `found`, that takes its approach (z) to the wanted one and then its roll there."""
+    """Rotation (3,), along the axes of `found`, that takes its approach (z) to the wanted one, then its roll there."""
     x, y, z = 0.0, 0.0, 0.0
     for i in range(3):
         x += found[i, 0] * wanted[i, 2]
@@ -189,24 +189,44 @@ def _ease(jacobian, error, turn, rotation, cone, roll):  # type: ignore[no-untyp
                 rotation[0, a] * jacobian[3, k] + rotation[1, a] * jacobian[4, k] + rotation[2, a] * jacobian[5, k]
             )
     for a in range(3):
-        weight = 0.0 if (roll if a == 2 else cone) >= math.pi else (10.0 if a == 2 else 1.0)
-        error[a, 0] *= 100.0
+        weight = 0.0 if (roll if a == 2 else cone) >= math.pi else (30.0 if a == 2 else 1.0)
+        error[a, 0] *= 500.0
         error[3 + a, 0] = weight * turn[a]
         for k in range(jacobian.shape[1]):
-            jacobian[a, k] *= 100.0
+            jacobian[a, k] *= 500.0
             jacobian[3 + a, k] = weight * turned[a, k]
 
 
 @_njit
-def _lock(jacobian, error, q, low, high):  # type: ignore[no-untyped-def]
-    """Leave out the joints that stand at a limit beyond which the task pulls them: the others do without."""
-    for k in range(len(q)):
-        pull = 0.0
+def _step(jacobian, error, gain, rest, q, low, high, is_whole):  # type: ignore[no-untyped-def]
+    """J# e + (I - J# J) gain (rest - q); where less than the whole pose is wanted, without the joints at their limits.
+
+    A joint that the step would take beyond its limit is left out, and the others do without it.
+    """
+    n = len(q)
+    wanted = np.empty((6, 1))
+    step = np.empty(n)
+    for _ in range(n):
         for i in range(6):
-            pull += jacobian[i, k] * error[i, 0]
-        if (q[k] <= low[k] + 0.01 and pull < 0.0) or (q[k] >= high[k] - 0.01 and pull > 0.0):
+            wanted[i, 0] = error[i, 0]
+            pulled = 0.0
+            for k in range(n):
+                pulled += jacobian[i, k] * gain[k] * (rest[k] - q[k])
+            wanted[i, 0] -= pulled
+        solved = _damped_solve(jacobian, 1e-3, wanted)
+        is_free = True
+        for k in range(n):
+            step[k] = gain[k] * (rest[k] - q[k])
             for i in range(6):
-                jacobian[i, k] = 0.0
+                step[k] += jacobian[i, k] * solved[i, 0]
+            if not is_whole and ((q[k] <= low[k] + 0.01 and step[k] < 0.0) or (q[k] >= high[k] - 0.01 and step[k] > 0)):
+                is_free = False
+                gain[k] = 0.0
+                for i in range(6):
+                    jacobian[i, k] = 0.0
+        if is_free:
+            break
+    return step
 
 
 @_njit
@@ -237,6 +257,7 @@ def inverse(  # type: ignore[no-untyped-def]
     n = len(start)
     q = start.copy()
     error = np.empty((6, 1))
+    gain = np.empty(n)
     is_whole = cone == 0.0 and roll == 0.0
     largest = math.inf
     for iteration in range(max_iterations + 1):
@@ -260,19 +281,11 @@ def inverse(  # type: ignore[no-untyped-def]
             break
         if not is_whole:
             _ease(jacobian, error, turn, rotation, cone, roll)
-            _lock(jacobian, error, q, low, high)
-        for i in range(6):
-            pull = 0.0
-            for k in range(n):
-                pull += jacobian[i, k] * null_gain * (rest[k] - q[k])
-            error[i, 0] -= pull
-        solved = _damped_solve(jacobian, 1e-3, error)
-        step = np.empty(n)
+        for k in range(n):
+            gain[k] = null_gain
+        step = _step(jacobian, error, gain, rest, q, low, high, is_whole)
         largest = 0.0
         for k in range(n):
-            step[k] = null_gain * (rest[k] - q[k])
-            for i in range(6):
-                step[k] += jacobian[i, k] * solved[i, 0]
             largest = max(largest, abs(step[k]))
         factor = 0.35 / largest if largest > 0.35 else 1.0
         for k in range(n):
