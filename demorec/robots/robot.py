@@ -113,11 +113,11 @@ class JawGripper:
 
     def __post_init__(self) -> None:
         turns = [b[0] - a[0] for a, b in pairwise(self.opening)]
-        grows = all(b[1] > a[1] for a, b in pairwise(self.opening))
+        grows = all(b[1] >= a[1] for a, b in pairwise(self.opening))
         if not turns or not grows or not (all(t > 0 for t in turns) or all(t < 0 for t in turns)):
             raise ValueError(
                 "the opening of a jaw needs two rows or more of joint position and opening, from closed to open, in "
-                "which the opening grows while the joint turns one way"
+                "which the opening never shrinks while the joint turns one way"
             )
 
     @property
@@ -146,7 +146,8 @@ class JawGripper:
 
     def contact_force(self, width: Array) -> Array:
         """As of `ParallelGripper`: the jaw's force is its torque over d opening / d angle, the fixed finger's equal."""
-        return np.asarray(2 * self.force / np.abs(self._slope(self.joint_position(width)[..., 0])))
+        slope = np.abs(self._slope(self.joint_position(width)[..., 0]))
+        return np.asarray(2 * self.force / np.maximum(slope, 1e-6))
 
     def grip_force(self, finger_forces: Sequence[float]) -> float:
         """As of `ParallelGripper`."""

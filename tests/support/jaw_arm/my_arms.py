@@ -32,7 +32,7 @@ JAW_ARM = RobotSpec(
         joints=("jaw",),
         finger_links=("hand", "jaw"),
         opening=tuple((q / 100, opening(q / 100)) for q in range(-34, 47, 4)),
-        force=1.0,
+        force=0.3,
         finger_depth=0.006,
         palm_clearance=0.058,
     ),
