@@ -131,7 +131,7 @@ def moving_frames(episode: CheckedEpisode) -> Iterator[Found]:
     ),
 )
 def derived_values(episode: CheckedEpisode) -> Iterator[Found]:
-    """The velocity of the opening is that of the finger joints; nothing is commanded but positions (zeros elsewhere)."""
+    """The velocity of the opening is that of the finger joints; only positions are commanded (zeros elsewhere)."""
     n, c = episode.num_arm, episode.columns
     for stream in frame_streams(episode.info):
         if stream.topic not in (channels.GRIPPER, channels.ACTION, channels.COMMAND):

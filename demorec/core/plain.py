@@ -104,7 +104,7 @@ def write_flat(
     _converter.register_unstructure_hook(part, make_dict_unstructure_fn(part, _converter, **renamed))
     of_part = frozenset(keys.values())
     _converter.register_structure_hook(
-        part | otherwise,  # type: ignore[operator]
+        part | otherwise,
         lambda value, _: _converter.structure(value, part if isinstance(value, _Flat) else otherwise),
     )
     structure: Any = make_dict_structure_fn(owner, _converter, _cattrs_forbid_extra_keys=True)

@@ -98,8 +98,8 @@ class JawGripper:
         play: Air between the fixed finger and an object before the jaw pushes it there, metres.
     """
 
-    joints: tuple[str]
-    finger_links: tuple[str, str]
+    joints: tuple[str, ...]
+    finger_links: tuple[str, ...]
     opening: tuple[tuple[float, float], ...]
     force: float
     finger_depth: float

@@ -101,9 +101,7 @@ def _scaled_body(body: Body, scale: float) -> Body:
     shape = replace(
         shape, size=tuple(scale * v for v in shape.size), scale=scale * shape.scale if is_file else shape.scale
     )
-    return replace(
-        body, shape=shape, mass=scale * body.mass, world_from_body=_scaled_pose(body.world_from_body, scale)
-    )
+    return replace(body, shape=shape, mass=scale * body.mass, world_from_body=_scaled_pose(body.world_from_body, scale))
 
 
 def _scaled_pose(pose: Pose, scale: float) -> Pose:
