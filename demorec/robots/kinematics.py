@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -151,10 +151,9 @@ class ArmKinematics:
         freedom = freedom or self.freedom
         if self.inverse(base_from_tcp, start=start, rest=rest, freedom=freedom) is not None:
             return ""
-        asked = (Freedom(cone=math.pi, roll=math.pi), replace(freedom, roll=math.pi), freedom)
-        tries = [self._seek(base_from_tcp, start, rest, 0.1, relaxed) for relaxed in asked]
-        step = next((number for number, (_, reached) in enumerate(tries) if not reached), 0)
-        q, _ = tries[step]
+        q, is_near = self._seek(base_from_tcp, start, rest, 0.1, Freedom(cone=math.pi, roll=math.pi))
+        if is_near:
+            q, _ = self._seek(base_from_tcp, start, rest, 0.1, freedom)
         found = self.forward(q)
         tilt_x, tilt_y, roll = tilt_and_roll(base_from_tcp.rotation, found.rotation)
         short, tilt = math.dist(base_from_tcp.position, found.position), math.hypot(tilt_x, tilt_y)
@@ -162,11 +161,12 @@ class ArmKinematics:
             k + 1 for k in range(self.num_joints) if min(q[k] - self.lower[k], self.upper[k] - q[k]) < 0.01 + 1e-9
         ]
         held = f" (at its limit: joint {', '.join(map(str, at_limit))})" if at_limit else ""
-        if step == 0:
+        if not is_near:
             return f"the TCP stays {short:.3f} m short of the position{held}"
-        missed = f"{tilt:.2f} rad off the approach" if step == 1 else f"{abs(roll):.2f} rad off the roll"
-        allowed = freedom.cone if step == 1 else freedom.roll
-        return f"at the position the hand stays {missed}, allowed are {allowed:.2f} rad{held}"
+        leans = tilt > freedom.cone
+        missed = f"{tilt:.3f} rad off the approach" if leans else f"{abs(roll):.3f} rad off the roll"
+        allowed = freedom.cone if leans else freedom.roll
+        return f"at the position the hand stays {missed}, allowed are {allowed:.3f} rad{held}"
 
     def _seek(
         self, base_from_tcp: Pose, start: Array, rest: Array | None, null_gain: float, freedom: Freedom

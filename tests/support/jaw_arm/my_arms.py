@@ -36,5 +36,5 @@ JAW_ARM = RobotSpec(
         finger_depth=0.006,
         palm_clearance=0.058,
     ),
-    task_scale=0.4,
+    task_scale=0.38,
 )
