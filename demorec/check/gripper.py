@@ -45,11 +45,11 @@ def grip_force(episode: CheckedEpisode) -> Found:
     carried = np.any([episode.is_carried(body.name, CARRIED_HEIGHT) for body in scene.movable], axis=0)
     if carried.sum() < 10:
         return NotMeasured(why="nothing is carried for ten frames")
-    expected = len(robot.gripper.joints) * robot.gripper.force
+    expected = float(np.median(robot.gripper.contact_force(episode.columns.gripper_width[carried])))
     force = float(np.median(episode.columns.contact_force[carried]))
     frame = int(np.argmax(carried))
     return Measurement(
-        value=abs(force / expected - 1), frame=frame, detail=f"{force:.1f} N, the motors give {expected:g} N"
+        value=abs(force / expected - 1), frame=frame, detail=f"{force:.1f} N, the motors give {expected:.3g} N"
     )
 
 
@@ -67,7 +67,7 @@ def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
         reach = math.hypot(*body.shape.extents) / 2 + 0.08
         alone &= np.linalg.norm(c.object_poses[body.name][:, :3] - tcp, axis=1) > reach
     # Closed fingers press on each other.
-    alone &= c.gripper_width > 0.005
+    alone &= c.gripper_width > episode.info.robot.gripper.min_width + 0.005
     if not alone.any():
         return None
     return worst_frame(np.where(alone, np.abs(c.contact_force), 0.0), f"{int(alone.sum())} frames alone")

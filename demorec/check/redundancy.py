@@ -131,7 +131,7 @@ def moving_frames(episode: CheckedEpisode) -> Iterator[Found]:
     ),
 )
 def derived_values(episode: CheckedEpisode) -> Iterator[Found]:
-    """The velocity of the opening is the sum of the fingers'; nothing is commanded but positions (zeros elsewhere)."""
+    """The velocity of the opening is that of the finger joints; only positions are commanded (zeros elsewhere)."""
     n, c = episode.num_arm, episode.columns
     for stream in frame_streams(episode.info):
         if stream.topic not in (channels.GRIPPER, channels.ACTION, channels.COMMAND):
@@ -140,7 +140,8 @@ def derived_values(episode: CheckedEpisode) -> Iterator[Found]:
             values = stream.layout.decode_rows(episode.block(stream.topic).rows(len(stream.layout.constant)))
         expected = values.copy()
         if stream.topic == channels.GRIPPER:
-            expected[:, 1] = c.joint_velocity[:, n:].sum(axis=1)
+            gripper = episode.info.robot.gripper
+            expected[:, 1] = gripper.width_velocity(c.joint_position[:, n:], c.joint_velocity[:, n:])
         else:
             expected[:, n + 1 :] = 0.0
         yield worst_frame(np.abs(values - expected).max(axis=1), stream.topic)

@@ -81,32 +81,47 @@ _converter.register_unstructure_hook(
 )
 
 
-def write_flat(owner: type, name: str, part: type, keys: Mapping[str, str]) -> None:
+class _Flat(dict[str, Any]):
+    """The keys of a part that stood among those of its owner."""
+
+
+def write_flat(
+    owner: type, name: str, part: type, *, otherwise: type, keys: Mapping[str, str], leave_out: tuple[str, ...] = ()
+) -> None:
     """Have a field that is a dataclass itself written as keys of its owner, not as an object within it.
 
     Args:
         owner: The dataclass that has the field.
         name: Of the field.
         part: The field's dataclass.
+        otherwise: The other dataclass that it may be; that one is written as an object within its owner.
         keys: Field of `part` -> key that it has among those of `owner`.
+        leave_out: Fields of `owner` that are written only where they differ from their defaults.
     """
     renamed: Any = {field: override(rename=key) for field, key in keys.items()}
     structure_part: Any = make_dict_structure_fn(part, _converter, _cattrs_forbid_extra_keys=True, **renamed)
     _converter.register_structure_hook(part, structure_part)
     _converter.register_unstructure_hook(part, make_dict_unstructure_fn(part, _converter, **renamed))
-    structure: Any = make_dict_structure_fn(owner, _converter, _cattrs_forbid_extra_keys=True)
-    unstructure: Any = make_dict_unstructure_fn(owner, _converter)
     of_part = frozenset(keys.values())
+    _converter.register_structure_hook(
+        part | otherwise,
+        lambda value, _: _converter.structure(value, part if isinstance(value, _Flat) else otherwise),
+    )
+    structure: Any = make_dict_structure_fn(owner, _converter, _cattrs_forbid_extra_keys=True)
+    omitted: Any = {field: override(omit_if_default=True) for field in leave_out}
+    unstructure: Any = make_dict_unstructure_fn(owner, _converter, **omitted)
 
     def from_flat(value: Mapping[str, Any], _: type) -> Any:
         if name in value:
-            raise cattrs.ClassValidationError("", [cattrs.ForbiddenExtraKeysError("", owner, {name})], owner)
+            return structure(value, owner)
         nested = {key: item for key, item in value.items() if key not in of_part}
-        nested[name] = {key: item for key, item in value.items() if key in of_part}
+        nested[name] = _Flat({key: item for key, item in value.items() if key in of_part})
         return structure(nested, owner)
 
     def to_flat(value: Any) -> dict[str, Any]:
         plain: dict[str, Any] = unstructure(value)
+        if isinstance(getattr(value, name), otherwise):
+            return plain
         nested: dict[str, Any] = plain.pop(name)
         return plain | nested
 

@@ -1,23 +1,42 @@
-"""Forward and inverse kinematics of any serial arm, from its URDF.
+"""Forward and inverse kinematics of any serial arm, from its URDF, as far as a task fixes the pose.
 
 One generic code (`demorec.robots.kinematics_kernels`) instead of a hand-written table per robot.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose, quat_from_rotation
-from demorec.robots.kinematics_kernels import forward, inverse, straight_path
+from demorec.core.geometry import Array, Pose, quat_from_rotation, wrap_angle
+from demorec.robots.kinematics_kernels import forward, inverse, straight_path, tilt_and_roll
 from demorec.robots.urdf import Urdf
 
 POSITION_TOLERANCE = 1e-5
 ROTATION_TOLERANCE = 1e-4
 MAX_ITERATIONS = 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class Freedom:
+    """How far a pose may be off what is wanted of it; its position is always exact.
+
+    Attributes:
+        cone: Between its approach (z of the TCP) and the wanted one, rad; pi: any approach will do.
+        roll: About the approach, rad; pi: any roll will do.
+    """
+
+    cone: float = 0.0
+    roll: float = 0.0
+
+
+WHOLE_POSE = Freedom()
+FIVE_JOINTS = Freedom(cone=math.radians(15.0), roll=math.radians(2.0))
+"""What an arm of fewer than six joints needs where nothing else is said: it cannot tilt its hand to every side."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,6 +50,7 @@ class ArmKinematics:
         tool: (3,) TCP in the last joint's frame, metres.
         tool_rotation: (3, 3).
         lower, upper: (n,) position limits that the inverse kinematics keeps, rad.
+        freedom: What poses leave open unless a caller says otherwise.
     """
 
     origins: Array
@@ -40,6 +60,7 @@ class ArmKinematics:
     tool_rotation: Array
     lower: Array
     upper: Array
+    freedom: Freedom = WHOLE_POSE
 
     @classmethod
     def from_urdf(
@@ -77,12 +98,24 @@ class ArmKinematics:
             tool_rotation=pending.rotation,
             lower=np.array(lower, dtype=np.float64),
             upper=np.array(upper, dtype=np.float64),
+            freedom=WHOLE_POSE if len(origins) >= 6 else FIVE_JOINTS,
         )
 
     @property
     def num_joints(self) -> int:
         """n."""
         return len(self.origins)
+
+    def turned_towards(self, joint_position: Array, point: Array) -> Array:
+        """A configuration (n,) of an arm that stands upright, its first joint turned so that the hand is at the azimuth
+        of a point (3,), metres, of the base frame; azimuths are seen from that joint's axis."""
+        x, y = self.origins[0][:2]
+        hand = self.forward(joint_position).position
+        turn = wrap_angle(math.atan2(point[1] - y, point[0] - x) - math.atan2(hand[1] - y, hand[0] - x))
+        turned = np.array(joint_position)
+        upwards = float(self.rotations[0][2] @ self.axes[0])
+        turned[0] += math.copysign(turn, upwards * turn)
+        return turned
 
     def forward(self, joint_position: Array) -> Pose:
         """`base_from_tcp` at (n,) joint positions, rad."""
@@ -97,15 +130,48 @@ class ArmKinematics:
         start: Array,
         rest: Array | None = None,
         null_gain: float = 0.1,
+        freedom: Freedom | None = None,
     ) -> Array | None:
-        """Joint positions (n,) that reach a pose to 0.01 mm and 0.1 mrad, or None.
+        """Joint positions (n,) that reach a pose to 0.01 mm and 0.1 mrad, or as its freedom says; None for none found.
 
         Args:
             base_from_tcp: Wanted pose.
             start: (n,) where the iteration starts, rad.
             rest: (n,) configuration towards which the null space is pulled; None for no pull.
             null_gain: Strength of the pull, 1 per iteration.
+            freedom: What of the pose is left open; None: the arm's own.
         """
+        q, reached = self._seek(base_from_tcp, start, rest, null_gain, freedom or self.freedom)
+        return q if reached else None
+
+    def why_unreachable(
+        self, base_from_tcp: Pose, *, start: Array, rest: Array | None = None, freedom: Freedom | None = None
+    ) -> str:
+        """What of a pose cannot be had, in words; "" where `inverse` with the same arguments finds it."""
+        freedom = freedom or self.freedom
+        if self.inverse(base_from_tcp, start=start, rest=rest, freedom=freedom) is not None:
+            return ""
+        q, is_near = self._seek(base_from_tcp, start, rest, 0.1, Freedom(cone=math.pi, roll=math.pi))
+        if is_near:
+            q, _ = self._seek(base_from_tcp, start, rest, 0.1, freedom)
+        found = self.forward(q)
+        tilt_x, tilt_y, roll = tilt_and_roll(base_from_tcp.rotation, found.rotation)
+        short, tilt = math.dist(base_from_tcp.position, found.position), math.hypot(tilt_x, tilt_y)
+        at_limit = [
+            k + 1 for k in range(self.num_joints) if min(q[k] - self.lower[k], self.upper[k] - q[k]) < 0.01 + 1e-9
+        ]
+        held = f" (at its limit: joint {', '.join(map(str, at_limit))})" if at_limit else ""
+        if not is_near:
+            return f"the TCP stays {short:.3f} m short of the position{held}"
+        leans = tilt > freedom.cone
+        missed = f"{tilt:.3f} rad off the approach" if leans else f"{abs(roll):.3f} rad off the roll"
+        allowed = freedom.cone if leans else freedom.roll
+        return f"at the position the hand stays {missed}, allowed are {allowed:.3f} rad{held}"
+
+    def _seek(
+        self, base_from_tcp: Pose, start: Array, rest: Array | None, null_gain: float, freedom: Freedom
+    ) -> tuple[Array, bool]:
+        """The joint positions (n,) at which the iteration ends, and whether they reach the pose."""
         q, reached = inverse(
             np.array(base_from_tcp.position),
             base_from_tcp.rotation,
@@ -115,9 +181,11 @@ class ArmKinematics:
             MAX_ITERATIONS,
             POSITION_TOLERANCE,
             ROTATION_TOLERANCE,
+            freedom.cone,
+            freedom.roll,
             *self._tables(),
         )
-        return cast(Array, q) if reached else None
+        return cast(Array, q), bool(reached)
 
     def straight_path(
         self, *, start: Array, goal: Array, base_from_start: Pose, base_from_goal: Pose, fractions: Array
@@ -139,6 +207,9 @@ class ArmKinematics:
             np.array(base_from_goal.position),
             base_from_goal.rotation,
             np.array(fractions, dtype=np.float64),
+            # On its way an arm of few joints may lean farther than where it is going to.
+            min(math.pi, 2 * self.freedom.cone),
+            min(math.pi, 5 * self.freedom.roll),
             *self._tables(),
         )
         return cast(Array, path) if reached else None

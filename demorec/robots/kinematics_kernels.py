@@ -3,7 +3,7 @@
 Without fast-math and without BLAS, every sum in a fixed order, so that the same targets come out on every CPU (an
 OpenBLAS kernel is chosen by CPU type and changes the last bits). Loops stand where NumPy would take whole arrays: they
 compile several times as fast. The methods are the textbook ones: product of homogeneous transforms, geometric Jacobian,
-damped least squares with a projected null-space pull (Siciliano et al., Robotics, sections 2.8, 3.1, 3.7).
+damped least squares with weights and a projected null-space pull (Siciliano et al., Robotics, sections 2.8, 3.1, 3.7).
 """
 
 from __future__ import annotations
@@ -152,6 +152,84 @@ def _damped_solve(jacobian, damping, rhs):  # type: ignore[no-untyped-def]
 
 
 @_njit
+def tilt_and_roll(wanted, found):  # type: ignore[no-untyped-def]
+    """Rotation (3,), along the axes of `found`, that takes its approach (z) to the wanted one, then its roll there."""
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(3):
+        x += found[i, 0] * wanted[i, 2]
+        y += found[i, 1] * wanted[i, 2]
+        z += found[i, 2] * wanted[i, 2]
+    sine = math.sqrt(x * x + y * y)
+    angle = math.atan2(sine, z)
+    axis = np.array([1.0, 0.0, 0.0])
+    if sine > 1e-12:
+        axis[0], axis[1] = -y / sine, x / sine
+    turned = _multiply(found, _axis_rotation(axis, angle))
+    along, across = 0.0, 0.0
+    for i in range(3):
+        along += turned[i, 0] * wanted[i, 0]
+        across += turned[i, 1] * wanted[i, 0]
+    out = np.empty(3)
+    out[0], out[1], out[2] = axis[0] * angle, axis[1] * angle, math.atan2(across, along)
+    return out
+
+
+@_njit
+def _ease(jacobian, error, turn, rotation, cone, roll):  # type: ignore[no-untyped-def]
+    """Weigh the rows of a task that leaves the approach within a cone and the roll within an angle.
+
+    The rows of rotation are turned into the TCP's axes, so that the roll is one of them. An arm of five joints cannot
+    serve all six rows: the position counts so much more than the roll, and the roll than the approach, that what is
+    missed is missed in the approach. A cone or a roll of half a turn leaves its rows out.
+    """
+    turned = np.empty((3, jacobian.shape[1]))
+    for k in range(jacobian.shape[1]):
+        for a in range(3):
+            turned[a, k] = (
+                rotation[0, a] * jacobian[3, k] + rotation[1, a] * jacobian[4, k] + rotation[2, a] * jacobian[5, k]
+            )
+    for a in range(3):
+        weight = 0.0 if (roll if a == 2 else cone) >= math.pi else (30.0 if a == 2 else 1.0)
+        error[a, 0] *= 500.0
+        error[3 + a, 0] = weight * turn[a]
+        for k in range(jacobian.shape[1]):
+            jacobian[a, k] *= 500.0
+            jacobian[3 + a, k] = weight * turned[a, k]
+
+
+@_njit
+def _step(jacobian, error, gain, rest, q, low, high, is_whole):  # type: ignore[no-untyped-def]
+    """J# e + (I - J# J) gain (rest - q); where less than the whole pose is wanted, without the joints at their limits.
+
+    A joint that the step would take beyond its limit is left out, and the others do without it.
+    """
+    n = len(q)
+    wanted = np.empty((6, 1))
+    step = np.empty(n)
+    for _ in range(n):
+        for i in range(6):
+            wanted[i, 0] = error[i, 0]
+            pulled = 0.0
+            for k in range(n):
+                pulled += jacobian[i, k] * gain[k] * (rest[k] - q[k])
+            wanted[i, 0] -= pulled
+        solved = _damped_solve(jacobian, 1e-3, wanted)
+        is_free = True
+        for k in range(n):
+            step[k] = gain[k] * (rest[k] - q[k])
+            for i in range(6):
+                step[k] += jacobian[i, k] * solved[i, 0]
+            if not is_whole and ((q[k] <= low[k] + 0.01 and step[k] < 0.0) or (q[k] >= high[k] - 0.01 and step[k] > 0)):
+                is_free = False
+                gain[k] = 0.0
+                for i in range(6):
+                    jacobian[i, k] = 0.0
+        if is_free:
+            break
+    return step
+
+
+@_njit
 def inverse(  # type: ignore[no-untyped-def]
     wanted_position,
     wanted_rotation,
@@ -161,6 +239,8 @@ def inverse(  # type: ignore[no-untyped-def]
     max_iterations,
     position_tolerance,
     rotation_tolerance,
+    cone,
+    roll,
     origins,
     rotations,
     axes,
@@ -169,13 +249,20 @@ def inverse(  # type: ignore[no-untyped-def]
     low,
     high,
 ):
-    """Damped least squares: dq = J# e + (I - J# J) gain (rest - q), clipped to 0.35 rad a step and to the limits."""
+    """Damped least squares: dq = J# e + (I - J# J) gain (rest - q), clipped to 0.35 rad a step and to the limits.
+
+    With a cone and a roll of 0 the whole pose is wanted. Otherwise the nearest to it is sought, which is reached once
+    nothing moves any more and position, approach and roll are within what is allowed.
+    """
     n = len(start)
     q = start.copy()
     error = np.empty((6, 1))
+    gain = np.empty(n)
+    is_whole = cone == 0.0 and roll == 0.0
+    largest = math.inf
     for iteration in range(max_iterations + 1):
         position, rotation, jacobian = forward(q, origins, rotations, axes, tool, tool_rotation)
-        turn = _rotation_vector(wanted_rotation, rotation)
+        turn = _rotation_vector(wanted_rotation, rotation) if is_whole else tilt_and_roll(wanted_rotation, rotation)
         worst_position = 0.0
         worst_rotation = 0.0
         for i in range(3):
@@ -187,20 +274,18 @@ def inverse(  # type: ignore[no-untyped-def]
         may_stop = iteration > 0 or null_gain == 0.0
         if may_stop and worst_position < position_tolerance and worst_rotation < rotation_tolerance:
             return q, True
+        if not is_whole and (largest < 1e-6 or iteration == max_iterations):
+            tilt = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1])
+            return q, worst_position < position_tolerance and tilt <= cone and abs(turn[2]) <= roll
         if iteration == max_iterations:
             break
-        for i in range(6):
-            pull = 0.0
-            for k in range(n):
-                pull += jacobian[i, k] * null_gain * (rest[k] - q[k])
-            error[i, 0] -= pull
-        solved = _damped_solve(jacobian, 1e-3, error)
-        step = np.empty(n)
+        if not is_whole:
+            _ease(jacobian, error, turn, rotation, cone, roll)
+        for k in range(n):
+            gain[k] = null_gain
+        step = _step(jacobian, error, gain, rest, q, low, high, is_whole)
         largest = 0.0
         for k in range(n):
-            step[k] = null_gain * (rest[k] - q[k])
-            for i in range(6):
-                step[k] += jacobian[i, k] * solved[i, 0]
             largest = max(largest, abs(step[k]))
         factor = 0.35 / largest if largest > 0.35 else 1.0
         for k in range(n):
@@ -217,6 +302,8 @@ def straight_path(  # type: ignore[no-untyped-def]
     goal_position,
     goal_rotation,
     fractions,
+    cone,
+    roll,
     origins,
     rotations,
     axes,
@@ -249,6 +336,8 @@ def straight_path(  # type: ignore[no-untyped-def]
             max_iterations,
             1e-4,
             1e-3,
+            cone,
+            roll,
             origins,
             rotations,
             axes,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -14,10 +15,10 @@ from demorec.core.plain import write_flat
 
 @dataclass(frozen=True, kw_only=True)
 class ParallelGripper:
-    """Two fingers that slide along one line, each by half the opening.
+    """Two fingers that slide along one line, each by half the opening; the TCP lies midway between them.
 
     What an opening means is known here alone: the rest of the program handles joint vectors and openings, and asks. A
-    gripper of another kind, such as a turning jaw, is a class with the same attributes and methods.
+    gripper of another kind has the same attributes and methods, as `JawGripper` has.
 
     Attributes:
         joints: Names of the finger joints; the first one leads.
@@ -41,6 +42,8 @@ class ParallelGripper:
     """With which the motor of each joint moves it, m/s."""
     gear_ratios: ClassVar[tuple[float, ...]] = (1.0,)
     """How far each joint after the first one moves for each unit of the first."""
+    min_width: ClassVar[float] = 0.0
+    """Opening, metres, when closed on nothing."""
 
     def joint_position(self, width: Array | float) -> Array:
         """Positions (..., n_joints), m, of the finger joints at openings (...), metres."""
@@ -54,9 +57,18 @@ class ParallelGripper:
         """Speeds (...), m/s, with which the opening grows; positions and velocities (..., n_joints), m and m/s."""
         return np.asarray(joint_velocity.sum(axis=-1))
 
+    def contact_force(self, width: Array) -> Array:
+        """Sum (...), N, of the forces of all fingers on what keeps them at openings (...), metres, apart."""
+        return np.full(np.shape(width), len(self.joints) * self.force)
+
     def grip_force(self, finger_forces: Sequence[float]) -> float:
         """With what force, N, an object is gripped on which the fingers press so, in the order of `finger_links`."""
         return min(finger_forces)
+
+    def object_offset(self, object_width: float) -> float:
+        """From the TCP along its y to the middle of an object of this width, metres, before the fingers close on it."""
+        del object_width
+        return 0.0
 
     def scaled(self, scale: float) -> ParallelGripper:
         """The same gripper with its lengths multiplied."""
@@ -66,6 +78,109 @@ class ParallelGripper:
             finger_depth=self.finger_depth * scale,
             palm_clearance=self.palm_clearance * scale,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class JawGripper:
+    """One finger that is fixed to the hand, and a jaw that one joint turns.
+
+    The TCP lies on the inner face of the fixed finger, its y axis points to the jaw. Between the rows of `opening` the
+    opening is interpolated linearly; of what lies beyond them, it is that of the nearest row.
+
+    Attributes:
+        joints: Name of the jaw's joint.
+        finger_links: The link of the fixed finger (which may be the hand itself), and that of the jaw.
+        opening: Position of the joint, rad, and the opening there, metres, measured at the tips; from closed (what the
+            expert closes to) to open (as far as it opens).
+        force: Torque of the joint's motor, N m.
+        finger_depth: How far the fixed finger reaches beyond the TCP, metres.
+        palm_clearance: From the TCP back to the palm, metres: what fits between the fingers above the grasp.
+        play: Air between the fixed finger and an object before the jaw pushes it there, metres.
+    """
+
+    joints: tuple[str, ...]
+    finger_links: tuple[str, ...]
+    opening: tuple[tuple[float, float], ...]
+    force: float
+    finger_depth: float
+    palm_clearance: float
+    play: float = 0.003
+
+    joint_kind: ClassVar[str] = "revolute"
+    joint_speed: ClassVar[float] = 1.0
+    """rad/s."""
+    gear_ratios: ClassVar[tuple[float, ...]] = ()
+
+    def __post_init__(self) -> None:
+        turns = [b[0] - a[0] for a, b in pairwise(self.opening)]
+        grows = all(b[1] >= a[1] for a, b in pairwise(self.opening))
+        if not turns or not grows or not (all(t > 0 for t in turns) or all(t < 0 for t in turns)):
+            raise ValueError(
+                "the opening of a jaw needs two rows or more of joint position and opening, from closed to open, in "
+                "which the opening never shrinks while the joint turns one way"
+            )
+
+    @property
+    def min_width(self) -> float:
+        """Opening, metres, when closed on nothing."""
+        return self.opening[0][1]
+
+    @property
+    def max_width(self) -> float:
+        """Full opening, metres."""
+        return self.opening[-1][1]
+
+    def joint_position(self, width: Array | float) -> Array:
+        """Positions (..., 1), rad, at openings (...), metres."""
+        position, opening = np.array(self.opening).T
+        return np.asarray(np.interp(width, opening, position)[..., np.newaxis])
+
+    def width(self, joint_position: Array) -> Array:
+        """Openings (...), metres, at positions (..., 1), rad."""
+        position, opening = self._rising()
+        return np.asarray(np.interp(joint_position[..., 0], position, opening))
+
+    def width_velocity(self, joint_position: Array, joint_velocity: Array) -> Array:
+        """Speeds (...), m/s, with which the opening grows; positions and velocities (..., 1), rad and rad/s."""
+        return np.asarray(self._slope(joint_position[..., 0]) * joint_velocity[..., 0])
+
+    def contact_force(self, width: Array) -> Array:
+        """As of `ParallelGripper`: the jaw's force is its torque over d opening / d angle, the fixed finger's equal."""
+        slope = np.abs(self._slope(self.joint_position(width)[..., 0]))
+        return np.asarray(2 * self.force / np.maximum(slope, 1e-6))
+
+    def grip_force(self, finger_forces: Sequence[float]) -> float:
+        """As of `ParallelGripper`."""
+        return min(finger_forces)
+
+    def object_offset(self, object_width: float) -> float:
+        """As of `ParallelGripper`: the object begins a little beside the fixed finger, against which it is pushed."""
+        return object_width / 2 + self.play
+
+    def scaled(self, scale: float) -> JawGripper:
+        """The same gripper with its lengths multiplied."""
+        return replace(
+            self,
+            opening=tuple((position, width * scale) for position, width in self.opening),
+            finger_depth=self.finger_depth * scale,
+            palm_clearance=self.palm_clearance * scale,
+            play=self.play * scale,
+        )
+
+    def _rising(self) -> tuple[Array, Array]:
+        """Positions, rising, and the openings there."""
+        position, opening = np.array(sorted(self.opening)).T
+        return position, opening
+
+    def _slope(self, position: Array) -> Array:
+        """d opening / d position, m/rad; beyond the rows that of the nearest two."""
+        at, opening = self._rising()
+        piece = np.clip(np.searchsorted(at, position, side="right") - 1, 0, len(at) - 2)
+        return np.asarray((np.diff(opening) / np.diff(at))[piece])
+
+
+Gripper = ParallelGripper | JawGripper
+"""What opens and closes: each kind answers the same questions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +201,8 @@ class RobotSpec:
         acceleration_limit: (n_arm,) rad/s^2.
         torque_limit: (n_arm,) N m.
         gripper: What opens and closes.
+        task_scale: Factor on the lengths of the tasks' layouts and of the expert's heights: 1 for an arm that reaches
+            0.3 to 0.7 m from its base with the hand down, less for a small one.
     """
 
     name: str
@@ -100,7 +217,8 @@ class RobotSpec:
     velocity_limit: tuple[float, ...]
     acceleration_limit: tuple[float, ...]
     torque_limit: tuple[float, ...]
-    gripper: ParallelGripper
+    gripper: Gripper
+    task_scale: float = 1.0
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -112,11 +230,13 @@ class RobotSpec:
         return replace(self, gripper=self.gripper.scaled(scale))
 
 
-# In files, since format version 1, a parallel gripper's fields stand beside the robot's.
+# In files, since format version 1, a parallel gripper's fields stand beside the robot's; another kind is an object.
 write_flat(
     RobotSpec,
     "gripper",
     ParallelGripper,
+    otherwise=JawGripper,
+    leave_out=("task_scale",),
     keys={
         "joints": "gripper_joints",
         "finger_links": "finger_links",

@@ -85,8 +85,9 @@ def grasps_beside(
         robot: Whose hand it is.
     """
     hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]
-    distance = max(abs(x), _half_extent(body, pose, hand_x) + _FINGERS[0] + _GAP)
-    centre = np.array([*pose.position[:2], grasp.position[2]])
+    distance = max(abs(x), half_extent(body, pose, hand_x) + _FINGERS[0] + _GAP)
+    offset = robot.gripper.object_offset(2 * half_extent(body, pose, hand_y))
+    centre = np.array([*(pose.position - offset * hand_y)[:2], grasp.position[2]])
     tips, palm = grasp.position[2] - robot.gripper.finger_depth, grasp.position[2] + robot.gripper.palm_clearance
     found = []
     for side in (1.0, -1.0):
@@ -104,17 +105,17 @@ def grasps_beside(
 
 
 def _is_lower(body: Body, pose: Pose, height: float) -> bool:
-    return not body.collides or pose.position[2] + _half_extent(body, pose, _UP) < height
+    return not body.collides or pose.position[2] + half_extent(body, pose, _UP) < height
 
 
 def _is_beside(hand: Pose, half_size: tuple[float, float], body: Body, pose: Pose) -> bool:
     """Whether a body is clear of a rectangle around the TCP, both seen from above along the hand's axes."""
     offset = np.abs((pose.position - hand.position) @ hand.rotation)
     return any(
-        offset[axis] > half_size[axis] + _half_extent(body, pose, hand.rotation[:, axis]) + _GAP for axis in (0, 1)
+        offset[axis] > half_size[axis] + half_extent(body, pose, hand.rotation[:, axis]) + _GAP for axis in (0, 1)
     )
 
 
-def _half_extent(body: Body, pose: Pose, direction: Array) -> float:
+def half_extent(body: Body, pose: Pose, direction: Array) -> float:
     """Half the extent of a body's bounding box along a unit vector of the world, metres."""
     return float(np.abs(direction @ pose.rotation) @ np.array(body.shape.extents)) / 2

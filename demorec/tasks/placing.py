@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -74,6 +75,10 @@ class TableTask(PlacingTask):
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         """Draw a layout."""
         bodies, goals = self.layout(sampler)
+        scale = robot.task_scale
+        if scale != 1.0:
+            bodies = [_scaled_body(body, scale) for body in bodies]
+            goals = [replace(goal, onto_from_goal=_scaled_pose(goal.onto_from_goal, scale)) for goal in goals]
         return Scene(robot=robot_at_origin(robot, sampler), bodies=(*table_and_floor(), *bodies), goals=tuple(goals))
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
@@ -87,6 +92,20 @@ class TableTask(PlacingTask):
             bases=[scene.body(goal.onto).color_name for goal in scene.goals if goal.onto],
             targets=[body.color_name for body in scene.bodies if body.role == "target"],
         )
+
+
+def _scaled_body(body: Body, scale: float) -> Body:
+    """A body with its lengths and its mass multiplied: a small hand takes small things."""
+    shape = body.shape
+    is_file = shape.kind in ("mesh", "urdf")
+    shape = replace(
+        shape, size=tuple(scale * v for v in shape.size), scale=scale * shape.scale if is_file else shape.scale
+    )
+    return replace(body, shape=shape, mass=scale * body.mass, world_from_body=_scaled_pose(body.world_from_body, scale))
+
+
+def _scaled_pose(pose: Pose, scale: float) -> Pose:
+    return Pose(position=scale * pose.position, quat_xyzw=pose.quat_xyzw)
 
 
 def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:

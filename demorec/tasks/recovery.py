@@ -117,7 +117,7 @@ def _stop(expert: Expert, *, holding: bool) -> Iterator[Step]:
     world = expert.world
     expert.phase = HALT_PHASE
     if holding:
-        expert.gripper_target = 0.0
+        expert.gripper_target = world.robot.gripper.min_width
     number = len(expert.joint_target)
     expert.joint_target = world.arm.arm_position()
     for _ in range(max(1, round(_STOP_SECONDS * world.fps))):

@@ -8,12 +8,12 @@ No step is wasted waiting: a policy that learns from idle frames learns to stand
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose, wrap_angle
+from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
 from demorec.episode.scene import Goal, yaw_of
 from demorec.robots.motion import MotionLimits, plan_straight
@@ -21,6 +21,7 @@ from demorec.sim.world import World
 from demorec.tasks.grasping import (
     grasp_yaws,
     grasps_beside,
+    half_extent,
     hand_down,
     hand_yaw,
     nearest_first,
@@ -89,10 +90,7 @@ class Expert:
             joint_velocity=0.6 * np.array(robot.velocity_limit),
             joint_acceleration=0.8 * np.array(robot.acceleration_limit),
         )
-        home = self.arm.forward(np.array(robot.home_q)).position
-        # Azimuths are seen from the first joint's axis, which need not be the base frame's.
-        self._axis = self.arm.origins[0]
-        self._home_azimuth = math.atan2(home[1] - self._axis[1], home[0] - self._axis[0])
+        self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
         self._base_from_world = self.world.arm.world_from_base.inverse()
 
     @property
@@ -100,9 +98,13 @@ class Expert:
         """The gripper's full opening, metres."""
         return self.world.robot.gripper.max_width
 
-    def _out_of_reach(self, what: str) -> GaveUp:
-        """What is raised for something that cannot be reached, which is noted."""
-        self.note("unreachable", f"{what} is out of reach", trouble=True)
+    def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> GaveUp:
+        """What is raised for something that cannot be reached, noted with what is wrong with the first of its poses."""
+        why = ""
+        for pose in poses[:1]:
+            goal = self._base_from_world @ pose
+            why = self.arm.why_unreachable(goal, start=self.joint_target, rest=self.rest_for(pose))
+        self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
         return GaveUp(self.phase, "unreachable")
 
     def note(self, name: str, message: str, *, trouble: bool = False) -> None:
@@ -133,9 +135,7 @@ class Expert:
     def rest_for(self, world_from_tcp: Pose) -> Array:
         """The home configuration turned towards a pose: what the goal configuration is pulled to."""
         position = (self._base_from_world @ world_from_tcp).position
-        rest = np.array(self.world.robot.home_q)
-        rest[0] += wrap_angle(math.atan2(position[1] - self._axis[1], position[0] - self._axis[0]) - self._home_azimuth)
-        return rest
+        return self.arm.turned_towards(np.array(self.world.robot.home_q), position)
 
     def reaches(self, world_from_tcp: Pose) -> bool:
         """Whether the arm can get there."""
@@ -250,11 +250,12 @@ class Expert:
         if found is not None:
             self.note("grasp", f"grasp {name} at yaw {hand_yaw(found):.4f} rad")
             return found
-        raise self._out_of_reach(f"{name} at {np.round(self.world.pose(name).position, 3).tolist()}")
+        place = np.round(self.world.pose(name).position, 3).tolist()
+        raise self._out_of_reach(f"{name} at {place}", self._grasps(name))
 
     def is_above_object(self, name: str) -> bool:
         """Whether the hand needs but to be lowered to grasp an object."""
-        grasp = self._first_reachable(self._grasps(name), self.behaviour.approach_height)
+        grasp = self._first_reachable(self._grasps(name), self._scale * self.behaviour.approach_height)
         return grasp is not None and self.is_above(grasp)
 
     def reachable_place(self, position: tuple[float, float, float]) -> Pose:
@@ -264,10 +265,10 @@ class Expert:
             GaveUp: Out of reach at every yaw.
         """
         now = hand_yaw(self.tcp())
-        yaws = nearest_first(symmetric_yaws(now, 24), now)
-        place = next((p for p in (hand_down(position, yaw) for yaw in yaws) if self.reaches(p)), None)
+        places = [hand_down(position, yaw) for yaw in nearest_first(symmetric_yaws(now, 24), now)]
+        place = next(filter(self.reaches, places), None)
         if place is None:
-            raise self._out_of_reach(f"{np.round(position, 3).tolist()}")
+            raise self._out_of_reach(f"{np.round(position, 3).tolist()}", places)
         return place
 
     def pick(self, name: str, *, is_begun: bool = False) -> Generator[Step, None, bool]:
@@ -279,7 +280,7 @@ class Expert:
         """
         world, behaviour = self.world, self.behaviour
         self.phase = "perceive"
-        above_by = behaviour.approach_height
+        above_by, lift = self._scale * behaviour.approach_height, self._scale * behaviour.lift_height
         start_height = world.pose(name).position[2]
         grasp = self.reachable_grasp(name, above_by=above_by)
 
@@ -291,13 +292,13 @@ class Expert:
         yield from self.move(grasp, speed=DESCEND_SPEED, until=lambda: world.pressed_from_above(name))
 
         self.phase = "close"
-        yield from self.set_gripper(0.0, max_seconds=1.5, done=steady_width(world))
+        yield from self.set_gripper(self._closed_width, max_seconds=1.5, done=steady_width(world))
         held = self.holds(name)
         if held:
             self.phase = "lift"
-            yield from self.move(raised(grasp, behaviour.lift_height), speed=LIFT_SPEED)
+            yield from self.move(raised(grasp, lift), speed=LIFT_SPEED)
             risen = world.pose(name).position[2] - start_height
-            held = self.holds(name) and risen > 0.5 * behaviour.lift_height
+            held = self.holds(name) and risen > 0.5 * lift
         if held:
             return True
         deliberate, self._missing = self._missing, False
@@ -307,7 +308,7 @@ class Expert:
 
     def holds(self, name: str) -> bool:
         """Whether both fingers press on an object that keeps them apart."""
-        return self.world.grip_force(name) > 0.5 and self.world.arm.gripper_width() > 0.01
+        return self.world.grip_force(name) > 0.5 and self._is_apart(0.01)
 
     def is_above(self, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
         """Whether the hand needs but to be lowered to get to `world_from_tcp`.
@@ -347,15 +348,15 @@ class Expert:
         if not self._is_full():
             self.note("drop", f"dropped {name}", trouble=True)
             here = self.tcp()
-            yield from self._recover(raised(here, max(0.0, 0.2 - here.position[2])))
+            yield from self._recover(raised(here, max(0.0, 0.2 * self._scale - here.position[2])))
             return False
 
         self.phase = "release"
         yield from self.open_gripper(max_seconds=1.0)
         self.phase = "retreat"
         here = self.tcp_target()
-        away = raised(here, max(0.1, self.behaviour.approach_height))
-        clear_height = float(here.position[2]) + 0.07
+        away = raised(here, self._scale * max(0.1, self.behaviour.approach_height))
+        clear_height = float(here.position[2]) + 0.07 * self._scale
         yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
         failed = [check.name for check in placement_checks(world, goal) if not check.passed]
@@ -379,17 +380,21 @@ class Expert:
 
     def _transport_height(self, place: Pose) -> float:
         """Height of the TCP, m, on the way to a place: never lower than now."""
-        return float(max(self.tcp_target().position[2], place.position[2] + LEAST_ABOVE_GOAL))
+        return float(max(self.tcp_target().position[2], place.position[2] + self._scale * LEAST_ABOVE_GOAL))
 
     def _is_full(self) -> bool:
-        return self.world.arm.gripper_width() > LOST_WIDTH
+        return self._is_apart(LOST_WIDTH)
+
+    def _is_apart(self, by: float) -> bool:
+        """Whether the fingers are more than so many metres (of an arm of task_scale 1) wider than when closed."""
+        return self.world.arm.gripper_width() > self._closed_width + self._scale * by
 
     def _recover(self, world_from_tcp: Pose) -> Iterator[Step]:
         """Let go of whatever is there and rise."""
         self.phase = "recover"
         self.joint_target = self.world.arm.arm_position()
         yield from self.open_gripper(max_seconds=0.3)
-        clear_height = float(self.tcp().position[2]) + 0.07
+        clear_height = float(self.tcp().position[2]) + 0.07 * self._scale
         yield from self.move(world_from_tcp, speed=0.4, free=True, clear_height=clear_height)
 
     def _grasps(self, name: str) -> list[Pose]:
@@ -399,10 +404,15 @@ class Expert:
         half = resting_half_height(body, pose)
         top, bottom = pose.position[2] + half, pose.position[2] - half
         # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
-        z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + gripper.finger_depth + 0.005)
+        above_support = gripper.finger_depth + 0.005 * self._scale
+        z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + above_support)
         now = hand_yaw(self.tcp())
-        yaws = nearest_first(grasp_yaws(body, pose, now, self.open_width), now)
-        return [self._perturbed(hand_down((pose.position[0], pose.position[1], z), yaw)) for yaw in yaws]
+        grasps = []
+        for yaw in nearest_first(grasp_yaws(body, pose, now, self.open_width), now):
+            across = hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
+            x, y = pose.position[:2] - gripper.object_offset(2 * half_extent(body, pose, across)) * across[:2]
+            grasps.append(self._perturbed(hand_down((x, y, z), yaw)))
+        return grasps
 
     def _grasps_beside(self, name: str, grasp: Pose) -> list[Pose]:
         """Where the hand misses an object as the behaviour wants it."""
@@ -435,9 +445,8 @@ class Expert:
             yaws = [now]
         else:
             yaws = nearest_first(symmetric_yaws(yaw_of(wanted) + now - yaw_of(pose), goal.yaw_symmetry), now)
-        for yaw in yaws:
-            down = hand_down((0.0, 0.0, 0.0), yaw)
-            place = hand_down(centre - down.apply(hand_from_object), yaw)
+        places = [hand_down(centre - hand_down((0.0, 0.0, 0.0), y).apply(hand_from_object), y) for y in yaws]
+        for place in places:
             if self.reaches(place) and self.reaches(raised(place, self._transport_height(place) - place.position[2])):
                 return place
-        raise self._out_of_reach(f"the goal of {goal.object}")
+        raise self._out_of_reach(f"the goal of {goal.object}", places)

@@ -143,7 +143,7 @@ class Tutorial(Task):
         expert.phase = "descend"
         yield from expert.move(grasp, speed=0.3)
         expert.phase = "close"
-        yield from expert.set_gripper(0.0, max_seconds=1.5, done=steady_width(world))
+        yield from expert.set_gripper(world.robot.gripper.min_width, max_seconds=1.5, done=steady_width(world))
         expert.phase = "hold"
         yield from expert.move(raised(grasp, ABOVE_CUBE), speed=0.3)
         expert.phase = "carry"

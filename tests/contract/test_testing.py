@@ -13,7 +13,7 @@ import pytest
 
 from demorec.core.errors import DemorecError
 from demorec.core.tables import ROBOTS
-from demorec.robots.robot import RobotSpec
+from demorec.robots.robot import ParallelGripper, RobotSpec
 from demorec.testing import RobotContract, TaskContract
 
 ROOT = Path(__file__).parents[2]
@@ -100,6 +100,7 @@ def test_a_gripper_that_opens_otherwise_is_found() -> None:
     class Contract(RobotContract):
         def _spec(self) -> RobotSpec:
             panda = ROBOTS.load("panda")
+            assert isinstance(panda.gripper, ParallelGripper)
             return replace(panda, gripper=replace(panda.gripper, max_width=0.1))
 
     with pytest.raises(AssertionError, match="panda_finger_joint1 at full opening is"):

@@ -1,0 +1,135 @@
+"""An arm of five joints with a turning jaw does what the others do; what it cannot reach is said in words."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from support.commands import exit_code
+from support.jaw_arm.my_arms import JAW_ARM, opening
+
+from demorec.cli import generate_dataset_main
+from demorec.core.geometry import Pose
+from demorec.core.plain import from_json, to_json
+from demorec.robots.kinematics import ArmKinematics, Freedom
+from demorec.robots.robot import JawGripper, RobotSpec
+from demorec.robots.urdf import Urdf
+from demorec.tasks.grasping import hand_down
+from demorec.testing import RobotContract
+
+FOLDER = Path(__file__).parents[1] / "support" / "jaw_arm"
+assert isinstance(JAW_ARM.gripper, JawGripper)
+JAW, HOME = JAW_ARM.gripper, np.array(JAW_ARM.home_q)
+ARM = ArmKinematics.from_urdf(
+    Urdf.load(FOLDER / "jaw_arm.urdf"),
+    arm_joints=JAW_ARM.arm_joints,
+    tcp_link="tcp",
+    lower=JAW_ARM.position_lower,
+    upper=JAW_ARM.position_upper,
+)
+
+
+@given(q=st.floats(-0.33, 0.45), speed=st.floats(-1.0, 1.0))
+def test_the_jaw_opens_as_far_as_its_tip_is_away(q: float, speed: float) -> None:
+    joints = np.array([[q]])
+    width = JAW.width(joints)
+    assert width == pytest.approx(opening(q), abs=2e-5)
+    np.testing.assert_allclose(JAW.joint_position(width), joints, atol=1e-9)
+    rate = (opening(q + 1e-6) - opening(q - 1e-6)) / 2e-6 * speed
+    assert JAW.width_velocity(joints, np.array([[speed]])) == pytest.approx(rate, abs=2e-3)
+
+
+def test_a_jaw_beyond_its_rows_is_as_closed_or_as_open_as_it_gets() -> None:
+    assert JAW.joint_position(0.0).tolist() == [pytest.approx(-0.34)]
+    assert JAW.width(np.array([1.5])) == JAW.max_width
+    larger = JAW.scaled(2.0)
+    assert (larger.max_width, larger.force) == (2 * JAW.max_width, JAW.force)
+
+
+@pytest.mark.parametrize("rows", [(), ((0.0, 0.01),), ((0.0, 0.02), (0.1, 0.01)), ((0.0, 0.0), (0.2, 0.1), (0.1, 0.2))])
+def test_an_opening_that_is_no_function_is_refused(rows: tuple[tuple[float, float], ...]) -> None:
+    with pytest.raises(ValueError, match="from closed to open"):
+        replace(JAW, opening=rows)
+    plain = json.loads(to_json(JAW_ARM))
+    plain["gripper"]["opening"] = [list(row) for row in rows]
+    with pytest.raises(ValueError, match=r"RobotSpec\.gripper"):
+        from_json(json.dumps(plain), RobotSpec)
+
+
+def test_a_robot_with_a_jaw_comes_back_from_a_file() -> None:
+    back = from_json(to_json(JAW_ARM), RobotSpec)
+    assert back == JAW_ARM
+    assert isinstance(back.gripper, JawGripper)
+
+
+@pytest.mark.parametrize("yaw", [-0.8, 0.0, 0.8])
+@pytest.mark.parametrize("z", [0.012, 0.06, 0.08])
+@pytest.mark.parametrize("xy", [(0.14, 0.0), (0.2, -0.1), (0.2, 0.1), (0.26, -0.1), (0.26, 0.1)])
+def test_position_and_roll_are_reached_and_the_hand_leans_within_the_cone(
+    xy: tuple[float, float], z: float, yaw: float
+) -> None:
+    wanted = hand_down((*xy, z), yaw)
+    rest = ARM.turned_towards(HOME, wanted.position)
+    q = ARM.inverse(wanted, start=rest, rest=rest)
+    assert q is not None
+    found = ARM.forward(q)
+    assert math.dist(found.position, wanted.position) < 2e-5
+    lean, _ = Rotation.align_vectors(wanted.rotation[:, 2:].T, found.rotation[:, 2:].T)
+    assert lean.magnitude() <= ARM.freedom.cone + 1e-9
+    upright = lean * Rotation.from_matrix(found.rotation)
+    assert (upright * Rotation.from_matrix(wanted.rotation).inv()).magnitude() <= ARM.freedom.roll + 1e-6
+    assert (np.array(JAW_ARM.position_lower) <= q).all()
+    assert (q <= np.array(JAW_ARM.position_upper)).all()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "freedom", "words"),
+    [
+        (hand_down((0.6, 0.0, 0.02), 0.0), None, "short of the position"),
+        (hand_down((0.2, 0.0, 0.25), 0.0), None, "rad off the approach, allowed are 0.262 rad"),
+        (hand_down((0.2, 0.0, 0.02), 3.0), None, "rad off the roll, allowed are 0.035 rad"),
+        (hand_down((0.2, 0.0, 0.02), 3.0), Freedom(cone=0.2, roll=math.pi), ""),
+        (hand_down((0.2, 0.0, 0.25), 0.0), Freedom(cone=math.pi, roll=math.pi), ""),
+    ],
+)
+def test_what_cannot_be_reached_is_said_in_words(wanted: Pose, freedom: Freedom | None, words: str) -> None:
+    rest = ARM.turned_towards(HOME, wanted.position)
+    why = ARM.why_unreachable(wanted, start=rest, rest=rest, freedom=freedom)
+    assert (words in why) if words else why == ""
+    assert (ARM.inverse(wanted, start=rest, rest=rest, freedom=freedom) is None) == bool(words)
+
+
+def test_it_makes_and_checks_a_dataset_with_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(FOLDER)
+    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delitem(sys.modules, "my_arms", raising=False)
+    out = tmp_path / "run"
+    flags = ["--robot", "my_arms:JAW_ARM", "--cameras", "none", "--seed", "3", "--workers", "1", "--out", out]
+    assert exit_code(*flags, "--num-episodes", "2", program=generate_dataset_main) == 0
+    assert exit_code("replay", out / "episodes" / "episode_000000.mcap", "--allow", "my_arms") == 0
+    told = capsys.readouterr().out
+    assert "2 of 2 asked" in told
+    assert "none failed, 0 warnings" in told
+    assert "identical, succeeds" in told
+
+
+@pytest.mark.usefixtures("_in_its_folder")
+class TestJawArm(RobotContract):
+    robot = "my_arms:JAW_ARM"
+    seed = 3
+
+    @pytest.fixture
+    @staticmethod
+    def _in_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.syspath_prepend(FOLDER)
