@@ -1,4 +1,4 @@
-"""A robot and a camera of one's own: an xArm 6 with a parallel gripper, and a camera that looks across the table.
+"""Your own robot and camera: an xArm 6 with a parallel gripper, and a camera that looks across the table.
 
 cd examples/own_robot
 generate-dataset --robot my_robots:XARM6 --cameras front my_robots:CORNER --num-episodes 10 --out recordings/xarm6

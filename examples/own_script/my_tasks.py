@@ -1,4 +1,4 @@
-"""A script of one's own: two finger tips push a cube to a mark, without grasping it.
+"""Your own script: two finger tips push a cube to a mark, without grasping it.
 
 cd examples/own_script
 generate-dataset --task my_tasks:PushToMark --num-episodes 10 --out recordings/push

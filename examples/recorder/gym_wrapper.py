@@ -16,10 +16,10 @@ from demorec.mcap.recorder import RecordedEpisode
 
 
 class RecordEpisodes(gymnasium.Wrapper):  # type: ignore[misc]
-    """Records what passes through an environment of vectors; an environment's picture becomes the camera "view".
+    """Records what passes through an environment of vectors; what it renders becomes the camera "view".
 
     Args:
-        env: With `render_mode="rgb_array"` its pictures are recorded, too.
+        env: With `render_mode="rgb_array"` its images are recorded, too.
         folder: Of the run.
         task: What is to be done, in words.
         fps: Steps per second.
@@ -42,7 +42,7 @@ class RecordEpisodes(gymnasium.Wrapper):  # type: ignore[misc]
         self._images = {name: np.asarray(self.env.render()) for name in self._cameras}
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; one that was not over is kept, as one whose success nobody knows."""
+        """Begin an episode; one that was not over is recorded without an outcome."""
         if self._episode is not None:
             self._episode.finish()
         observation, info = self.env.reset(**kwargs)

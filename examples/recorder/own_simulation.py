@@ -1,7 +1,7 @@
-"""Records a PyBullet simulation of one's own: python examples/recorder/own_simulation.py runs/kuka.
+"""Records your own PyBullet simulation: python examples/recorder/own_simulation.py runs/kuka.
 
-Nothing of demorec's simulator is used: the program loads a URDF from pybullet_data, steps its own world, takes pictures
-with two cameras of its own and hands everything to the recorder. The URDF goes with it, so that a viewer shows the arm.
+demorec's simulator is not used: the program loads a URDF from pybullet_data, steps its own world, takes images with two
+cameras and hands everything to the recorder. The URDF goes with it, so that a viewer shows the arm.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ INTRINSICS = (FOCAL, 0.0, SIDE / 2, 0.0, FOCAL, SIDE / 2, 0.0, 0.0, 1.0)
 EYES = {"front": (1.5, 0.0, 0.9), "side": (0.0, 1.5, 0.9)}
 
 
-def picture(client: int, eye: tuple[float, float, float]) -> NDArray[np.uint8]:
+def take_image(client: int, eye: tuple[float, float, float]) -> NDArray[np.uint8]:
     """(H, W, 3) RGB of the arm, seen from `eye` (world frame, metres)."""
     view = pybullet.computeViewMatrix(eye, (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), physicsClientId=client)
     projection = pybullet.computeProjectionMatrixFOV(FOV_DEGREES, 1.0, 0.1, 5.0, physicsClientId=client)
@@ -45,7 +45,7 @@ def main(folder: str, num_episodes: int = 2, num_frames: int = 45) -> None:
         arm = pybullet.loadURDF(str(URDF), useFixedBase=True, physicsClientId=client)
         joints = list(range(pybullet.getNumJoints(arm, physicsClientId=client)))
         cameras = {name: Camera(name=name, width=SIDE, height=SIDE, intrinsics=INTRINSICS) for name in EYES}
-        # A simulator can wait for the coder, which a robot cannot.
+        # A simulator can wait for the encoder; a robot cannot.
         with Recorder(folder, robot=URDF, cameras=cameras, fps=FPS, task="reach out", when_full="wait") as recorder:
             for _ in range(num_episodes):
                 goal = random.uniform(-0.8, 0.8, len(joints))
@@ -60,7 +60,7 @@ def main(folder: str, num_episodes: int = 2, num_frames: int = 45) -> None:
                             targetPositions=goal.tolist(),
                             physicsClientId=client,
                         )
-                        images = {name: picture(client, eye) for name, eye in EYES.items()}
+                        images = {name: take_image(client, eye) for name, eye in EYES.items()}
                         # Simulated time, exact: the clock on the wall says nothing about a simulation.
                         episode.write(position, goal, images, time_ns=frame * 1_000_000_000 // FPS)
                         for _ in range(PHYSICS_HZ // FPS):

@@ -1,7 +1,7 @@
 """Records a real robot's own control loop: python examples/recorder/real_robot.py runs/mine.
 
 `MyArm` and `MyCamera` stand in for the drivers of your arm and camera. The loop reads what there is, sends a command
-and hands all of it to the recorder, which never holds it up: pictures are coded by another thread.
+and hands all of it to the recorder, which never holds it up: another thread encodes the images.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FPS = 30
 
 
 class MyArm:
-    """An arm whose joints follow what they are told."""
+    """An arm whose joints follow their targets."""
 
     def __init__(self) -> None:
         self._position = np.zeros(len(JOINTS))
@@ -35,7 +35,7 @@ class MyArm:
 
 
 class MyCamera:
-    """A camera that has a new picture now and then, and tells when it was taken."""
+    """A camera that has a new image now and then, with the time at which it was taken."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -43,9 +43,9 @@ class MyCamera:
     def latest(self) -> tuple[NDArray[np.uint8], int]:
         """(480, 640, 3) RGB and its stamp in nanoseconds, of the clock that the loop uses, too."""
         self._count += 1
-        picture = np.zeros((480, 640, 3), dtype=np.uint8)
-        picture[:, (4 * self._count) % 600 :][:, :40] = (200, 120, 0)
-        return picture, time.monotonic_ns()
+        image = np.zeros((480, 640, 3), dtype=np.uint8)
+        image[:, (4 * self._count) % 600 :][:, :40] = (200, 120, 0)
+        return image, time.monotonic_ns()
 
 
 def every(seconds: float, count: int) -> Iterator[int]:

@@ -116,14 +116,6 @@ def test_lerobots_parser_takes_the_configs(path: Path, monkeypatch: pytest.Monke
     assert config.policy.push_to_hub is False
 
 
-def test_the_config_of_numbers_is_what_the_docs_have_measured() -> None:
-    text = (ROOT / "docs" / "data-quality.md").read_text()
-    (command,) = re.findall(r"lerobot-train ((?:.*\\\n)+.*)", text)
-    words = [word.strip('"') for word in re.findall(r'"[^"]*"|\S+', command.replace("\\\n", " "))]
-    assert len(words) > 20
-    assert parsed(f"--config_path={ROOT / 'examples' / 'act_numbers.json'}") == parsed(*words)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["act_numbers", "act_pictures"])
 def test_the_losses_are_those_of_lerobot_train(name: str, dataset: Path, tmp_path: Path) -> None:

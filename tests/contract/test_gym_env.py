@@ -272,6 +272,6 @@ def test_every_task_is_registered_on_import() -> None:
         assert gymnasium.spec(env_id(task)).kwargs["task"] == task
 
 
-def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_examples("README.md", "gymnasium.make", {}) == 1
+def test_the_example_of_the_docs_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_examples("docs/training.md", "gymnasium.make", {}) == 1
     assert "(224, 224, 3) False" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Every command of the README on an imported run and on its dataset: it works, or says in a sentence why it cannot."""
+"""Every command of docs/README.md on an imported run and its dataset: it works, or says in a sentence why it cannot."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
-def test_every_command_of_the_readme_has_a_row() -> None:
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    block = readme.partition("## Use\n")[2].partition("Every command has `--help`")[0]
+def test_every_documented_command_has_a_row() -> None:
+    readme = (Path(__file__).parents[2] / "docs" / "README.md").read_text()
+    block = readme.partition("## Commands\n")[2].partition("Every command has `--help`")[0]
     commands = set(re.findall(r"^    demorec (\S+)", block, flags=re.MULTILINE))
     # `list` tells of demorec alone; training on such datasets is in tests/conformance/test_training_reader.py, and that
     # `pretrain` refuses those that do not tell where the hand is, in test_pretrain.py there.
