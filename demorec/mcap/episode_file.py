@@ -97,6 +97,11 @@ class EpisodeFile[C](Closing):
 
     @property
     @abstractmethod
+    def simulated(self) -> SimulatedInfo | None:
+        """What is known of an episode that demorec simulated: task, seed, scene; None of any other."""
+
+    @property
+    @abstractmethod
     def has_failed(self) -> bool:
         """Whether its attempt failed."""
 
@@ -140,6 +145,14 @@ class EpisodeFile[C](Closing):
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order."""
         return decode(self.video_settings(camera), self.packets(camera))
+
+    @abstractmethod
+    def num_images(self, camera: str) -> int:
+        """How many images there are of a camera."""
+
+    @abstractmethod
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
+        """What some frames, in rising order, show of a camera that has images, (H, W, 3) uint8 RGB; in one pass."""
 
     def picture(self, camera: str, number: int) -> Rgb:
         """One decoded picture of a camera, (H, W, 3) uint8 RGB, by its own number."""

@@ -83,6 +83,11 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         return self._camera(camera).segmentation
 
     @property
+    def simulated(self) -> SimulatedInfo:
+        """Its `info`."""
+        return self.info
+
+    @property
     def has_failed(self) -> bool:
         """Whether it did not succeed, or a crash cut it off."""
         return self.outcome is None or not self.outcome.success
@@ -275,6 +280,11 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
             IndexError: There is no such frame; negative ones count from the end.
         """
         return next(self.images_at(camera, [frame]))
+
+    def num_images(self, camera: str) -> int:
+        """How many images there are of a camera: one a frame."""
+        self._camera(camera)
+        return self.num_frames
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
         """As `image`, of several frames, read in one pass."""

@@ -35,7 +35,8 @@ class ReportedEpisode:
         phases: (name, first frame, frame after the last) of each phase, in order.
         flags: Results of checks that failed or warned, failures first.
         filmstrip: None without images, and for some successes in a long report.
-        info: Everything known before the first frame.
+        facts: (name, value) of what the summary says of all episodes together: robot, cameras, ...
+        info: Everything known before the first frame of a simulated one.
     """
 
     name: str
@@ -49,6 +50,7 @@ class ReportedEpisode:
     phases: tuple[tuple[str, int, int], ...] = ()
     flags: tuple[Result, ...] = ()
     filmstrip: Filmstrip | None = None
+    facts: tuple[tuple[str, str], ...] = ()
     info: SimulatedInfo | None = None
 
     @property

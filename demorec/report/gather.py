@@ -9,13 +9,14 @@ from itertools import pairwise
 from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
-from demorec.core.errors import ConfigError, RecordingError, without_path
+from demorec.core.errors import ConfigError, ExportError, RecordingError, without_path
 from demorec.core.plain import to_plain
 from demorec.core.processes import in_turn
-from demorec.episode.episode import Outcome, SimulatedInfo
-from demorec.episode.features import ACTION, STATE, action_names, action_vectors, observation_names, observation_vectors
-from demorec.episode.sensed import ObservationRows
-from demorec.mcap import SimulatedRecording
+from demorec.datasets.exported import exported
+from demorec.datasets.options import CommonOptions
+from demorec.episode.episode import Outcome
+from demorec.episode.features import ACTION, STATE
+from demorec.mcap import AnyRecording, open_recording
 from demorec.report.content import (
     CheckSummaries,
     Components,
@@ -28,6 +29,7 @@ from demorec.report.content import (
 )  # fmt: skip
 from demorec.report.dataset import dataset_report
 from demorec.report.filmstrip import MAX_SHOWN, filmstrip, strip_budget
+from demorec.runs.external import is_external_run, load_external_run
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import FAILED, RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
 
@@ -109,7 +111,7 @@ def _recordings_report(
         facts=tuple(_facts(found, run, episodes)),
         episodes=tuple(episodes),
         distributions=components,
-        has_units=True,
+        has_units=all(episode.info is not None for episode in episodes if episode.facts),
         checks=summaries if checks else None,
         missing=tuple(missing),
         configs=tuple(configs.values()) if run is None else (to_plain(run.config),),
@@ -134,28 +136,29 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
     path = subject.path
     source = path.name if path == root else path.relative_to(root).as_posix()
     try:
-        with SimulatedRecording(path) as recording:
+        with open_recording(path) as recording:
             episode, counts = _read_recording(recording, camera, strip_bytes)
     except RecordingError as error:
         episode, counts = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
     return replace(episode, source=source, flags=tuple(flags)), counts, checked
 
 
-def _read_recording(recording: SimulatedRecording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
-    info, columns = recording.info, recording.columns()
+def _read_recording(recording: AnyRecording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
+    info, names = recording.info, recording.phases()
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
     strip = None
-    if strip_bytes and recording.cameras:
-        shown = camera or recording.cameras[0]
+    shown = next((name for name in recording.cameras if camera in ("", name) and recording.num_images(name)), None)
+    if strip_bytes and shown is not None:
         strip = filmstrip(
             shown, recording.num_frames, lambda frames: recording.images_at(shown, frames), max_bytes=strip_bytes
         )
-    changes = [frame for frame, (a, b) in enumerate(pairwise(columns.phase), 1) if a != b]
-    bounds = [0, *changes, columns.num_frames] if columns.num_frames else []
+    changes = [frame for frame, (a, b) in enumerate(pairwise(names), 1) if a != b]
+    bounds = [0, *changes, len(names)] if names else []
     is_failed = recording.path.parent.name == FAILED
     attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
+    simulated = recording.simulated
     episode = ReportedEpisode(
         name=f"episode {info.episode_index}{attempt}",
         problem="A crash cut the recording off; it was recovered." if recording.outcome is None else "",
@@ -163,22 +166,43 @@ def _read_recording(recording: SimulatedRecording, camera: str, strip_bytes: int
         outcome=recording.outcome,
         num_frames=recording.num_frames,
         fps=info.fps,
-        seed=info.root_seed,
-        phases=tuple((columns.phase[first], first, end) for first, end in pairwise(bounds)),
+        seed=None if simulated is None else simulated.root_seed,
+        phases=tuple((names[first], first, end) for first, end in pairwise(bounds)),
         filmstrip=strip,
-        info=info,
+        facts=tuple(_facts_of(recording)),
+        info=simulated,
     )
+    return episode, _components(recording)
+
+
+def _components(recording: AnyRecording) -> Components:
+    """State and action as an export has them; nothing of an episode that could not be exported."""
     counts: Components = {}
-    if columns.num_frames:  # state and action as an export with joint targets has them
-        state = observation_vectors(ObservationRows.of_columns(columns), info.robot, info.scene)[STATE]
-        count(counts, STATE, observation_names(info.robot, info.scene)[STATE], state)
-        count(counts, ACTION, action_names(info.robot, "joint"), action_vectors(columns, info.scene, "joint"))
-    return episode, counts
+    try:
+        episode = exported(recording, CommonOptions())
+        for feature in (STATE, ACTION):
+            if feature in episode.vectors:
+                count(counts, feature, episode.names[feature], episode.vectors[feature])
+    except ExportError:  # no frames, or numbers that are not finite, which the checks report
+        return {}
+    return counts
+
+
+def _facts_of(recording: AnyRecording) -> Iterator[tuple[str, str]]:
+    info, simulated = recording.info, recording.simulated
+    if simulated is not None:
+        yield "task", simulated.task
+    yield "robot", info.robot_name
+    videos = ((name, recording.video_settings(name)) for name in recording.cameras)
+    yield "cameras", ", ".join(f"{name} {video.width}x{video.height}" for name, video in videos) or "none"
+    if simulated is not None:
+        yield "root seed", str(simulated.root_seed)
+    yield "made with", f"demorec {info.versions.get('demorec', 'of an unknown version')}"
 
 
 def _run_file(found: Found) -> tuple[RunFile | None, list[str]]:
     """run.json if it can be read, and sentences about what is missing."""
-    if found.kind != "run":
+    if found.kind != "run" or is_external_run(found.path):
         return None, []
     try:
         return load_run_file(found.path), []
@@ -198,20 +222,15 @@ def _without_recording(attempt: Attempt) -> ReportedEpisode:
 
 
 def _facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
-    infos = [episode.info for episode in episodes if episode.info is not None]
     if run is not None:
         yield "episodes", f"{len(run.successes)} of {run.num_episodes} asked"
     yield "attempts" if found.failed else "recordings", str(len(episodes))
     yield from common_facts(episodes, (*found.recordings, *found.failed))
-    yield "task", few(info.task for info in infos)
-    yield "robot", few(info.robot.name for info in infos)
-    yield "cameras", few(_cameras(info) for info in infos)
-    yield "root seed", few(str(info.root_seed) for info in infos)
+    facts = [fact for episode in episodes for fact in episode.facts]
+    for name in dict.fromkeys(name for name, _ in facts):
+        yield name, few(value for of, value in facts if of == name)
     if run is not None:
         yield "variation", run.config.variation
         yield "run digest", run.digest
-    yield "made with", few(f"demorec {info.versions.get('demorec', 'of an unknown version')}" for info in infos)
-
-
-def _cameras(info: SimulatedInfo) -> str:
-    return ", ".join(f"{camera.name} {camera.width}x{camera.height}" for camera in info.scene.cameras) or "none"
+    elif found.kind == "run" and is_external_run(found.path):
+        yield "run digest", load_external_run(found.path).digest

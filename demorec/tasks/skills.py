@@ -16,6 +16,7 @@ import numpy as np
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
 from demorec.episode.scene import Goal, yaw_of
+from demorec.robots.kinematics import WHOLE_POSE
 from demorec.robots.motion import MotionLimits, plan_straight
 from demorec.sim.world import World
 from demorec.tasks.grasping import (
@@ -99,9 +100,12 @@ class Expert:
         return self.world.robot.gripper.max_width
 
     def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> GaveUp:
-        """What is raised for something that cannot be reached, noted with what is wrong with the first of its poses."""
+        """What is raised for something that cannot be reached, noted with what is wrong with the first of its poses.
+
+        Of arms that need no freedom the text stays as it was: recordings are made again byte for byte.
+        """
         why = ""
-        for pose in poses[:1]:
+        for pose in poses[:1] if self.arm.freedom != WHOLE_POSE else ():
             goal = self._base_from_world @ pose
             why = self.arm.why_unreachable(goal, start=self.joint_target, rest=self.rest_for(pose))
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)

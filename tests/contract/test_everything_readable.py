@@ -91,8 +91,6 @@ def test_a_command_reads_it(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if command == "report" and not kind.startswith("lerobot"):
-        pytest.xfail("demorec report does not read external episodes yet")
     words: list[str] = []
     for word in COMMANDS[command].split():
         words += map(str, places[kind]) if word == "PATH" else [word.replace("NEW", str(tmp_path / "new"))]

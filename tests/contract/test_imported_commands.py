@@ -15,13 +15,13 @@ from demorec.sources.import_run import import_bags
 
 COLLECTED = "collected from another robot or program"
 ROWS: dict[str, tuple[int, str]] = {
-    "view RUN --save NEW.rrd": (0, "MB: "),
-    "view DATASET --save NEW.rrd": (0, "MB: "),
+    "view RUN --save NEW.rrd": (0, "kB: "),
+    "view DATASET --save NEW.rrd": (0, "kB: "),
     "check RUN": (0, "2 checked, 0 failed, 0 with warnings."),
     "check DATASET": (0, "1 checked, 0 failed, 0 with warnings."),
     "check RUN --deep": (1, COLLECTED),
     "check DATASET --deep": (1, COLLECTED),
-    "report RUN --out NEW.html": (2, COLLECTED),
+    "report RUN --out NEW.html": (0, "1 episode"),
     "report DATASET --out NEW.html": (0, "1 episode"),
     "replay RECORDING": (1, COLLECTED),
     "replay DATASET": (2, COLLECTED),

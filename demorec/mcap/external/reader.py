@@ -114,6 +114,11 @@ class Recording(EpisodeFile[VideoSettings]):
         return tuple(camera.name for camera in self.info.cameras)
 
     @property
+    def simulated(self) -> None:
+        """No simulator of ours made it."""
+        return
+
+    @property
     def has_failed(self) -> bool:
         """Whether somebody said so."""
         return self.outcome is not None and self.outcome.success is False
@@ -231,6 +236,15 @@ class Recording(EpisodeFile[VideoSettings]):
         """
         number = int(self.columns().pictures[camera][range(self.num_frames)[frame]])
         return None if number == NO_PICTURE else self.picture(camera, number)
+
+    def num_images(self, camera: str) -> int:
+        """How many images there are of a camera."""
+        return len(self.columns().picture_stamps[camera])
+
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
+        """What some frames show of a camera; one without an image shows the last before it, or else the first."""
+        held = np.maximum(np.maximum.accumulate(self.columns().pictures[camera]), 0)
+        return self._images(camera, held[list(frames)].tolist())
 
     def digest(self) -> str:
         """SHA-256 (hex) of the content: metadata, numbers, stamps, coded pictures; not of what versions wrote it."""
