@@ -137,7 +137,12 @@ class Dataset:
     @cached_property
     def motions(self) -> Motions:
         """Those of its episodes."""
-        return Motions(lambda: list(motions_of_dataset(self)))
+        return Motions(lambda: list(motions_of_dataset(self.info, self.rows, self._arms, self.urdf)))
+
+    @property
+    def _arms(self) -> dict[int, DatasetRobot]:
+        """Episode -> its arm, where the sidecar has it."""
+        return {number: self.robots[name] for number, name in self.robot_digests.items() if name is not None}
 
     def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
         """The torques that a motion needs."""

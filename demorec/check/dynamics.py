@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Found, Measurement, NotMeasured, physics_check, worst
-from demorec.check.episode import CheckedEpisode
+from demorec.check.base import Found, Measurement, NotMeasured, worst
 from demorec.core.errors import SceneError, as_reason
 from demorec.core.geometry import Array
 from demorec.robots.assets import asset_path
@@ -109,34 +108,6 @@ class Dynamics:
         return worst(*found) or NotMeasured(why="no joint of the arm bears a load")
 
 
-def dynamics_of(episode: CheckedEpisode) -> Dynamics | NotMeasured:
-    """Of a simulated episode, with what the hand carries."""
-    gravity, robot = np.array(episode.info.scene.physics.gravity), episode.info.robot
-    if not gravity.any():
-        return NotMeasured(why="there is no gravity")
-    joints = frozenset(joint.name for joint in episode.urdf.path_to(robot.tcp_link))
-    carried, free = [], episode.columns.contact_force == 0
-    for body in episode.info.scene.movable:
-        is_carried = episode.is_carried(body.name, LIFTED_HEIGHT)
-        force: Array = is_carried[:, None] * (-body.mass * gravity)
-        carried.append(Load(episode.columns.object_poses[body.name][:, :3], force, joints))
-        free = free | is_carried
-    scale = episode.info.scene.robot.scale
-    try:
-        return Dynamics(
-            episode.world_from_link,
-            episode.urdf,
-            {name: (mass, scale * centre) for name, (mass, centre) in masses_of(robot.urdf).items()},
-            gravity=gravity,
-            fps=episode.info.fps,
-            tip=robot.tcp_link,
-            carried=carried,
-            free=free,
-        )
-    except (SceneError, KeyError) as error:
-        return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
-
-
 def masses_of(model: str) -> dict[str, tuple[float, Array]]:
     """Link -> mass, kg, and centre of mass in the link's frame, metres.
 
@@ -150,26 +121,3 @@ def masses_of(model: str) -> dict[str, tuple[float, Array]]:
         return link_masses(model if "<" in model else asset_path(model).read_text())
     except (OSError, ValueError) as error:
         raise SceneError(as_reason(error)) from error
-
-
-@physics_check(
-    measures="force on the hand against the weight and motion of what it bears, median difference of it",
-    reads=("/wrench", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
-)
-def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
-    """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""
-    wrench = episode.columns.wrench
-    if wrench is None:
-        return None
-    dynamics = episode.shared(dynamics_of)
-    if isinstance(dynamics, NotMeasured):
-        return dynamics
-    link = episode.info.robot.hand_link
-    mount = episode.urdf.path_to(link)[-1].name
-    force = np.sum([load.force for load in dynamics.below(mount)], axis=0)
-    turned = np.einsum("tji,tj->ti", episode.world_from_link(link)[:, :3, :3], force)
-    off = np.linalg.norm(wrench[:, :3] - turned, axis=1) / np.maximum(np.linalg.norm(turned, axis=1), 1e-6)
-    judged = off[dynamics.is_judged]
-    if len(judged) < MIN_FRAMES:
-        return NotMeasured(why=f"the hand is free and moves smoothly in {len(judged)} frames, fewer than {MIN_FRAMES}")
-    return Measurement(value=float(np.median(judged)), detail=f"{len(judged)} frames")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 from demorec.check.base import Form, Found, NotMeasured
 from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells, correlation
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
+from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode
+from demorec.check.evidence import Motion, motion_of_simulated
+from demorec.check.motion import Motions
 from demorec.check.rows import LinkMatrices, matrices
-from demorec.core.errors import RecordingError
+from demorec.core.errors import RecordingError, SceneError
 from demorec.core.geometry import Array
 from demorec.episode.episode import Event, Outcome, SimulatedColumns, SimulatedInfo, frame_time_ns
 from demorec.episode.scene import SceneCamera
@@ -27,11 +30,6 @@ from demorec.mcap import SimulatedRecording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
-
-if TYPE_CHECKING:
-    from demorec.check.dynamics import Dynamics
-    from demorec.check.evidence import Motion
-    from demorec.check.motion import Motions
 
 _STAMP_FIRST = {
     "sensor_msgs/msg/JointState",
@@ -174,16 +172,39 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def motions(self) -> Motions:
         """The one of its robot."""
-        from demorec.check.evidence import motion_of_simulated
-        from demorec.check.motion import Motions
-
-        return Motions(lambda: [motion_of_simulated(self)] if self.num_frames else [])
+        return Motions(lambda: [motion_of_simulated(self.info, self.columns, self.urdf)] if self.num_frames else [])
 
     def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
         """The torques that its motion needs."""
-        from demorec.check.dynamics import dynamics_of
+        return self.dynamics
 
-        return self.shared(dynamics_of)
+    @cached_property
+    def dynamics(self) -> Dynamics | NotMeasured:
+        """Of its robot, with what the hand carries."""
+        gravity, robot = np.array(self.info.scene.physics.gravity), self.info.robot
+        if not gravity.any():
+            return NotMeasured(why="there is no gravity")
+        joints = frozenset(joint.name for joint in self.urdf.path_to(robot.tcp_link))
+        carried, free = [], self.columns.contact_force == 0
+        for body in self.info.scene.movable:
+            is_carried = self.is_carried(body.name, LIFTED_HEIGHT)
+            force: Array = is_carried[:, None] * (-body.mass * gravity)
+            carried.append(Load(self.columns.object_poses[body.name][:, :3], force, joints))
+            free = free | is_carried
+        scale = self.info.scene.robot.scale
+        try:
+            return Dynamics(
+                self.world_from_link,
+                self.urdf,
+                {name: (mass, scale * centre) for name, (mass, centre) in masses_of(robot.urdf).items()},
+                gravity=gravity,
+                fps=self.info.fps,
+                tip=robot.tcp_link,
+                carried=carried,
+                free=free,
+            )
+        except (SceneError, KeyError) as error:
+            return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
 
     @property
     def num_arm(self) -> int:

@@ -10,21 +10,19 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.core.tables import ROBOTS
+from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
+from demorec.episode.episode import SimulatedColumns, SimulatedInfo
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
+from demorec.mcap import Recording
 from demorec.robots.urdf import Urdf
-
-if TYPE_CHECKING:
-    from demorec.check.dataset import Dataset
-    from demorec.check.episode import CheckedEpisode
-    from demorec.check.external import CheckedRecording
 
 EFFORT = "observation.effort"
 GRIPPER = "gripper.width"
@@ -96,9 +94,9 @@ class Motion:
         return [f"{name}{where}" for name, is_known in zip(self.names, known, strict=True) if is_known]
 
 
-def motion_of_simulated(episode: CheckedEpisode) -> Motion:
+def motion_of_simulated(info: SimulatedInfo, c: SimulatedColumns, urdf: Urdf) -> Motion:
     """Of a recording that demorec simulated: all is known."""
-    robot, c = episode.info.robot, episode.columns
+    robot = info.robot
     n = len(robot.arm_joints)
     nothing, inf = np.full((c.num_frames, 1), np.nan), (math.inf,)
     sensors = {"velocities": c.joint_velocity, "efforts": c.joint_effort[:, :n], "EE pose": c.base_from_tcp}
@@ -106,8 +104,8 @@ def motion_of_simulated(episode: CheckedEpisode) -> Motion:
         sensors["wrench"] = c.wrench
     return Motion(
         where="",
-        fps=episode.info.fps,
-        steps_s=np.full(max(c.num_frames - 1, 0), 1 / episode.info.fps),
+        fps=info.fps,
+        steps_s=np.full(max(c.num_frames - 1, 0), 1 / info.fps),
         names=(*robot.arm_joints, GRIPPER),
         state=np.column_stack([c.joint_position[:, :n], c.gripper_width]),
         velocity=np.column_stack([c.joint_velocity[:, :n], nothing]),
@@ -117,7 +115,7 @@ def motion_of_simulated(episode: CheckedEpisode) -> Motion:
         upper=np.array([*robot.position_upper, robot.gripper.max_width + 1e-3]),
         speed=np.array([*robot.velocity_limit, *inf]),
         joints=(*robot.arm_joints, ""),
-        urdf=episode.urdf,
+        urdf=urdf,
         commands={
             "action": np.column_stack([c.action_joint_target, c.action_gripper]),
             "command": np.column_stack([c.command_joint_target, c.command_gripper]),
@@ -128,9 +126,9 @@ def motion_of_simulated(episode: CheckedEpisode) -> Motion:
     )
 
 
-def motion_of_recording(subject: CheckedRecording) -> Motion | None:
-    """Of a recording that somebody else made; None without a state."""
-    info, columns = subject.recording.info, subject.recording.columns()
+def motion_of_recording(recording: Recording, urdf: str) -> Motion | None:
+    """Of a recording that somebody else made, by the URDF that the user names or its own; None without a state."""
+    info, columns = recording.info, recording.columns()
     described = {feature.name: feature for feature in info.features}
     if STATE not in described or not columns.num_frames:
         return None
@@ -141,14 +139,16 @@ def motion_of_recording(subject: CheckedRecording) -> Motion | None:
         columns.features,
         {name: feature.names for name, feature in described.items()},
         units={name: feature.units for name, feature in described.items()},
-        arm=_arm(state.names, subject.urdf or info.urdf, state.joints),
+        arm=_arm(state.names, urdf or info.urdf, state.joints),
         time_ns=columns.time_ns,
     )
 
 
-def motions_of_dataset(dataset: Dataset) -> Iterator[Motion]:
-    """Of every episode of a dataset that has a state."""
-    features = dataset.info.features
+def motions_of_dataset(
+    info: DatasetInfo, rows_of: Sequence[Mapping[str, NDArray[Any]]], robots: Mapping[int, DatasetRobot], urdf: str
+) -> Iterator[Motion]:
+    """Of every episode of a dataset that has a state; by its own robot, or else by the URDF that the user names."""
+    features = info.features
     if STATE not in features or features[STATE].dtype not in ("float32", "float64"):
         return
     names = {
@@ -156,17 +156,16 @@ def motions_of_dataset(dataset: Dataset) -> Iterator[Motion]:
         for name, feature in features.items()
         if feature.is_numeric and len(feature.shape) == 1
     }
-    stranger = _arm(names[STATE], dataset.urdf)
-    for number, rows in enumerate(dataset.rows):
-        digest = dataset.robot_digests.get(number)
-        robot = None if digest is None else dataset.robots[digest]
+    stranger = _arm(names[STATE], urdf)
+    for number, rows in enumerate(rows_of):
+        robot = robots.get(number)
         where = f"episode {number}"
         if robot is None:
-            yield _motion(where, dataset.info.fps, rows, names, arm=stranger)
+            yield _motion(where, info.fps, rows, names, arm=stranger)
             continue
         spec, arm = robot.record.spec, _Arm.of(robot)
         opening = math.inf if spec is None else spec.gripper.max_width
-        yield _motion(where, dataset.info.fps, rows, names, units=robot.record.units, arm=arm, opening=opening)
+        yield _motion(where, info.fps, rows, names, units=robot.record.units, arm=arm, opening=opening)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -68,7 +68,7 @@ class CheckedRecording(ExitStack):
     @cached_property
     def motions(self) -> Motions:
         """The one of its robot."""
-        return Motions(lambda: [motion] if (motion := motion_of_recording(self)) else [])
+        return Motions(lambda: [motion] if (motion := motion_of_recording(self.recording, self.urdf)) else [])
 
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
         """(two cameras, 1 where their encoded images are the same)."""
@@ -88,7 +88,7 @@ class CheckedRecording(ExitStack):
     group="time",
     measures="frames and images that were dropped while recording",
     fail=float("inf"),
-    reads=("metadata demorec.outcome",),
+    reads=("metadata demorec.outcome", "outcome.drops"),
 )
 def drops(subject: CheckedRecording) -> Found:
     """What came could be taken."""

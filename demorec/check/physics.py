@@ -7,7 +7,17 @@ from typing import Protocol
 
 import numpy as np
 
-from demorec.check.base import EE_TOPICS, Found, Lacking, Measurement, physics_check, worst_entry, worst_frame
+from demorec.check.base import (
+    EE_TOPICS,
+    Found,
+    Lacking,
+    Measurement,
+    NotMeasured,
+    physics_check,
+    worst_entry,
+    worst_frame,
+)
+from demorec.check.dynamics import MIN_FRAMES
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.core.geometry import Array
@@ -236,3 +246,26 @@ def idle_frames(episode: CheckedEpisode) -> Measurement | None:
     still &= np.abs(c.joint_velocity[1:, n:]).max(axis=1, initial=0.0) < 2e-3
     frame = int(np.argmax(still)) + 1 if still.any() else None
     return Measurement(value=float(still.mean()), frame=frame, detail=f"{int(still.sum())} of {len(still)} frames")
+
+
+@physics_check(
+    measures="force on the hand against the weight and motion of what it bears, median difference of it",
+    reads=("/wrench", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
+)
+def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
+    """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""
+    wrench = episode.columns.wrench
+    if wrench is None:
+        return None
+    dynamics = episode.dynamics
+    if isinstance(dynamics, NotMeasured):
+        return dynamics
+    link = episode.info.robot.hand_link
+    mount = episode.urdf.path_to(link)[-1].name
+    force = np.sum([load.force for load in dynamics.below(mount)], axis=0)
+    turned = np.einsum("tji,tj->ti", episode.world_from_link(link)[:, :3, :3], force)
+    off = np.linalg.norm(wrench[:, :3] - turned, axis=1) / np.maximum(np.linalg.norm(turned, axis=1), 1e-6)
+    judged = off[dynamics.is_judged]
+    if len(judged) < MIN_FRAMES:
+        return NotMeasured(why=f"the hand is free and moves smoothly in {len(judged)} frames, fewer than {MIN_FRAMES}")
+    return Measurement(value=float(np.median(judged)), detail=f"{len(judged)} frames")

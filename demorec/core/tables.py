@@ -89,7 +89,7 @@ CHECKS: Registry[Check] = Registry(
         ("motion", "joint_limits", "joint_speed", "velocity_matches_position"),
         ("physics", "forward_kinematics", "unit_quaternions", "gripper_width"),
         ("physics", "command_tracking", "action_matches_command"),
-        ("dynamics", "wrench_bears_the_hand"),
+        ("physics", "wrench_bears_the_hand"),
         ("motion", "effort_matches_dynamics", "stuck_sensors", "elements_alive", "pose_follows_joints"),
         ("motion", "gripper_follows"),
         ("gripper", "joint_effort", "gripper_label", "grip_force", "touches_nothing"),

@@ -10,6 +10,7 @@ import pytest
 from support import bag_mappings, bags
 from support.bag_faults import ACTION, FAULTS, FRONT, hurt
 
+from demorec.check.run import ExternalRun
 from demorec.core.tables import CHECKS
 from demorec.sources.bag import open_bag
 from demorec.sources.bag_files import BagError
@@ -133,7 +134,11 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
     mapping = bag_mappings.write_mapping(MAPPING, tmp_path / "robot.toml")
     import_bags([bag], mapping, tmp_path / "run")
     bag.unlink()
-    found = {check: CHECKS.load(check).run(tmp_path / "run") for check in CHECKS.names() if check.startswith("import_")}
+    found = {
+        check: CHECKS.load(check).run(ExternalRun(tmp_path / "run"))
+        for check in CHECKS.names()
+        if check.startswith("import_")
+    }
     assert len(found) == 4
     for check, result in found.items():
         assert result.level == ("warn" if CHECK_OF.get(kind) == check else "pass"), check
@@ -141,7 +146,7 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
 
 
 def test_a_run_that_was_not_imported_has_no_report(tmp_path: Path) -> None:
-    assert CHECKS.load("import_times").run(tmp_path).level == "skip"
+    assert CHECKS.load("import_times").run(ExternalRun(tmp_path)).level == "skip"
 
 
 def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:
@@ -150,6 +155,6 @@ def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:
     text = MAPPING.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
     text = text.replace("[cameras.front]", cut + "[cameras.front]")
     import_bags([bag], bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run")
-    result = CHECKS.load("import_dropped").run(tmp_path / "run")
+    result = CHECKS.load("import_dropped").run(ExternalRun(tmp_path / "run"))
     assert (result.level, result.value) == ("warn", 1)
     assert "camera front" in result.detail
