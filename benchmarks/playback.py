@@ -49,9 +49,10 @@ def row_by_row(episode: PlayedEpisode, target: Path) -> None:
     """The same numbers, each at its time."""
     stream = new_recording(episode)
     stream.save(target)
-    placement = episode.info.scene.robot
-    urdf, _ = robot_model(episode.info.robot.urdf, placement.scale, episode.robot_description)
-    positions = dict(zip(episode.info.robot.joint_names, episode.joint_position.T, strict=True))
+    info, positions = episode.simulated, episode.joint_position
+    assert info is not None
+    assert episode.base_from_tcp is not None
+    urdf, _ = robot_model(info.robot.urdf, info.scene.robot.scale, episode.robot_description)
     motions = [
         (joint.child, *joint_columns(joint, positions[joint.name])) for joint in urdf.joints if joint.name in positions
     ]
@@ -79,7 +80,7 @@ def measure_saving(path: Path, rounds: int) -> None:
         target = Path(folder) / "x.rrd"
         save(source, target)  # meshes into the cache, libraries into memory
         with source.open() as episode:
-            assert isinstance(episode, PlayedEpisode)
+            assert episode.simulated is not None
             num_frames, num_samples = episode.num_frames, len(episode.curves["position"].time_ns)
             for _ in range(rounds):
                 columns.append(_cpu(lambda: as_columns(episode, target)))

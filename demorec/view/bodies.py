@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, as_reason
 from demorec.core.geometry import Array, Pose
-from demorec.episode.scene import Body, Rgba, Shape, Texture
+from demorec.episode.scene import Body, Rgba, Scene, Shape, Texture
 from demorec.render.procedural import texture_pixels
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
@@ -31,12 +31,13 @@ _SAME_SIZE = 0.1
 """How far a model's extents may be from those of the recorded scene, as a part of the largest."""
 
 
-def log_bodies(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, tint: Rgba | None = None) -> None:
+def log_bodies(
+    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, scene: Scene, tint: Rgba | None = None
+) -> None:
     """Every body at its place or along its way, and as wire frames the goals and the known ends of objects.
 
     A body whose model is not installed here, or is another one, is drawn as the recording describes it.
     """
-    scene = episode.info.scene
     for body in scene.bodies:
         entity = paths.body(body.name)
         if tint is not None and body.role in ("support", "fixture"):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from functools import partial
+from collections.abc import Iterable
 from itertools import batched
 from typing import Any
 
@@ -11,7 +10,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from demorec.view.episode import Depth, Distances, PlayedEpisode, PlayedExternal, Video, timed
+from demorec.episode.scene import Scene
+from demorec.view.episode import Distances, PlayedEpisode, Video, timed
 from demorec.view.paths import Paths
 from demorec.view.style import FRUSTUM, segment_colors
 from demorec.view.times import indexes, log_pose, send_poses
@@ -22,24 +22,20 @@ _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
 
 
-def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedExternal) -> None:
+def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """Every camera with what it saw; the coded pictures are passed on as they are."""
-    if isinstance(episode, PlayedExternal):
-        names, depth = list({**episode.videos, **episode.depth}), episode.depth
-    else:
-        names = [camera.name for camera in episode.info.scene.cameras]
-        depth = {name: partial(_millimetres, read) for name, read in episode.depth.items()}
-        _log_calibrations(recording, paths, episode)
-        _log_segmentations(recording, paths, episode)
-    for name in names:
+    if episode.scene is not None:
+        _log_calibrations(recording, paths, episode, episode.scene)
+        _log_segmentations(recording, paths, episode, episode.scene)
+    for name in episode.cameras:
         if name in episode.videos:
             _send_video(recording, paths.camera(name), episode.time_ns, episode.videos[name])
-        if name in depth:
-            _send_images(recording, paths.camera(name, "/depth"), episode.time_ns, depth[name]())
+        if name in episode.depth:
+            _send_images(recording, paths.camera(name, "/depth"), episode.time_ns, episode.depth[name]())
 
 
-def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
-    for camera in episode.info.scene.cameras:
+def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, scene: Scene) -> None:
+    for camera in scene.cameras:
         entity = paths.camera(camera.name)
         pinhole = rr.Pinhole(
             image_from_camera=camera.intrinsics,
@@ -70,11 +66,6 @@ def _send_video(recording: rr.RecordingStream, entity: str, frame_times: NDArray
         recording.send_columns(entity, indexes(np.array(times), frame_times), columns)
 
 
-def _millimetres(read: Depth) -> Iterator[tuple[int, Distances]]:
-    for time_ns, metres in read():
-        yield time_ns, np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
-
-
 def _send_images(
     recording: rr.RecordingStream,
     entity: str,
@@ -95,10 +86,10 @@ def _send_images(
         recording.send_columns(entity, indexes(np.array([time_ns for time_ns, _ in batch]), frame_times), columns)
 
 
-def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, scene: Scene) -> None:
     """Segments by small numbers, the smallest of theirs (the background) 0, and what the numbers mean."""
     known = np.array(sorted(episode.segment_names))
-    for camera in episode.info.scene.cameras:
+    for camera in scene.cameras:
         if camera.name not in episode.segmentation:
             continue
         pictures = timed(episode.time_ns, episode.segmentation[camera.name])

@@ -35,9 +35,14 @@ def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpi
         ConfigError: The robots differ, so that nothing can be laid over each other.
         DemorecError: A source is damaged.
     """
-    if a.info.robot.joint_names != b.info.robot.joint_names:
+    if a.simulated is None or b.simulated is None:
         raise ConfigError(
-            f"The episodes have different robots, {a.info.robot.name} and {b.info.robot.name}: "
+            "Only simulated episodes can be laid over each other: of others nobody knows that their robots stand "
+            "alike. View them without --compare."
+        )
+    if [*a.joint_position] != [*b.joint_position]:
+        raise ConfigError(
+            f"The episodes have different robots, {a.info.robot_name} and {b.info.robot_name}: "
             "compare two of the same robot."
         )
     log_episode(recording, a, root=A.root, label="A ")
@@ -53,7 +58,10 @@ def differences(a: PlayedEpisode, b: PlayedEpisode) -> dict[str, Curves]:
     """Frame by frame, as long as both last: the gripper's and the objects' distance (mm), the joints' largest (rad)."""
     count = min(a.num_frames, b.num_frames)
     time_ns = a.time_ns[:count]
-    joints = np.abs(a.joint_position[:count] - b.joint_position[:count]).max(axis=1, initial=0.0)
+    first, second = (np.stack([*episode.joint_position.values()])[:, :count] for episode in (a, b))
+    joints = np.abs(first - second).max(axis=0, initial=0.0)
+    assert a.base_from_tcp is not None
+    assert b.base_from_tcp is not None
     names, columns = ["gripper"], [_distance(a.base_from_tcp[:count], b.base_from_tcp[:count])]
     for name in a.object_poses:
         if name in b.object_poses:

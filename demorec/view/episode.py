@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.geometry import Array
+from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event, Outcome, SimulatedInfo
 from demorec.episode.external import EpisodeInfo
+from demorec.episode.scene import Scene
 
 Distances = NDArray[np.uint16] | NDArray[np.float32]
 """(H, W) millimetres or metres."""
@@ -50,50 +51,97 @@ class Video:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Shown:
-    """What is shown of any episode. What a source does not have is None or empty.
+class PlayedEpisode:
+    """What is shown of an episode. What a source does not have is None or empty.
+
+    The curves of a simulated one are "position", "velocity", "effort" of the joints, "gripper" (m), "force" (N), "ee"
+    (m), "hand force" (N) and "hand torque" (N m) along the hand's axes; "target" and "gripper target" are what was
+    asked for. Those of any other are the elements of its features, by the features' names.
 
     Attributes:
         name: In the list of recordings.
         group: Run or dataset that it belongs to.
         identity: Distinguishes it from all others.
         source: Where it was read from, for people.
+        simulated: Scene, robot, cameras, seed; None of an episode that demorec did not simulate.
+        described: What is known of such a one.
+        outcome: How it ended, None when nobody knows.
         time_ns: (T,) of the frames, since the first one.
         curves: Name -> measured values.
-        videos: Camera -> coded pictures.
-        depth: Camera -> reads (time_ns, distances) of each of its pictures.
-        statements: What is said of it: (time_ns, kind, sentence), each holds until the next one of its kind.
+        videos: Camera -> encoded images.
+        depth: Camera -> reads (time_ns, distances) of each of its images.
+        statements: What is said of it.
+        robot_description: URDF; of a simulated robot primitives, for where the original model is not installed.
+        joint_position: Joint of the URDF -> (T,) rad or m.
+        body_description: URDF of the body of a name, None where the source has none.
+        base_from_tcp: (T, 7), None where it is not known.
+        object_poses: name -> (T, 7), world_from_object.
+        end_poses: name -> (7,) where an object ended, for sources that may not know its way there.
+        world_from_camera: name -> (T, 7).
+        phase: T names, or none.
+        events: (time_ns, event).
+        segmentation: Camera -> reads (H, W) segment numbers of every frame.
+        segment_names: Segment number -> name.
+        boxes: Camera -> frame -> (name, (x, y, width, height) px) of what it sees.
     """
 
     name: str
     group: str
     identity: str
     source: str
+    simulated: SimulatedInfo | None = None
+    described: EpisodeInfo | None = None
+    outcome: Outcome | None
     time_ns: NDArray[np.int64]
     curves: Mapping[str, Curves]
     videos: Mapping[str, Video]
     depth: Mapping[str, Depth] = field(default_factory=dict)
     statements: Statements = ()
+    robot_description: str | None = None
+    joint_position: Mapping[str, Array] = field(default_factory=dict)
+    body_description: Callable[[str], str | None] = lambda _: None
+    base_from_tcp: Array | None = None
+    object_poses: Mapping[str, Array] = field(default_factory=dict)
+    end_poses: Mapping[str, Array] = field(default_factory=dict)
+    world_from_camera: Mapping[str, Array] = field(default_factory=dict)
+    phase: tuple[str, ...] = ()
+    events: tuple[tuple[int, Event], ...] = ()
+    segmentation: Mapping[str, Callable[[], Iterator[NDArray[np.int32]]]] = field(default_factory=dict)
+    segment_names: Mapping[int, str] = field(default_factory=dict)
+    boxes: Mapping[str, Mapping[int, Sequence[tuple[str, Box]]]] = field(default_factory=dict)
+
+    @property
+    def info(self) -> SimulatedInfo | EpisodeInfo:
+        """What is known before the first frame."""
+        info = self.simulated or self.described
+        assert info is not None, "every source describes its episodes"
+        return info
+
+    @property
+    def scene(self) -> Scene | None:
+        """The world at the start, where it is known."""
+        return None if self.simulated is None else self.simulated.scene
+
+    @property
+    def world_from_base(self) -> Pose:
+        """Where the robot stands; at the origin where nobody knows."""
+        return Pose() if self.scene is None else self.scene.robot.world_from_base
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras that there are images of, or that the scene has."""
+        placed = () if self.scene is None else (camera.name for camera in self.scene.cameras)
+        return tuple(dict.fromkeys([*placed, *self.videos, *self.depth]))
 
     @property
     def num_frames(self) -> int:
         """Length."""
         return len(self.time_ns)
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlayedExternal(_Shown):
-    """What is shown of a collected episode; its curves are the elements of its features.
-
-    Attributes:
-        info: Instruction, features, cameras, origin.
-        outcome: How it ended, None when nobody knows.
-        joint_position: Joint of the URDF -> (T,) rad or m.
-    """
-
-    info: EpisodeInfo
-    outcome: Outcome | None
-    joint_position: Mapping[str, NDArray[np.float64]]
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the end of the last, which lasts as long as the nominal rate says."""
+        return float(self.time_ns[-1]) / 1e9 + 1 / self.info.fps if self.num_frames else 0.0
 
     @property
     def verdict(self) -> str:
@@ -103,58 +151,12 @@ class PlayedExternal(_Shown):
         return "success" if self.outcome.success else f"failure: {self.outcome.failure_reason or 'no reason given'}"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlayedEpisode(_Shown):
-    """What is shown of a simulated episode; its distances are metres.
-
-    Its curves are "position", "velocity", "effort" of the joints, "gripper" (m), "force" (N), "ee" (m), "hand force"
-    (N) and "hand torque" (N m) along the hand's axes; "target" and "gripper target" are what was asked for.
-
-    Attributes:
-        info: Scene, robot, cameras, seed.
-        outcome: How it ended, None when nobody knows.
-        robot_description: URDF of primitives, for where the original model is not installed.
-        body_description: The same of the body of a name, None where the source has none.
-        joint_position: (T, n_joints) rad, fingers m.
-        base_from_tcp: (T, 7).
-        object_poses: name -> (T, 7), world_from_object.
-        end_poses: name -> (7,) where an object ended, for sources that may not know its way there.
-        world_from_camera: name -> (T, 7).
-        phase: T names.
-        events: (time_ns, event).
-        segmentation: Camera -> reads (H, W) segment numbers of every frame.
-        segment_names: Segment number -> name.
-        boxes: Camera -> frame -> (name, (x, y, width, height) px) of what it sees.
-    """
-
-    info: SimulatedInfo
-    outcome: Outcome | None
-    robot_description: str | None
-    body_description: Callable[[str], str | None] = lambda _: None
-    joint_position: Array
-    base_from_tcp: Array
-    object_poses: Mapping[str, Array]
-    end_poses: Mapping[str, Array] = field(default_factory=dict)
-    world_from_camera: Mapping[str, Array]
-    phase: tuple[str, ...]
-    events: tuple[tuple[int, Event], ...] = ()
-    segmentation: Mapping[str, Callable[[], Iterator[NDArray[np.int32]]]] = field(default_factory=dict)
-    segment_names: Mapping[int, str] = field(default_factory=dict)
-    boxes: Mapping[str, Mapping[int, Sequence[tuple[str, Box]]]] = field(default_factory=dict)
-
-    @property
-    def verdict(self) -> str:
-        """The outcome in a word or two."""
-        if self.outcome is None:
-            return "outcome unknown"
-        return "success" if self.outcome.success else f"failure: {self.outcome.failure_reason}"
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first frame to the end of the last."""
-        return self.num_frames / self.info.fps
-
-
 def timed[Picture](time_ns: NDArray[np.int64], read: Callable[[], Iterator[Picture]]) -> Iterator[tuple[int, Picture]]:
     """Pictures with their times (P,), as far as there are any."""
     return zip(time_ns.tolist(), read(), strict=False)
+
+
+def millimetres(read: Callable[[], Iterator[NDArray[np.float32]]]) -> Iterator[NDArray[np.uint16]]:
+    """Distances in metres as whole millimetres, which take half the space."""
+    for metres in read():
+        yield np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)

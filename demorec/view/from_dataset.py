@@ -27,7 +27,7 @@ from demorec.episode.validity import read_episode_info
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.urdf import Urdf, check_primitives
-from demorec.view.episode import Box, Curves, PlayedEpisode, PlayedExternal, Statements, timed
+from demorec.view.episode import Box, Curves, PlayedEpisode, Statements, millimetres, timed
 from demorec.view.from_recording import external_episode, shown_at, video_of
 from demorec.view.held_objects import held_object_poses
 
@@ -42,7 +42,7 @@ def dataset_episodes(root: Path) -> list[int]:
 
 
 @contextmanager
-def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode | PlayedExternal]:
+def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode]:
     """One episode of a dataset.
 
     Raises:
@@ -56,7 +56,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
     yield episode
 
 
-def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode | PlayedExternal:
+def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
     root = dataset.root
     numbers = [number for number, place in enumerate(dataset.places) if place.episode_index == episode_index]
     if not numbers:
@@ -112,11 +112,11 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
     time_ns = columns.time_ns - columns.time_ns[0]
     return PlayedEpisode(
         **known,
-        info=info,
+        simulated=info,
         outcome=_outcome(row, len(state)),
         robot_description=None if robot is None else robot.urdf,
         time_ns=time_ns,
-        joint_position=np.concatenate([state[:, :num_arm], fingers], axis=1),
+        joint_position=dict(zip(info.robot.joint_names, [*state[:, :num_arm].T, *fingers.T], strict=True)),
         base_from_tcp=base_from_tcp,
         object_poses=_object_poses(info, ends, data, described, base_from_tcp),
         end_poses=ends,
@@ -125,7 +125,9 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
         curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
         videos={name: video_of(recording, name, shown_at(columns, name, time_ns)) for name in recording.cameras},
         depth={
-            name.removesuffix(DEPTH_SUFFIX): partial(timed, time_ns, partial(recording.distances, name))
+            name.removesuffix(DEPTH_SUFFIX): partial(
+                timed, time_ns, partial(millimetres, partial(recording.distances, name))
+            )
             for name in recording.depth_cameras
         },
         statements=_statements(recording),

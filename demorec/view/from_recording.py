@@ -1,4 +1,4 @@
-"""Episodes out of recordings, of simulated and of collected ones."""
+"""Episodes out of recordings."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from demorec.mcap import AnyRecording, Recording, SimulatedRecording, open_recor
 from demorec.mcap.channels import description_topic
 from demorec.mcap.external.transforms import JointPositions
 from demorec.runs.run_file import EPISODES, FAILED
-from demorec.view.episode import Curves, PlayedEpisode, PlayedExternal, Video, timed
+from demorec.view.episode import Curves, PlayedEpisode, Video, millimetres, timed
 
 
 @contextmanager
-def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedExternal]:
+def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
     """The episode of a recording; its pictures can be read until the context is left.
 
     Raises:
@@ -37,24 +37,25 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode | PlayedExternal]:
         "source": path.name,
     }
     with open_recording(path) as recording:
-        if isinstance(recording, Recording):
-            yield external_episode(recording, known, recording.info)
-        else:
-            yield _simulated(recording, known)
+        match recording:
+            case SimulatedRecording():
+                yield _simulated(recording, known)
+            case Recording():
+                yield external_episode(recording, known, recording.info)
 
 
 def _simulated(recording: SimulatedRecording, known: dict[str, Any]) -> PlayedEpisode:
     info, columns = recording.info, recording.columns()
     return PlayedEpisode(
         **known,
-        info=info,
+        simulated=info,
         outcome=recording.outcome,
         robot_description=recording.description(),
         body_description=lambda body: (
             recording.description(body) if description_topic(body) in recording.topics else None
         ),
         time_ns=columns.time_ns,
-        joint_position=columns.joint_position,
+        joint_position=dict(zip(info.robot.joint_names, columns.joint_position.T, strict=True)),
         base_from_tcp=columns.base_from_tcp,
         object_poses=columns.object_poses,
         world_from_camera=columns.world_from_camera,
@@ -63,7 +64,7 @@ def _simulated(recording: SimulatedRecording, known: dict[str, Any]) -> PlayedEp
         curves=_curves(recording, columns),
         videos={name: video_of(recording, name, columns.time_ns) for name in recording.cameras},
         depth={
-            name: partial(timed, columns.time_ns, partial(recording.depth, name))
+            name: partial(timed, columns.time_ns, partial(millimetres, partial(recording.depth, name)))
             for name in recording.cameras
             if recording.has_depth(name)
         },
@@ -78,15 +79,16 @@ def _simulated(recording: SimulatedRecording, known: dict[str, Any]) -> PlayedEp
 
 def external_episode(
     recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo
-) -> PlayedExternal:
+) -> PlayedEpisode:
     """An episode of which nothing is known but what came; `info` may describe its robot."""
     columns = recording.columns()
     time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
     positions = JointPositions(info.features)
     values = positions.of(columns.features) if positions.joints else np.zeros((len(time_ns), 0))
-    return PlayedExternal(
+    return PlayedEpisode(
         **known,
-        info=info,
+        described=info,
+        robot_description=info.urdf or None,
         outcome=recording.outcome,
         time_ns=time_ns,
         joint_position=dict(zip(positions.joints, values.T, strict=True)),

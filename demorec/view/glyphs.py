@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from demorec.view.episode import PlayedEpisode, PlayedExternal
+from demorec.view.episode import PlayedEpisode
 from demorec.view.sources import PlaybackSource
 
 DRAWABLE = (
@@ -51,14 +51,15 @@ def drawable_source(source: PlaybackSource, missing: set[str]) -> PlaybackSource
     """The same episode with drawable text; `missing` takes what was replaced."""
 
     @contextmanager
-    def opened() -> Iterator[PlayedEpisode | PlayedExternal]:
+    def opened() -> Iterator[PlayedEpisode]:
         with source.open() as episode:
             spelt = drawable(episode, missing)
-            if isinstance(episode, PlayedEpisode):  # models are looked for by their own names
-                bodies = {drawable(body.name, missing): body.name for body in episode.info.scene.bodies}
+            if episode.simulated is not None:  # models are looked for by their own names
+                bodies = {drawable(body.name, missing): body.name for body in episode.simulated.scene.bodies}
                 spelt = replace(
                     spelt,
-                    info=replace(spelt.info, robot=episode.info.robot),
+                    simulated=replace(spelt.simulated, robot=episode.simulated.robot),
+                    joint_position=episode.joint_position,
                     body_description=lambda name: episode.body_description(bodies[name]),
                 )
             yield spelt

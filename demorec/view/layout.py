@@ -3,36 +3,51 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from demorec.core.geometry import Array
 from demorec.view.compare import DIFFERENCES, A, B
-from demorec.view.episode import PlayedEpisode, PlayedExternal
+from demorec.view.episode import PlayedEpisode
 from demorec.view.paths import Paths
 from demorec.view.times import FRAMES, SECONDS
 
 BACKGROUND = (24, 27, 33)
+_SIDE = ("gripper opening (m)", "contact force (N)")
+_PLOTS: Mapping[str, tuple[str, ...]] = {
+    "joints and their targets (rad)": ("position", "target"),
+    "joint velocity (rad/s)": ("velocity",),
+    "joint effort (N m)": ("effort",),
+    "gripper position (m)": ("ee",),
+    "force on the hand (N)": ("hand force",),
+    "torque on the hand (N m)": ("hand torque",),
+    "gripper opening (m)": ("gripper", "gripper target"),
+    "contact force (N)": ("force",),
+}
+"""Title -> curves of a simulated episode; those of `_SIDE` stand beside the tabs of the others. Any other curve, as of
+the features of other episodes, has a plot of its own."""
+_COMPARED_PLOTS = {("joints (rad)" if "position" in names else title): names[:1] for title, names in _PLOTS.items()}
+"""Of two episodes over each other: what was asked for would hide what is compared."""
 _FLOOR = 3.0
 """Bodies wider than this (metres) are the floor, which would only hide the grid."""
 
 
-def episode_layout(episode: PlayedEpisode | PlayedExternal, *, is_alone: bool = False) -> rrb.Blueprint:
+def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blueprint:
     """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
-    if isinstance(episode, PlayedExternal):
-        return _panels(_external_views(episode), episode.info.fps, is_alone=is_alone)
     paths = Paths()
+    title = episode.info.robot_name if episode.simulated is None else f"{episode.simulated.task}: the world"
+    is_known = episode.scene is not None or episode.robot_description is not None
     return _blueprint(
         episode,
         is_alone=is_alone,
-        three_d=_view_3d(episode, [paths], f"{episode.info.task}: the world"),
+        three_d=_view_3d(episode, [paths], title) if is_known else None,
         cameras=_camera_views(episode, paths),
         curves=_curve_views([paths], episode),
         states=[rrb.StateTimelineView(origin=paths.phase, name="phases")] if any(episode.phase) else [],
         texts=[
             *_pages(episode),
-            rrb.TextLogView(origin=paths.events, name="events"),
+            *([rrb.TextLogView(origin=paths.events, name="events")] if any(episode.phase) or episode.events else []),
         ],
     )
 
@@ -71,7 +86,7 @@ def _blueprint(
     episode: PlayedEpisode,
     *,
     is_alone: bool,
-    three_d: rrb.View,
+    three_d: rrb.View | None,
     cameras: list[rrb.View | rrb.Container],
     curves: rrb.Container,
     states: list[rrb.View],
@@ -79,14 +94,18 @@ def _blueprint(
     more_curves: list[rrb.View] | None = None,
     pictures_share: float = 1.0,
 ) -> rrb.Blueprint:
-    top: rrb.View | rrb.Container = three_d
-    if cameras:
-        top = rrb.Horizontal(three_d, rrb.Vertical(*cameras), column_shares=[3.0 - pictures_share, pictures_share])
+    top: list[rrb.View | rrb.Container] = [] if three_d is None else [three_d]
+    if three_d is not None and cameras:
+        shares = [3.0 - pictures_share, pictures_share]
+        top = [rrb.Horizontal(three_d, rrb.Vertical(*cameras), column_shares=shares)]
+    elif cameras:
+        top = [rrb.Horizontal(*cameras)]
     columns = [curves, *([rrb.Tabs(*more_curves, active_tab=0)] if more_curves else []), rrb.Tabs(*texts, active_tab=0)]
     bottom = rrb.Horizontal(*columns, column_shares=[2.6, *([1] * (len(columns) - 1))])
-    parts, shares = [top, bottom], [5.0, 2.6]
+    parts, shares = [*top, bottom], [*[5.0] * len(top), 2.6]
     if states:
-        parts, shares = [top, *states, bottom], [4.6, 0.95 if more_curves is None else 1.4, 2.9]
+        parts = [*top, *states, bottom]
+        shares = [*[4.6] * len(top), 0.95 if more_curves is None else 1.4, 2.9]
     return _panels(rrb.Vertical(*parts, row_shares=shares), episode.info.fps, is_alone=is_alone)
 
 
@@ -101,52 +120,29 @@ def _panels(views: rrb.Container, fps: int, *, is_alone: bool) -> rrb.Blueprint:
     )
 
 
-def _pages(episode: PlayedEpisode | PlayedExternal) -> list[rrb.View]:
+def _pages(episode: PlayedEpisode) -> list[rrb.View]:
     """What is said of the episode, if anything is, and the episode in words."""
     pages = [rrb.TextDocumentView(origin=Paths().words, name="in words")] if episode.statements else []
     return [*pages, rrb.TextDocumentView(origin=Paths().summary, name="episode")]
-
-
-def _external_views(episode: PlayedExternal) -> rrb.Container:
-    """The robot, if it is known, beside the cameras; the features below."""
-    paths = Paths()
-    top: list[rrb.View | rrb.Container] = []
-    if episode.info.urdf:
-        top.append(rrb.Spatial3DView(origin="/", contents=[f"+ {paths.robot}/**"], name=episode.info.robot))
-    top += [
-        rrb.Spatial2DView(origin=paths.camera(camera), contents=["$origin"], name=camera) for camera in episode.videos
-    ]
-    top += [rrb.Spatial2DView(origin=paths.camera(camera, "/depth"), name=camera) for camera in episode.depth]
-    plots = [
-        rrb.TimeSeriesView(
-            origin="/",
-            contents=[paths.curves(name)],
-            name=name,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
-        )
-        for name in episode.curves
-    ]
-    # Without pictures above there is room for texts one below the other.
-    texts = _pages(episode) if top else [rrb.Vertical(*_pages(episode))]
-    bottom = rrb.Horizontal(*plots, *texts, column_shares=[1.6] * len(plots) + [1.0] * len(texts))
-    return rrb.Vertical(rrb.Horizontal(*top), bottom, row_shares=[5.0, 3.0]) if top else bottom
 
 
 def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spatial3DView:
     contents = []
     for paths in roots:
         contents.append(f"+ {paths.world}/**")
-        for camera in episode.info.scene.cameras:
+        for camera in episode.cameras:
+            if episode.scene is None:  # nobody knows where it is
+                contents.append(f"- {paths.camera(camera)}/**")
+                continue
             hidden = (
-                paths.camera(camera.name, "/depth"),
-                paths.camera(camera.name, "/segmentation"),
-                paths.camera(camera.name, "/boxes"),
+                paths.camera(camera, "/depth"),
+                paths.camera(camera, "/segmentation"),
+                paths.camera(camera, "/boxes"),
             )
             contents += [f"- {entity}" for entity in hidden]
-        for body in episode.info.scene.bodies:
+        for body in () if episode.scene is None else episode.scene.bodies:
             if max(body.shape.extents) > _FLOOR:
                 contents.append(f"- {paths.body(body.name)}")
-    eye, target = _eye(episode)
     behind = rrb.VisibleTimeRanges(
         [
             rrb.VisibleTimeRange(timeline, start=rrb.TimeRangeBoundary.infinite(), end=now)
@@ -163,31 +159,36 @@ def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spati
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         spatial_information=rrb.SpatialInformation(target_frame="tf#/", show_axes=False),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.components.Eye3DKind.Orbital,
-            position=eye.tolist(),
-            look_target=target.tolist(),
-            eye_up=(0.0, 0.0, 1.0),
-        ),
+        eye_controls=_eye(episode),
         overrides={paths.ee_path: [behind, rr.LineStrips3D.from_fields()] for paths in roots},
     )
 
 
-def _eye(episode: PlayedEpisode) -> tuple[Array, Array]:
-    """Where the 3D view looks from and to: at the gripper's way from the side, with the arm in the picture."""
-    base = episode.info.scene.robot.world_from_base
+def _eye(episode: PlayedEpisode) -> rrb.EyeControls3D | None:
+    """Where the 3D view looks from and to: at the gripper's way from the side, with the arm in the image.
+
+    None where that way is not known: the viewer finds a place itself.
+    """
+    if episode.base_from_tcp is None:
+        return None
+    base = episode.world_from_base
     points = base.apply(episode.base_from_tcp[:, :3])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else base.apply((0.5, 0.0, 0.2))
     target = 0.7 * middle + 0.3 * base.apply((0.2, 0.0, 0.4))
     side = base.rotation[:, 1]
     forward = base.rotation[:, 0]
-    return target + 0.15 * forward - 1.05 * side + (0.0, 0.0, 0.42), target
+    eye = target + 0.15 * forward - 1.05 * side + (0.0, 0.0, 0.42)
+    return rrb.EyeControls3D(
+        kind=rrb.components.Eye3DKind.Orbital,
+        position=eye.tolist(),
+        look_target=target.tolist(),
+        eye_up=(0.0, 0.0, 1.0),
+    )
 
 
 def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.Container]:
     views: list[rrb.View | rrb.Container] = []
-    for camera in episode.info.scene.cameras:
-        name = camera.name
+    for name in episode.cameras:
         boxes = [paths.camera(name, "/boxes")] if name in episode.boxes else []
         tabs: list[rrb.View] = []
         if name in episode.videos:
@@ -221,23 +222,13 @@ def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
             ),
         )
 
-    joints = [
-        view("joints (rad)", "position")
-        if len(roots) > 1
-        else view("joints and their targets (rad)", "position", "target"),
-        view("joint velocity (rad/s)", "velocity"),
-        view("joint effort (N m)", "effort"),
-        view("gripper position (m)", "ee"),
-        view("force on the hand (N)", "hand force"),
-        view("torque on the hand (N m)", "hand torque"),
+    plots = _PLOTS if len(roots) == 1 else _COMPARED_PLOTS
+    known = {name for names in plots.values() for name in names} | {"target", "gripper target"}
+    tabs = [item for title, names in plots.items() if title not in _SIDE and (item := view(title, *names)) is not None]
+    beside = [
+        *((title, plots[title]) for title in _SIDE),
+        *((name, (name,)) for name in episode.curves if name not in known),
     ]
-    side = [
-        view("gripper opening (m)", "gripper", *(["gripper target"] if len(roots) == 1 else [])),
-        view("contact force (N)", "force"),
-    ]
-    columns: list[rrb.View | rrb.Container] = []
-    tabs = [item for item in joints if item is not None]
-    if tabs:
-        columns.append(rrb.Tabs(*tabs, active_tab=0))
-    columns += [item for item in side if item is not None]
+    columns: list[rrb.View | rrb.Container] = [rrb.Tabs(*tabs, active_tab=0)] if tabs else []
+    columns += [item for title, names in beside if (item := view(title, *names)) is not None]
     return rrb.Horizontal(*columns, column_shares=[1.8, *([1.0] * (len(columns) - 1))] if tabs else None)

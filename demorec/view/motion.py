@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from demorec.view.episode import Curves, PlayedEpisode, PlayedExternal
+from demorec.view.episode import Curves, PlayedEpisode
 from demorec.view.paths import Paths
 from demorec.view.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
 from demorec.view.times import indexes
@@ -16,14 +16,14 @@ _WIDTHS = {"target": 0.7, "gripper target": 1.2}
 
 def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
     """The gripper's path: one piece a frame, so that a view can show what lies behind; coloured by phase."""
-    if episode.num_frames < 2:
+    if episode.num_frames < 2 or episode.base_from_tcp is None:
         return
-    world_from_base = episode.info.scene.robot.world_from_base
-    points = world_from_base.apply(episode.base_from_tcp[:, :3])
-    colors = phase_colors(episode.phase)
+    points = episode.world_from_base.apply(episode.base_from_tcp[:, :3])
+    phases = episode.phase or ("",) * episode.num_frames
+    colors = phase_colors(phases)
     recording.log(paths.ee_path, rr.LineStrips3D.from_fields(radii=[-2.0]), static=True)
     columns = rr.LineStrips3D.columns(
-        strips=np.stack([points[:-1], points[1:]], axis=1), colors=[colors[name] for name in episode.phase[1:]]
+        strips=np.stack([points[:-1], points[1:]], axis=1), colors=[colors[name] for name in phases[1:]]
     )
     recording.send_columns(paths.ee_path, indexes(episode.time_ns[1:], episode.time_ns), columns)
 
@@ -31,7 +31,7 @@ def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
 def log_curves(
     recording: rr.RecordingStream,
     paths: Paths,
-    episode: PlayedEpisode | PlayedExternal,
+    episode: PlayedEpisode,
     label: str = "",
     *,
     is_second: bool = False,
@@ -39,14 +39,11 @@ def log_curves(
     """All plots; `label` goes before the names of the curves, a second episode's have other colours."""
     for name, curves in episode.curves.items():
         entity = paths.curves(name)
-        if isinstance(episode, PlayedExternal):
-            lines = rr.SeriesLines(names=list(curves.names), colors=series_colors(len(curves.names)))
-        else:
-            lines = rr.SeriesLines(
-                names=_curve_names(name, curves, label, is_second=is_second),
-                colors=_curve_colors(name, curves, is_second=is_second),
-                widths=[0.7 if is_second and len(curves.names) > 1 else _WIDTHS.get(name, 2.0)] * len(curves.names),
-            )
+        lines = rr.SeriesLines(
+            names=_curve_names(name, curves, label, is_second=is_second),
+            colors=_curve_colors(name, curves, is_second=is_second),
+            widths=[0.7 if is_second and len(curves.names) > 1 else _WIDTHS.get(name, 2.0)] * len(curves.names),
+        )
         recording.log(entity, lines, static=True)
         on_frame = np.isin(curves.time_ns, episode.time_ns)
         for chosen, frame_times in ((on_frame, episode.time_ns), (~on_frame, None)):

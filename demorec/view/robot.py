@@ -10,11 +10,11 @@ import numpy as np
 import rerun as rr
 
 from demorec.core.errors import DemorecError, as_reason
-from demorec.core.geometry import Array, Pose, quat_multiply
+from demorec.core.geometry import Array, quat_multiply
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf, UrdfJoint
-from demorec.view.episode import PlayedEpisode, PlayedExternal
+from demorec.view.episode import PlayedEpisode
 from demorec.view.meshes import SurfaceMesh, skeleton_meshes, urdf_meshes
 from demorec.view.paths import Paths
 from demorec.view.times import log_pose, send_poses
@@ -25,9 +25,7 @@ _SAME_PLACE = 1e-3
 """How far joints of the installed model may be from those of the recorded description, metres."""
 
 
-def log_robot(
-    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode | PlayedExternal, tint: Rgba | None = None
-) -> None:
+def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, tint: Rgba | None = None) -> None:
     """Meshes of all links below `paths.robot`, nested as the links are, and how the joints move them.
 
     Joints whose positions are not known stay at 0; a robot without a description is not shown.
@@ -35,24 +33,21 @@ def log_robot(
     Raises:
         RecordingError: A mesh of the robot's model cannot be read.
     """
-    positions: Mapping[str, Array]
-    if isinstance(episode, PlayedExternal):
-        if not episode.info.urdf:
-            return
-        urdf, base, positions = Urdf.parse(episode.info.urdf), Pose(), episode.joint_position
-        meshes = _external_meshes(episode.info.urdf, urdf)
+    info, description, positions = episode.simulated, episode.robot_description, episode.joint_position
+    if info is not None:
+        urdf, meshes = robot_model(info.robot.urdf, info.scene.robot.scale, description)
+    elif description is not None:
+        urdf = Urdf.parse(description)
+        meshes = _meshes_or_rods(description, urdf)
     else:
-        placement = episode.info.scene.robot
-        urdf, meshes = robot_model(episode.info.robot.urdf, placement.scale, episode.robot_description)
-        positions = dict(zip(episode.info.robot.joint_names, episode.joint_position.T, strict=True))
-        base = placement.world_from_base
+        return
     entities = {urdf.root: f"{paths.robot}/{urdf.root}"}
     waiting = list(urdf.joints)
     while waiting:
         for joint in [joint for joint in waiting if joint.parent in entities]:
             entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
             waiting.remove(joint)
-    log_pose(recording, entities[urdf.root], base.vector())
+    log_pose(recording, entities[urdf.root], episode.world_from_base.vector())
     for joint in urdf.joints:
         entity = entities[joint.child]
         if joint.kind == "fixed" or joint.name not in positions:
@@ -64,7 +59,7 @@ def log_robot(
         recording.log(entities[link], as_mesh3d(mesh, tint), static=True)
 
 
-def _external_meshes(text: str, urdf: Urdf) -> Mapping[str, SurfaceMesh]:
+def _meshes_or_rods(text: str, urdf: Urdf) -> Mapping[str, SurfaceMesh]:
     """Link -> what it looks like; rods between the joints where the URDF names files that are not here."""
     try:
         return urdf_meshes(text, None)

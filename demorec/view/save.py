@@ -8,10 +8,9 @@ from pathlib import Path
 
 import rerun as rr
 
-from demorec.core.errors import ConfigError, RecordingError
+from demorec.core.errors import RecordingError
 from demorec.core.replacing import RERUN_FILE, written_whole
 from demorec.view.compare import log_comparison, new_comparison
-from demorec.view.episode import PlayedExternal
 from demorec.view.layout import comparison_layout, episode_layout
 from demorec.view.scene import log_episode, new_recording
 from demorec.view.sources import PlaybackSource
@@ -57,11 +56,6 @@ def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
         DemorecError: As `save`; ConfigError when they cannot be compared.
     """
     with _partial(target) as part, a.open() as first, b.open() as second:
-        if isinstance(first, PlayedExternal) or isinstance(second, PlayedExternal):
-            raise ConfigError(
-                "Collected episodes cannot be laid over each other: nobody knows that their robots stand alike. View "
-                "them without --compare."
-            )
         recording = new_comparison(first, second)
         with _saving(recording, part, comparison_layout(first, second)):
             log_comparison(recording, first, second)

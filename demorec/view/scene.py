@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from demorec.episode.scene import Rgba
 from demorec.view.bodies import log_bodies
 from demorec.view.cameras import log_cameras
-from demorec.view.episode import PlayedEpisode, PlayedExternal, Statements
+from demorec.view.episode import PlayedEpisode, Statements
 from demorec.view.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.view.paths import Paths
 from demorec.view.robot import log_robot
@@ -26,7 +26,7 @@ _HEADINGS = {"subtask": "Now", "motion": "Motion", "plan": "Plan", "memory": "So
 
 def log_episode(
     recording: rr.RecordingStream,
-    episode: PlayedEpisode | PlayedExternal,
+    episode: PlayedEpisode,
     *,
     root: str = "",
     label: str = "",
@@ -42,17 +42,17 @@ def log_episode(
     log_robot(recording, paths, episode, tint)
     log_cameras(recording, paths, episode)
     log_curves(recording, paths, episode, label, is_second=tint is not None)
-    if isinstance(episode, PlayedEpisode):
-        log_bodies(recording, paths, episode, tint)
-        log_ee_path(recording, paths, episode)
-        log_phases(recording, paths, episode)
-        log_events(recording, paths, episode)
-        log_boxes(recording, paths, episode)
+    if episode.scene is not None:
+        log_bodies(recording, paths, episode, episode.scene, tint)
+    log_ee_path(recording, paths, episode)
+    log_phases(recording, paths, episode)
+    log_events(recording, paths, episode)
+    log_boxes(recording, paths, episode)
     log_words(recording, paths, episode.statements, episode.time_ns)
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 
 
-def new_recording(episode: PlayedEpisode | PlayedExternal) -> rr.RecordingStream:
+def new_recording(episode: PlayedEpisode) -> rr.RecordingStream:
     """An empty Rerun recording with the episode's name and properties."""
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(entry(episode))
@@ -60,12 +60,9 @@ def new_recording(episode: PlayedEpisode | PlayedExternal) -> rr.RecordingStream
     return recording
 
 
-def application_id(episode: PlayedEpisode | PlayedExternal) -> str:
+def application_id(episode: PlayedEpisode) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
-    if isinstance(episode, PlayedExternal):
-        words = [camera.name for camera in episode.info.cameras]
-    else:
-        words = [episode.info.task, "-".join(camera.name for camera in episode.info.scene.cameras)]
+    words = ["" if episode.simulated is None else episode.simulated.task, *episode.cameras]
     return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in (episode.group, *words) if word)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from demorec.core.errors import ConfigError, OptionError
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
-from demorec.view.episode import PlayedEpisode, PlayedExternal
+from demorec.view.episode import PlayedEpisode
 from demorec.view.from_dataset import dataset_episodes, open_dataset_episode
 from demorec.view.from_recording import open_recorded
 
@@ -25,7 +25,7 @@ class PlaybackSource:
     """
 
     name: str
-    open: Callable[[], AbstractContextManager[PlayedEpisode | PlayedExternal]]
+    open: Callable[[], AbstractContextManager[PlayedEpisode]]
 
 
 def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[PlaybackSource]:

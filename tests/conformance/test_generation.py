@@ -103,7 +103,6 @@ def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
 
 @pytest.mark.usefixtures("unverified")
 def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path, reference: RunResult) -> None:
-    from demorec.view.episode import PlayedEpisode
     from demorec.view.from_dataset import open_dataset_episode
 
     few = ExportOptions(features=("observation.images.wrist",), action="ee_delta", verify=False)
@@ -116,7 +115,7 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
         SimulatedRecording(reference.folder / "episodes" / "episode_000001.mcap") as recording,
         open_dataset_episode(tmp_path / "few", 1) as shown,
     ):
-        assert isinstance(shown, PlayedEpisode)
+        assert shown.base_from_tcp is not None
         recorded = recording.columns().base_from_tcp
         # The simulator's pose against that of the joints, which the dataset has as float32.
         assert np.allclose(shown.base_from_tcp[:, :3], recorded[:, :3], atol=1e-5)

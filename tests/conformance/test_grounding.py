@@ -301,7 +301,6 @@ def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) 
 def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
-    from demorec.view.episode import PlayedEpisode
     from demorec.view.from_dataset import open_dataset_episode
     from demorec.view.save import save
     from demorec.view.sources import find_episodes
@@ -309,7 +308,7 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
     (frames,) = language_of(dataset)
     subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
     with open_dataset_episode(dataset, 0) as episode:
-        assert isinstance(episode, PlayedEpisode)
+        assert episode.simulated is not None
         shown = {time_ns: text for time_ns, kind, text in episode.statements if kind == "subtask"}
         assert [round(time_ns / 1e9, 3) for time_ns in shown] == [round(time, 3) for time in subtasks]
         assert list(shown.values()) == list(subtasks.values())

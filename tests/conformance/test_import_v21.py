@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from support.commands import exit_code
 
 from demorec.mcap import Recording
-from demorec.view.episode import PlayedExternal
 from demorec.view.from_dataset import open_dataset_episode
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
@@ -130,7 +129,7 @@ def test_every_tool_reads_it(version: str, tmp_path: Path, capsys: pytest.Captur
     assert exit_code("view", root, "--save", tmp_path / "cups.rrd", "--episodes", "1") == 0
     assert exit_code("report", root, "--out", tmp_path / "cups.html", "--no-checks") == 0
     with open_dataset_episode(root, 1) as episode:
-        assert isinstance(episode, PlayedExternal)
+        assert episode.simulated is None
         np.testing.assert_array_equal(episode.curves["observation.state"].values, state(1))
         assert len(list(episode.videos["top"].packets())) == LENGTHS[1]
 

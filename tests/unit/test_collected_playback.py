@@ -10,14 +10,14 @@ from rerun.chunk import RrdReader
 from support.external import TOP, WRIST, make_external, write_external
 
 from demorec.core.errors import ConfigError
-from demorec.view.episode import PlayedExternal
+from demorec.view.episode import PlayedEpisode
 from demorec.view.save import save, save_comparison
 from demorec.view.sources import find_episodes
 
 
-def opened(path: Path) -> PlayedExternal:
+def opened(path: Path) -> PlayedEpisode:
     with find_episodes([path])[0].open() as episode:
-        assert isinstance(episode, PlayedExternal)
+        assert episode.simulated is None
         return episode
 
 
@@ -25,7 +25,7 @@ def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
     given = make_external()
     path = write_external(tmp_path / "a.mcap", given)
     with find_episodes([path])[0].open() as episode:
-        assert isinstance(episode, PlayedExternal)
+        assert episode.simulated is None
         times = [frame.time_ns - given.frames[0].time_ns for frame in given.frames]
         assert episode.time_ns.tolist() == times
         assert set(episode.curves) == {"observation.state", "action", "observation.force"}

@@ -15,7 +15,6 @@ from demorec.cli.view import View
 from demorec.core.errors import DemorecError, RecordingError
 from demorec.mcap import SimulatedWriter
 from demorec.robots.urdf import Urdf
-from demorec.view.episode import PlayedEpisode, PlayedExternal
 from demorec.view.glyphs import DRAWABLE, drawable, drawable_source
 from demorec.view.layout import episode_layout
 from demorec.view.scene import log_episode, new_recording
@@ -59,13 +58,13 @@ def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
     (source,) = find_episodes([foreign])
     missing: set[str] = set()
     with drawable_source(source, missing).open() as episode:
-        assert isinstance(episode, PlayedEpisode)
+        assert episode.scene is not None
         written = [
             summary(episode),
             episode.name,
             episode.group,
             *episode.phase,
-            *(body.name for body in episode.info.scene.bodies),
+            *(body.name for body in episode.scene.bodies),
             *episode.videos,
             *episode.object_poses,
         ]
@@ -75,7 +74,7 @@ def test_all_text_of_a_layout_is_drawable(foreign: Path) -> None:
         assert episode.info.instruction == "".join(f"U+{ord(character):X}" for character in INSTRUCTION)
         assert set(episode.phase) == {"U+62ACU+8D77", "U+653EU+4E0B"}
         assert "U+65B9U+5757" in episode.object_poses
-        assert [camera.name for camera in episode.info.scene.cameras] == list(episode.videos) == ["U+524D"]
+        assert [camera.name for camera in episode.scene.cameras] == list(episode.videos) == ["U+524D"]
     assert re.fullmatch(f"[{DRAWABLE}]*", "".join(written))
     assert set(INSTRUCTION) <= missing
     with source.open() as episode:  # the source itself is as it was
@@ -94,10 +93,10 @@ def test_joints_of_a_robot_without_a_scene_still_belong_together(tmp_path: Path)
     (source,) = find_episodes([path])
     missing: set[str] = set()
     with drawable_source(source, missing).open() as episode:
-        assert isinstance(episode, PlayedExternal)
+        assert episode.simulated is None
         assert missing == set("关节机器人")
         assert "U+5173U+8282" in episode.joint_position
-        assert "U+5173U+8282" in {found.name for found in Urdf.parse(episode.info.urdf).joints}
+        assert "U+5173U+8282" in {found.name for found in Urdf.parse(str(episode.robot_description)).joints}
         log_episode(new_recording(episode), episode)
 
 
