@@ -72,7 +72,7 @@ class ReportedEpisode:
     @property
     def failure(self) -> str:
         """Why it failed and in which phase; "" of any other."""
-        if self.outcome is None or self.outcome.success:
+        if self.outcome is None or self.outcome.success is not False:
             return ""
         reason, phase = self.outcome.failure_reason or "no reason recorded", self.outcome.failure_phase
         return f"{reason} in phase {phase}" if phase else reason

@@ -134,6 +134,8 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
     for number, episode in enumerate(episodes):
         if episode.outcome is None:
             outcome = "cannot be read" if episode.problem else "not recorded"
+        elif episode.outcome.success is None:
+            outcome = "not recorded"
         elif not episode.outcome.success:
             outcome = f"failed: {episode.failure}"
         else:

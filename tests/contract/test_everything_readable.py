@@ -108,6 +108,12 @@ def test_a_command_reads_it(
         with h5py.File(tmp_path / "new.hdf5") as file:
             assert len(file["data"]) == episodes
             assert sum(len(file[f"data/{name}/actions"]) for name in file["data"]) == frames
+    if command == "report" and kind in ("mcap", "robomimic"):
+        page = (tmp_path / "new.html").read_text()
+        assert page.count("<article") == episodes
+        assert f"{frames} (" in page
+        assert page.count('src="data:image/jpeg') == episodes
+        assert "failed:" not in page  # nobody said so
     if command == "view":
         assert len(list(tmp_path.glob("new*.rrd"))) == episodes
 
