@@ -1,4 +1,4 @@
-"""Collected episodes: demonstrations that somebody else's robot, simulator or program made.
+"""External episodes: demonstrations that somebody else's robot, simulator or program made.
 
 Nothing is known of them but what came: vectors and pictures, each with the stamp of its own clock. There is no scene,
 no seed, no gripper and no phase, and time may be uneven. Every frame says which sample of each stream it holds and how
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Pose
 
-COLLECTED_VERSION = 1
-"""Of the recordings of collected episodes. A reader knows every version up to this one."""
+EXTERNAL_VERSION = 1
+"""Of the recordings of external episodes. A reader knows every version up to this one."""
 
 NO_PICTURE = -1
 """Stands for the number of a picture where a frame has none."""
@@ -98,7 +98,7 @@ class SourceFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """How a collected episode came here.
+    """How an external episode came here.
 
     Attributes:
         kind: By the `Recorder` in somebody's program, by `demorec import`, or read in place from a dataset.
@@ -133,7 +133,7 @@ class EpisodeInfo:
     scene: ClassVar[None] = None
     attempt: ClassVar[int] = 0
 
-    format_version: int = COLLECTED_VERSION
+    format_version: int = EXTERNAL_VERSION
     episode_index: int
     instruction: str
     robot: str
@@ -184,7 +184,7 @@ class SampledFrame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Columns:
-    """All numbers of a collected episode, one row a frame (T rows); the pictures are read on their own.
+    """All numbers of an external episode, one row a frame (T rows); the pictures are read on their own.
 
     Attributes:
         time_ns: (T,) stamps of the frames.

@@ -15,11 +15,11 @@ from demorec.core.files import Closing
 from demorec.core.plain import to_json, to_plain
 from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.episode.external import EpisodeInfo
-from demorec.mcap import messages, metadata
+from demorec.mcap import metadata
 from demorec.mcap.channels import camera_topic
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container, damage_as_recording_error
-from demorec.mcap.pixels import PixelCounter, PixelStatistics
+from demorec.mcap.pictures import PixelCounter, PixelStatistics, read_pixel_statistics
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode
 
 
@@ -169,7 +169,7 @@ class EpisodeFile[C](Closing):
     def pixel_statistics(self, camera: str) -> PixelStatistics:
         """Histograms of a camera's pictures: as written, or counted now where none were written."""
         self.video_settings(camera)
-        for _, statistics in self._read(camera_topic(camera, "histogram"), messages.read_pixel_statistics):
+        for _, statistics in self._read(camera_topic(camera, "histogram"), read_pixel_statistics):
             return statistics
         counter = PixelCounter()
         for picture in self.images(camera):

@@ -16,16 +16,15 @@ from demorec.episode.episode import Event, JointSample, SimulatedColumns, Simula
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.depth import decode_depth
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.labels import LabelDecoder, from_labels
+from demorec.mcap.lossless import LabelDecoder, decode_depth, from_labels
 from demorec.mcap.streams import ColumnArrays, FrameStream, frame_streams, merged_columns
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 from demorec.robots.urdf import check_primitives
 
 
 class NotSimulatedError(RecordingError):
-    """The recording is one of a collected episode, which `Recording` reads."""
+    """The recording is one of an external episode, which `Recording` reads."""
 
 
 class RecordingReader(EpisodeFile[metadata.CameraStreams]):

@@ -25,7 +25,7 @@ from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.episode.episode import Outcome
 from demorec.episode.external import EpisodeInfo, Origin, SourceFile, Vector
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.episode.validity import what_is_wrong
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect

@@ -18,8 +18,8 @@ import numpy as np
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.episode.external import EpisodeInfo, Origin, SourceFile
-from demorec.mcap.external.frame_check import MAX_STAMP_NS, MAX_SUBTASK
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.episode.validity import what_is_wrong
+from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.video import size_problem
 from demorec.robots.urdf import Urdf

@@ -34,9 +34,9 @@ from demorec.episode.external import (
     SampledFrame,
     SourceFile,
 )
+from demorec.episode.validity import what_is_wrong
 from demorec.mcap import EpisodeWriter, Recording, SimulatedRecording, recover
-from demorec.mcap.external.transforms import JointPositions
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.mcap.transforms import JointPositions
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 45, 100])

@@ -26,9 +26,9 @@ from demorec.episode.external import (
     Sample,
     SampledFrame,
 )
+from demorec.episode.validity import what_is_wrong
 from demorec.mcap import EpisodeWriter
-from demorec.mcap.external.frame_check import SampledFrameCheck
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.mcap.frame_check import SampledFrameCheck
 from demorec.mcap.recorder.encoder import Buffers, Encoder, WaitingImages, WhenFull
 from demorec.mcap.recorder.vectors import (
     NamedVectors,

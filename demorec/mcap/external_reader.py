@@ -1,4 +1,4 @@
-"""Reads the recording of a collected episode: numbers as columns, pictures as packets."""
+"""Reads the recording of an external episode: numbers as columns, pictures as packets."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.episode.external import DEPTH_UNITS, NO_PICTURE, Columns, EpisodeInfo
-from demorec.mcap import messages
+from demorec.episode.validity import what_is_wrong
+from demorec.mcap import messages, metadata
 from demorec.mcap.channels import description_topic, video_topic
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.depth import decode_distances
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.external import metadata
-from demorec.mcap.external.streams import FRAMES, SUBTASK, feature_streams, frames_layout
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.mcap.lossless import decode_distances
 from demorec.mcap.metadata import EXTERNAL
+from demorec.mcap.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, is_keyframe
 
 _READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
@@ -57,7 +56,7 @@ class _Table:
 
 
 class Recording(EpisodeFile[VideoSettings]):
-    """What one file holds of a collected episode; a context manager.
+    """What one file holds of an external episode; a context manager.
 
     Attributes:
         path: Of the file.
@@ -66,7 +65,7 @@ class Recording(EpisodeFile[VideoSettings]):
         num_frames: Length.
 
     Raises:
-        RecordingError: No recording of a collected episode, cut off, damaged, or of an unknown format version; so do
+        RecordingError: No recording of an external episode, cut off, damaged, or of an unknown format version; so do
             all methods.
     """
 
@@ -76,7 +75,7 @@ class Recording(EpisodeFile[VideoSettings]):
     def _read_metadata(self) -> None:
         found = self._container.metadata(EXTERNAL)
         if found is None:
-            raise RecordingError(f"The file holds no collected episode: {self.path}")
+            raise RecordingError(f"The file holds no external episode: {self.path}")
         try:
             info, self._cameras, urdf_sha256 = metadata.read_external_metadata(found)
             self._read_end(FRAMES)

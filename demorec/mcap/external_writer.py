@@ -1,4 +1,4 @@
-"""Writes a collected episode as it comes into NAME.mcap.part, which becomes NAME.mcap when it is complete.
+"""Writes an external episode as it comes into NAME.mcap.part, which becomes NAME.mcap when it is complete.
 
 As in `demorec.mcap.writer`, a second is gathered and written at once. The pictures of it go in front of the frames
 that hold them, so that whatever a crash leaves of the frames has its pictures.
@@ -15,19 +15,17 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.external import NO_PICTURE, Camera, EpisodeInfo, SampledFrame
-from demorec.mcap import messages
+from demorec.episode.validity import what_is_wrong
+from demorec.mcap import messages, metadata
 from demorec.mcap.cdr import encode
 from demorec.mcap.channels import TF, TF_STATIC, camera_topic, description_topic
-from demorec.mcap.depth import encode_distances
-from demorec.mcap.external import metadata
-from demorec.mcap.external.frame_check import SampledFrameCheck
-from demorec.mcap.external.streams import FRAMES, SUBTASK, feature_streams, frames_layout
-from demorec.mcap.external.transforms import ExternalTree
-from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.file_writer import FileWriter
+from demorec.mcap.frame_check import SampledFrameCheck
+from demorec.mcap.lossless import encode_distances
 from demorec.mcap.metadata import EXTERNAL
 from demorec.mcap.pictures import PictureCoder
-from demorec.mcap.transforms import camera_frame
+from demorec.mcap.streams import FRAMES, SUBTASK, feature_streams, frames_layout
+from demorec.mcap.transforms import ExternalTree, camera_frame
 
 _SECOND_NS = 1_000_000_000
 
@@ -66,7 +64,7 @@ class _Pictures(PictureCoder):
 
 
 class EpisodeWriter(FileWriter[_Pictures]):
-    """Context manager that writes one collected episode; left without `finish`, NAME.mcap.part stays for `recover`.
+    """Context manager that writes one external episode; left without `finish`, NAME.mcap.part stays for `recover`.
 
     Frames must not be changed after they were given.
 
