@@ -26,7 +26,7 @@ MAX_DESCRIPTION_BYTES = 1 << 20
 _MAX_VALUES = 20_000
 """In one description: 255 bodies have about 12,000."""
 _MOST = {"bodies": 255, "goals": 255, "cameras": 64, "arm joints": 64, "gripper joints": 64}
-"""Segmentation pictures tell 255 bodies apart; the others are far beyond any scene that was ever made."""
+"""Segmentation images tell 255 bodies apart; the others are far beyond any scene that was ever made."""
 _SIZE_LENGTH = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3, "urdf": 3}
 _MAX_METRES = 1e4
 _MAX_TOLD = 5
@@ -187,7 +187,7 @@ MAX_CAMERAS = 64
 _MAX_TEXT = 10_000
 
 
-def what_is_wrong(info: EpisodeInfo) -> list[str]:
+def find_problems(info: EpisodeInfo) -> list[str]:
     """Everything that makes a description impossible, in words; empty when nothing does."""
     return list(_external(info))
 

@@ -83,9 +83,9 @@ PICTURE_STREAMS = (
     "segmentation",
     "histogram",
 )
-"""Streams of a camera that come from its pictures; H.265 is only kept, in external episodes."""
+"""Streams of a camera that come from its images; H.265 is only kept, in external episodes."""
 
 
 def video_topic(camera: str, codec: str) -> str:
-    """Where the coded pictures of a camera, in colour or of distances, are read from."""
+    """Where the encoded images of a camera, in colour or of distances, are read from."""
     return camera_topic(camera, _VIDEO_STREAMS[codec])

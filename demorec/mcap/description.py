@@ -59,7 +59,7 @@ def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
     robot = ET.Element("robot", name=source.get("name", "robot"))
     for link in read_links(text, scale=scale):
         target = ET.SubElement(robot, "link", name=link.name)
-        # Collision shapes are simpler to begin with; their pose may differ from the picture's.
+        # Collision shapes are simpler to begin with; their pose may differ from the image's.
         shapes = link.collisions if len(link.collisions) == len(link.visuals) else link.visuals
         for visual, shape in zip(link.visuals, shapes, strict=True):
             for primitive in _primitives(shape, folder):

@@ -53,7 +53,7 @@ class FrameCheck:
         self._has_wrench = any(stream.topic == WRENCH for stream in frame_streams(info))
 
     def __call__(self, frame: Frame) -> None:
-        """Raise RecordingError for what is wrong with a frame; missing pictures are found by who codes them."""
+        """Raise RecordingError for what is wrong with a frame; missing images are found by who codes them."""
         seen, action, command = frame.observation, frame.action, frame.command
         joints = [seen.joint_position, seen.joint_velocity, seen.joint_effort]
         for sample in frame.joint_samples:
@@ -137,7 +137,7 @@ MAX_SUBTASK = 1000
 
 
 class SampledFrameCheck:
-    """Looks at pictures and frames in the order in which they come, and is told of those that were taken."""
+    """Looks at images and frames in the order in which they come, and is told of those that were taken."""
 
     def __init__(self, info: EpisodeInfo) -> None:
         self._features = {feature.name: feature for feature in info.features}
@@ -147,7 +147,7 @@ class SampledFrameCheck:
         self._num_frames = 0
 
     def check_picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> None:
-        """Raise RecordingError unless it can be the next picture of the camera."""
+        """Raise RecordingError unless it can be the next image of the camera."""
         known = self._cameras.get(camera)
         if known is None:
             raise RecordingError(
@@ -158,7 +158,7 @@ class SampledFrameCheck:
         self._check_stamp(f"the picture of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
 
     def note_picture(self, camera: str, stamp_ns: int) -> None:
-        """The camera's next picture was taken."""
+        """The camera's next image was taken."""
         self._last["camera " + camera] = int(stamp_ns)
         self._num_pictures[camera] += 1
 

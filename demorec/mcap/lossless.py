@@ -30,7 +30,7 @@ from demorec.robots.urdf import Urdf
 DEPTH_FORMAT = "16UC1; compressedDepth rvl"
 MAX_METRES = 65.535
 DEPTH_TYPES: dict[str, type[np.uint16] | type[np.float32]] = {"16UC1": np.uint16, "32FC1": np.float32}
-"""Encodings of external episodes, which keep distances to the bit: millimetres as RVL, or metres as they are."""
+"""Encodings of external episodes, which keep distances bit-exact: millimetres as RVL, or metres as they are."""
 _RVL_HEAD = struct.Struct("<iffii")
 """ConfigHeader (format, two parameters of inverse depth, both unused here), then width and height."""
 
@@ -54,12 +54,12 @@ def encode_millimetres(millimetres: NDArray[np.uint16]) -> bytes:
 
 
 def decode_depth(data: bytes, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Inverse of `encode_depth`, to half a millimetre; ValueError for no RVL picture of that (height, width)."""
+    """Inverse of `encode_depth`, to half a millimetre; ValueError for no RVL image of that (height, width)."""
     return np.asarray(decode_millimetres(data, size) / np.float32(1000), dtype=np.float32)
 
 
 def decode_millimetres(data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
-    """Inverse of `encode_millimetres`; ValueError for no RVL picture of that (height, width)."""
+    """Inverse of `encode_millimetres`; ValueError for no RVL image of that (height, width)."""
     from demorec.mcap import kernels
 
     if len(data) < _RVL_HEAD.size or (len(data) - _RVL_HEAD.size) % 4:
@@ -137,12 +137,12 @@ def decode_labels(data: bytes, size: tuple[int, int]) -> NDArray[np.int32]:
 
 
 class LabelDecoder:
-    """Reads the segmentation pictures of one camera.
+    """Reads the segmentation images of one camera.
 
-    FFmpeg unpacks a picture in a third of the time that Pillow takes; to set it up costs as much as to unpack one.
+    FFmpeg unpacks an image in a third of the time that Pillow takes; to set it up costs as much as to unpack one.
 
     Args:
-        size: (height, width) of all pictures.
+        size: (height, width) of all images.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:
@@ -165,7 +165,7 @@ class LabelDecoder:
         if (height, width) != self._size:  # before anything is unpacked
             raise ValueError(f"a segmentation picture of {width}x{height} pixels")
         packet = av.Packet(data)
-        packet.is_keyframe = True  # else FFmpeg takes it for the difference to the picture before
+        packet.is_keyframe = True  # else FFmpeg takes it for the difference to the image before
         try:
             frames = self._decoder.decode(packet)
         except av.FFmpegError as error:

@@ -113,7 +113,7 @@ def read_image(data: bytes) -> bytes:
 
 
 def read_compressed_image(data: bytes) -> bytes:
-    """The coded picture of a `compressed_image`."""
+    """The encoded image of a `compressed_image`."""
     start = _compressed_image_start(data)
     (length,) = _U32.unpack_from(data, start - 4)
     picture = data[start : start + length]
@@ -123,7 +123,7 @@ def read_compressed_image(data: bytes) -> bytes:
 
 
 def _compressed_image_start(data: bytes) -> int:
-    """Where the picture begins in a message, its length in the four bytes before."""
+    """Where the image begins in a message, its length in the four bytes before."""
     # Encapsulation (4 bytes) and stamp (8), then two strings and the octets, each after its length, which starts at a
     # multiple of four.
     position = 12
@@ -134,7 +134,7 @@ def _compressed_image_start(data: bytes) -> int:
 
 
 def coded_pictures(block: Block, codec: str) -> Block:
-    """The coded pictures alone, given the messages of a camera; ValueError for what is no picture."""
+    """The encoded images alone, given the messages of a camera; ValueError for what is no image."""
     if codec == "av1":
         return _one_by_one(block, read_protobuf_video)
     if not len(block):
@@ -142,7 +142,7 @@ def coded_pictures(block: Block, codec: str) -> Block:
     start = _compressed_image_start(next(iter(block.messages())))
     heads = block.heads(start)
     constant = np.ones(start, dtype=np.bool_)
-    constant[4:12] = constant[-4:] = False  # stamp, length of the picture
+    constant[4:12] = constant[-4:] = False  # stamp, length of the image
     if not (heads[:, constant] == heads[0, constant]).all():
         return _one_by_one(block, read_compressed_image)
     lengths = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
@@ -169,7 +169,7 @@ def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) 
 
 
 def read_protobuf_video(data: bytes) -> bytes:
-    """The coded picture of a `protobuf_video`."""
+    """The encoded image of a `protobuf_video`."""
     for name, value in protobuf_fields(data):
         if name == "data":
             return value
@@ -207,7 +207,7 @@ def _varint(data: bytes, position: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
-    """What a `camera_info` message says: picture size in pixels and K (3, 3)."""
+    """What a `camera_info` message says: image size in pixels and K (3, 3)."""
 
     width: int
     height: int
@@ -238,7 +238,7 @@ def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
 
 
 def label_info(labels: Sequence[tuple[int, str]]) -> bytes:
-    """vision_msgs/LabelInfo: which number stands for what in segmentation pictures."""
+    """vision_msgs/LabelInfo: which number stands for what in segmentation images."""
     return encode(LABEL_INFO, (_stamp(0), ""), labels, 0.0)
 
 
@@ -252,9 +252,10 @@ Value = bool | int | float | str | bytes
 
 
 def message_fields(schema: str, data: bytes) -> dict[str, Value]:
-    """Any message taken apart by the definition of its type: name of each field, as in `pose.position.x` or `position[3]`, -> its value, in order.
+    """Any message taken apart by the definition of its type, so that what differs can be named.
 
-    A sequence also has its length, as `position.length`; octets (a coded picture) are one value.
+    Name of each field, as in `pose.position.x` or `position[3]`, -> its value, in order. A sequence also has its
+    length, as `position.length`; octets (an encoded image) are one value.
 
     Args:
         schema: Type of the message, one that recordings use.

@@ -17,7 +17,7 @@ from demorec.core.errors import RecordingError, in_words
 from demorec.core.plain import from_plain, to_json, to_plain
 from demorec.episode.episode import FORMAT_VERSION, Outcome, SimulatedInfo
 from demorec.episode.external import EXTERNAL_VERSION, EpisodeInfo
-from demorec.episode.validity import from_description, read_episode_info, what_is_wrong
+from demorec.episode.validity import find_problems, from_description, read_episode_info
 from demorec.mcap.video import VideoSettings
 
 EPISODE = "demorec.episode"
@@ -45,7 +45,7 @@ class CameraStreams:
     """What was recorded of one camera.
 
     Attributes:
-        video: Coding of the colour pictures.
+        video: Coding of the colour images.
         depth, segmentation: Whether these were recorded.
     """
 
@@ -192,7 +192,7 @@ def read_external_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, di
     try:
         info = from_description(metadata["info"], EpisodeInfo)
         cameras = from_description(metadata["cameras"], dict[str, VideoSettings])
-        wrong = what_is_wrong(info)
+        wrong = find_problems(info)
         for camera in info.cameras:
             video = cameras.get(camera.name)
             if video is None or (video.width, video.height) != (camera.width, camera.height):

@@ -26,11 +26,11 @@ _MOST_PIXELS = 1 << 50
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PixelStatistics:
-    """Histograms of a camera's pictures.
+    """Histograms of a camera's images.
 
     Attributes:
         counts: (3, 256) int64: for red, green, blue, how many pixels have each value.
-        num_images: How many pictures were counted.
+        num_images: How many images were counted.
     """
 
     counts: NDArray[np.int64]
@@ -38,15 +38,15 @@ class PixelStatistics:
 
 
 class PixelCounter:
-    """Counts every other picture (of 180 frames 90, where LeRobot's writer takes 100) and thins large ones as it does.
+    """Counts every other image (of 180 frames 90, where LeRobot's writer takes 100) and thins large ones as it does.
 
     LeRobot (`compute_stats.py`) spreads its sample evenly over an episode of known length; here the length is not
-    known yet. Of a picture only every fourth row is counted, a different quarter in turn.
+    known yet. Of an image only every fourth row is counted, a different quarter in turn.
     """
 
     def __init__(self, *, compiled: bool = False) -> None:
         """Count by a compiled function: up to six times as fast as NumPy (0.01 against 0.06 ms for 224x224), but worth
-        it only for a process that draws pictures, since it takes 0.4 s to load Numba's compiled functions."""
+        it only for a process that draws images, since it takes 0.4 s to load Numba's compiled functions."""
         self._count_values = _count_values
         if compiled:
             from demorec.mcap.kernels import count_values
@@ -57,7 +57,7 @@ class PixelCounter:
         self._num_images = 0
 
     def add(self, picture: NDArray[np.uint8]) -> None:
-        """Take the next picture, (H, W, 3) uint8."""
+        """Take the next image, (H, W, 3) uint8."""
         if self._num_seen % 2 == 0:
             longer_side = max(picture.shape[:2])
             step = longer_side // 150 if longer_side >= 300 else 1
@@ -83,7 +83,7 @@ Message = tuple[str, str, bytes]
 
 
 def pixel_statistics(statistics: PixelStatistics) -> bytes:
-    """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many pictures were counted."""
+    """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many images were counted."""
     dimensions = (("red, green, blue", 3, 3 * 256), ("value", 256, 256))
     data_offset = 1  # what comes in front of the table
     values = np.concatenate(([statistics.num_images], statistics.counts.reshape(-1)))
@@ -99,11 +99,11 @@ def read_pixel_statistics(data: bytes) -> PixelStatistics:
 
 
 class PictureTopics:
-    """Where the coded pictures of one camera go, be they of colours or of distances.
+    """Where the encoded images of one camera go, be they of colours or of distances.
 
     Args:
         camera: The camera.
-        codec: Of the pictures.
+        codec: Of the images.
     """
 
     def __init__(self, camera: SceneCamera | Camera, codec: str) -> None:
@@ -113,7 +113,7 @@ class PictureTopics:
         self._layout = messages.PictureMessages(self._frame_id, DEPTH_FORMAT if codec == "16UC1" else codec)
 
     def of(self, time_ns: int, packet: bytes) -> list[Message]:
-        """The messages of one picture."""
+        """The messages of one image."""
         if self._codec == "av1":
             data = messages.protobuf_video(time_ns, self._frame_id, self._codec, packet)
             return [(self._topic, messages.PROTOBUF_VIDEO, data)]
@@ -129,20 +129,20 @@ class PictureTopics:
 
 
 class PictureCoder:
-    """Codes the pictures of one camera and keeps the packets until they are written.
+    """Codes the images of one camera and keeps the packets until they are written.
 
     Args:
         camera: The camera.
-        video: How colours are coded, where they do not come so.
+        video: How colours are encoded, where they do not come so.
         fps: Of the episode.
         compiled: Whether pixels are counted by a compiled function.
 
     Attributes:
-        settings: How the pictures are coded.
+        settings: How the images are encoded.
         topics: Where they go.
         num_ready: Packets so far.
         num_video_bytes: Of them.
-        last_ns: Stamp of the last picture.
+        last_ns: Stamp of the last image.
     """
 
     def __init__(self, camera: SceneCamera | Camera, video: VideoConfig, fps: int, *, compiled: bool = False) -> None:
@@ -173,7 +173,7 @@ class PictureCoder:
             self._keep(self._encoder.finish())
 
     def statistics(self) -> Message | None:
-        """What was counted of all pictures; None where nothing was."""
+        """What was counted of all images; None where nothing was."""
         if self._encoder is None or not self.num_ready:
             return None
         data = pixel_statistics(self._pixels.statistics())

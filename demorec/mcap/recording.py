@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 class SimulatedRecording(RecordingReader):
     """Context manager over one recording, and the sequence of its frames.
 
-    `for frame in recording` gives numbers and pictures together, `recording[120]`, `recording[-1]` and
-    `recording[::30]` any of them; `columns` gives all numbers at once, which is much faster where pictures are not
+    `for frame in recording` gives numbers and images together, `recording[120]`, `recording[-1]` and
+    `recording[::30]` any of them; `columns` gives all numbers at once, which is much faster where images are not
     needed.
     """
 
@@ -68,7 +68,7 @@ class SimulatedRecording(RecordingReader):
         return _html_page(self)
 
     def to_pandas(self) -> pd.DataFrame:
-        """All numbers as a table, one row a frame, float64 to the bit; the index is `frame_index`.
+        """All numbers as a table, one row a frame, bit-exact float64; the index is `frame_index`.
 
         Columns are named as in `demorec.episode.episode.SimulatedColumns`, vectors with their component:
         `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
@@ -104,7 +104,7 @@ class SimulatedRecording(RecordingReader):
 
 
 def frames_of(recording: RecordingReader, columns: SimulatedColumns | None = None) -> Iterator[Frame]:
-    """Every frame without its pictures: numbers, phase, events, and the joint samples before it.
+    """Every frame without its images: numbers, phase, events, and the joint samples before it.
 
     Args:
         recording: An open recording.
@@ -146,7 +146,7 @@ def _samples_before_frames(recording: RecordingReader, times: list[int]) -> dict
 
 
 def decoded_images(recording: RecordingReader, columns: SimulatedColumns) -> Iterator[Mapping[str, CameraImages]]:
-    """The recorded pictures of every frame, decoded (so not those that were coded), with the recorded camera poses."""
+    """The recorded images of every frame, decoded (so not those that were encoded), with the recorded camera poses."""
     streams = {
         name: (
             recording.images(name),
@@ -168,14 +168,14 @@ def decoded_images(recording: RecordingReader, columns: SimulatedColumns) -> Ite
 
 
 def _frames_with_images(recording: RecordingReader) -> Iterator[Frame]:
-    """Every frame with its decoded pictures, one after the other: a few pictures are in memory at a time."""
+    """Every frame with its decoded images, one after the other: a few images are in memory at a time."""
     columns = recording.columns()
     for frame, images in zip(frames_of(recording, columns), decoded_images(recording, columns), strict=True):
         yield replace(frame, images=images)
 
 
 def _images_at(recording: RecordingReader, columns: SimulatedColumns, frame: int) -> Mapping[str, CameraImages]:
-    """The pictures of one frame; only those from the keyframe before it on are decoded."""
+    """The images of one frame; only those from the keyframe before it on are decoded."""
 
     def at[P](pictures: Callable[[str], Iterator[P]], camera: str) -> P:
         return next(islice(pictures(camera), frame, None))
@@ -214,7 +214,7 @@ def _facts(recording: RecordingReader) -> Iterator[tuple[str, str]]:
 
 
 def _html_page(recording: RecordingReader) -> str:
-    """The facts, and pictures of every camera from the first to the last frame, as one piece of HTML."""
+    """The facts, and images of every camera from the first to the last frame, as one piece of HTML."""
     facts = (("instruction", recording.info.instruction), *_facts(recording), ("file", str(recording.path)))
     rows = [
         f"<tr><th>{html.escape(printable(name or 'length'))}</th>"

@@ -207,7 +207,7 @@ def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames
 
 
 def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
-    """Pictures come before the frames that hold them, so what is there of the frames has its pictures."""
+    """Images come before the frames that hold them, so what is there of the frames has its images."""
     info, _, _ = read_external_metadata(episode)
     topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
     num_frames = min(counts[topic] for topic in topics)

@@ -59,7 +59,7 @@ class FrameValues(NamedTuple):
 
     @classmethod
     def of(cls, frame: Frame) -> FrameValues:
-        """Those of a frame, without its pictures."""
+        """Those of a frame, without its images."""
         poses = {name: image.world_from_camera for name, image in frame.images.items()}
         return cls(frame.observation, frame.action, frame.command, poses)
 
@@ -162,7 +162,7 @@ def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
 
 
 def observation_at(columns: SimulatedColumns, frame: int) -> Observation:
-    """The observation of a frame, to the bit."""
+    """The observation of a frame, bit-exact."""
     return Observation(
         joint_position=columns.joint_position[frame].copy(),
         joint_velocity=columns.joint_velocity[frame].copy(),

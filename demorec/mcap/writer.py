@@ -1,7 +1,7 @@
 """Writes an episode as it happens into NAME.mcap.part, which becomes NAME.mcap when it is complete.
 
 Frames are gathered for one simulated second and then written at once, each stream as a batch, the numbers and the
-pictures in chunks of their own: so a reader of the numbers never decompresses a picture, the recorder costs little,
+images in chunks of their own: so a reader of the numbers never decompresses an image, the recorder costs little,
 and a crash loses at most the last second.
 """
 
@@ -34,7 +34,7 @@ _OTHERS: dict[str, tuple[str, Callable[[Any], bytes]]] = {
     "depth": (DEPTH_FORMAT, encode_depth),
     "segmentation": (LABELS_FORMAT, encode_labels),
 }
-"""Pictures beside colour: stream -> its format, and how one is coded."""
+"""Images beside colour: stream -> its format, and how one is encoded."""
 
 
 class CameraRecorder(PictureCoder):
@@ -55,10 +55,10 @@ class CameraRecorder(PictureCoder):
         self._others: list[list[Message]] = []
 
     def add(self, frame: Frame) -> None:
-        """Take the camera's pictures of the next frame.
+        """Take the camera's images of the next frame.
 
         Raises:
-            RecordingError: A picture is missing or of another size.
+            RecordingError: An image is missing or of another size.
         """
         name = self._camera.name
         images = frame.images.get(name)
@@ -95,7 +95,7 @@ class CameraRecorder(PictureCoder):
 
 
 class _Pending(NamedTuple):
-    """A frame that waits to be written, without its pictures.
+    """A frame that waits to be written, without its images.
 
     Attributes:
         time_ns: When.
@@ -118,7 +118,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
     Args:
         path: The file to be made; its folder must exist.
         info: Written first.
-        video: How colour pictures are coded.
+        video: How colour images are encoded.
         overwrite: Whether a recording of that name may be replaced.
 
     Raises:
@@ -150,7 +150,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
 
         Raises:
             RecordingError: Frames out of order, vectors of another length, other objects or cameras than the scene's,
-                numbers that are not finite, pictures missing or of another size, or a full disk.
+                numbers that are not finite, images missing or of another size, or a full disk.
         """
         due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
@@ -176,7 +176,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
             self._write_pending()
 
     def _begin(self, first: Frame | None) -> None:
-        """Write what is said once, as soon as it is known which pictures there are."""
+        """Write what is said once, as soon as it is known which images there are."""
         for camera in self._info.scene.cameras if first is not None else ():
             assert first is not None
             if camera.name not in first.images:
@@ -192,7 +192,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
         self._file.flush()
 
     def _write_pending(self) -> None:
-        """Write the frames whose pictures have all left the encoders: numbers first, then pictures."""
+        """Write the frames whose images have all left the encoders: numbers first, then images."""
         num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self.num_frames)
         frames = self._pending[: num_ready - self._num_written]
         if not frames:

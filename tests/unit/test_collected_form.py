@@ -34,7 +34,7 @@ from demorec.episode.external import (
     SampledFrame,
     SourceFile,
 )
-from demorec.episode.validity import what_is_wrong
+from demorec.episode.validity import find_problems
 from demorec.mcap import EpisodeWriter, Recording, SimulatedRecording, recover
 from demorec.mcap.transforms import JointPositions
 
@@ -237,7 +237,7 @@ def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str,
 
 
 def test_a_good_description_has_nothing_wrong() -> None:
-    assert what_is_wrong(make_external().info) == []
+    assert find_problems(make_external().info) == []
 
 
 def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) -> None:
