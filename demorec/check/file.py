@@ -8,8 +8,7 @@ from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.external import CheckedRecording
 from demorec.mcap import channels, messages
-from demorec.mcap.external.streams import SUBTASK
-from demorec.mcap.streams import frame_streams
+from demorec.mcap.streams import SUBTASK, frame_streams
 
 
 @file_check(

@@ -21,9 +21,8 @@ from demorec.episode import features
 from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.episode.scene import Body, RobotPlacement, Scene, SceneCamera, Shape
 from demorec.mcap import channels
-from demorec.mcap.external.streams import SUBTASK
 from demorec.mcap.metadata import EPISODE, EXTERNAL, OUTCOME, RECOVERED, CameraStreams
-from demorec.mcap.streams import frame_streams
+from demorec.mcap.streams import SUBTASK, frame_streams
 from demorec.mcap.transforms import FrameTree
 from demorec.runs.run_file import IMPORT_NAME, RunFile
 

@@ -19,10 +19,9 @@ from demorec.episode.episode import Event
 from demorec.episode.scene import SceneCamera
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.depth import FORMAT as DEPTH_FORMAT
-from demorec.mcap.labels import FORMAT as LABELS_FORMAT
-from demorec.mcap.streams import frame_streams, transforms_layout
-from demorec.mcap.transforms import WORLD, FrameTree, camera_frame
+from demorec.mcap.lossless import DEPTH_FORMAT, LABELS_FORMAT
+from demorec.mcap.streams import frame_streams
+from demorec.mcap.transforms import WORLD, FrameTree, camera_frame, transforms_layout
 
 
 @file_check(

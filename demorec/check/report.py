@@ -18,7 +18,7 @@ from demorec.core.processes import SPAWN
 from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
 from demorec.episode.episode import SimulatedInfo
-from demorec.mcap.opening import is_external
+from demorec.mcap.recording import is_external
 from demorec.robots.assets import allow_models, modules_of_models
 from demorec.runs.external import is_external_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find

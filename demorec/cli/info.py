@@ -18,8 +18,8 @@ from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import Found, expect
 
 if TYPE_CHECKING:
-    from demorec.mcap.external.summary import ExternalCameraSummary, ExternalSummary, FeatureSummary
-    from demorec.mcap.summary import RecordingSummary
+    from demorec.episode.external import Origin
+    from demorec.mcap.summary import CameraSummary, FeatureSummary, RecordingSummary
     from demorec.runs.external import ExternalRun
     from demorec.runs.run_file import RunFile
 
@@ -75,77 +75,67 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.core.plain import to_plain
-    from demorec.mcap.opening import is_external
     from demorec.mcap.summary import summarize
 
-    if is_external(path):
-        from demorec.mcap.external.summary import summarize_external
-
-        collected = summarize_external(path)
-        return {"kind": "collected recording", **to_plain(collected)}, _external_lines(collected)
     summary = summarize(path)
-    return {"kind": "recording", **to_plain(summary)}, _recording_lines(summary)
+    kind = "recording" if summary.is_simulated else "external recording"
+    return {"kind": kind, **to_plain(summary)}, _recording_lines(summary)
 
 
 def _recording_lines(summary: RecordingSummary) -> list[str]:
-    attempt = f", attempt {summary.attempt}" if summary.attempt else ""
-    rates = f"{summary.fps} Hz (physics {summary.physics_hz} Hz)"
+    form = f"format {summary.format_version}" if summary.is_simulated else f"external, format {summary.format_version}"
     facts = [
-        ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, format {summary.format_version})"),
+        ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, {form})"),
         ("instruction", summary.instruction),
-        ("episode", f"{summary.task}, seed {summary.root_seed}, episode {summary.episode_index}{attempt}"),
+        ("episode", _episode(summary)),
         ("outcome", _outcome(summary)),
-        ("length", f"{summary.frames} frames, {summary.seconds:.2f} s at {rates}"),
-        ("robot", summary.robot),
-        ("objects", ", ".join(summary.objects) or "none"),
+        ("length", f"{summary.frames} frames, {summary.seconds:.2f} s{_rate(summary)}"),
+        ("robot", summary.robot if summary.is_simulated or not summary.has_urdf else f"{summary.robot} (URDF known)"),
     ]
+    if summary.is_simulated:
+        facts.append(("objects", ", ".join(summary.objects) or "none"))
     if summary.origin:
-        facts.append(("origin", summary.origin))
-    for camera in summary.cameras:
-        video = camera.video
-        quality = f"quality {video.jpeg_quality}" if video.codec == "jpeg" else f"GOP {video.gop}, crf {video.crf}"
-        more = [name for name, there in (("depth", camera.depth), ("segmentation", camera.segmentation)) if there]
-        facts.append(
-            (f"camera {camera.name}", ", ".join([f"{video.width}x{video.height} {video.codec}", quality, *more]))
-        )
+        facts.append(("origin", _origin(summary.origin)))
+    facts += [(f"feature {feature.name}", ", ".join(_feature(feature))) for feature in summary.features]
+    facts += [(f"camera {camera.name}", ", ".join(_camera(summary, camera))) for camera in summary.cameras]
+    facts += [(f"dropped {what}", str(count)) for what, count in summary.drops.items()]
     for check in summary.checks:
         verdict = "passed" if check.passed else "FAILED"
         value = f"{check.value:.4g} {check.unit}".rstrip()
         facts.append((f"check {check.name}", f"{verdict}: {value} (limit {check.limit:.4g})"))
     facts.append(("digest", summary.digest[:16]))
-    facts.append(("made with", ", ".join(f"{name} {version}" for name, version in summary.versions.items())))
+    versions = ", ".join(f"{name} {version}" for name, version in summary.versions.items())
+    facts.append(("made with", versions or "unknown"))
     streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]
     return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
 
 
-def _external_lines(summary: ExternalSummary) -> list[str]:
-    """About one recording."""
-    robot = f"{summary.robot}{' (URDF known)' if summary.has_urdf else ''}"
-    facts = [
-        ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, collected, format {summary.format_version})"),
-        ("instruction", summary.instruction),
-        ("episode", str(summary.episode_index)),
-        ("outcome", _external_outcome(summary)),
-        (
-            "length",
-            f"{summary.frames} frames, {summary.seconds:.2f} s, {summary.rate:.2f} Hz (nominal {summary.fps} Hz)",
-        ),
-        ("robot", robot),
-        ("origin", " ".join([summary.origin.kind, *(file.name for file in summary.origin.files)])),
-        *((f"feature {feature.name}", ", ".join(_feature(feature))) for feature in summary.features),
-        *((f"camera {camera.name}", ", ".join(_camera(camera))) for camera in summary.cameras),
-        *((f"dropped {what}", str(count)) for what, count in summary.drops.items()),
-        ("digest", summary.digest[:16]),
-        ("made with", ", ".join(f"{name} {version}" for name, version in summary.versions.items()) or "unknown"),
-    ]
-    streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]
-    return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
+def _episode(summary: RecordingSummary) -> str:
+    if not summary.is_simulated:
+        return str(summary.episode_index)
+    attempt = f", attempt {summary.attempt}" if summary.attempt else ""
+    return f"{summary.task}, seed {summary.root_seed}, episode {summary.episode_index}{attempt}"
 
 
-def _external_outcome(summary: ExternalSummary) -> str:
+def _outcome(summary: RecordingSummary) -> str:
     if summary.is_recovered:
         return "unknown: recovered after a crash"
-    return _SUCCESS_WORDS[summary.success] + (f": {summary.reason}" if summary.reason else "")
+    if not summary.is_simulated:
+        return _SUCCESS_WORDS[summary.success] + (f": {summary.failure_reason}" if summary.failure_reason else "")
+    retries = f" after {summary.retries} retries" if summary.retries else ""
+    if summary.success:
+        return f"success{retries}"
+    return f"failure in phase {summary.failure_phase or 'unknown'}: {summary.failure_reason or 'unknown'}{retries}"
+
+
+def _rate(summary: RecordingSummary) -> str:
+    if summary.is_simulated:
+        return f" at {summary.fps} Hz (physics {summary.physics_hz} Hz)"
+    return f", {summary.rate:.2f} Hz (nominal {summary.fps} Hz)"
+
+
+def _origin(origin: str | Origin) -> str:
+    return origin if isinstance(origin, str) else " ".join([origin.kind, *(file.name for file in origin.files)])
 
 
 def _feature(feature: FeatureSummary) -> Iterator[str]:
@@ -155,9 +145,13 @@ def _feature(feature: FeatureSummary) -> Iterator[str]:
         yield feature.source
 
 
-def _camera(camera: ExternalCameraSummary) -> Iterator[str]:
+def _camera(summary: RecordingSummary, camera: CameraSummary) -> Iterator[str]:
     video = camera.video
     yield f"{video.width}x{video.height} {video.codec}{' as it came' if camera.is_kept else ''}"
+    if summary.is_simulated:
+        yield f"quality {video.jpeg_quality}" if video.codec == "jpeg" else f"GOP {video.gop}, crf {video.crf}"
+        yield from (name for name, there in (("depth", camera.depth), ("segmentation", camera.segmentation)) if there)
+        return
     yield f"{camera.pictures} pictures"
     yield f"at most {1000 * camera.oldest:.3g} ms old"
     if camera.frames_without:
@@ -166,25 +160,16 @@ def _camera(camera: ExternalCameraSummary) -> Iterator[str]:
         yield camera.source
 
 
-def _outcome(summary: RecordingSummary) -> str:
-    if summary.success is None:
-        return "unknown: recovered after a crash"
-    retries = f" after {summary.retries} retries" if summary.retries else ""
-    if summary.success:
-        return f"success{retries}"
-    return f"failure in phase {summary.failure_phase or 'unknown'}: {summary.failure_reason or 'unknown'}{retries}"
-
-
 def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     from demorec.core.plain import to_plain
     from demorec.runs.external import is_external_run, load_external_run
     from demorec.runs.run_file import load_run_file
 
     if is_external_run(path):
-        collected = load_external_run(path)
+        external = load_external_run(path)
         left_out = _left_out(path)
-        plain = {"kind": "collected run", "path": str(path), "digest": collected.digest, **to_plain(collected)}
-        return plain | {"left_out": left_out}, [*_external_run_lines(path, collected), *_left_out_lines(left_out)]
+        plain = {"kind": "external run", "path": str(path), "digest": external.digest, **to_plain(external)}
+        return plain | {"left_out": left_out}, [*_external_run_lines(path, external), *_left_out_lines(left_out)]
     run = load_run_file(path)
     plain = {
         "kind": "run",
@@ -236,7 +221,7 @@ def _external_run_lines(path: Path, run: ExternalRun) -> list[str]:
     counts = {word: sum(line.success is success for line in run.episodes) for success, word in _SUCCESS_WORDS.items()}
     told = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     facts = [
-        ("run", f"{path} (collected)"),
+        ("run", f"{path} (external)"),
         ("robot", run.robot),
         ("episodes", f"{len(run.episodes)} ({told})"),
         ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
@@ -351,7 +336,7 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
     for file in recordings:
         with open_recording(file) as recording:
             info, outcome = recording.info, recording.outcome
-            task, seed = ("(collected)", "") if isinstance(info, EpisodeInfo) else (info.task, str(info.root_seed))
+            task, seed = ("(external)", "") if isinstance(info, EpisodeInfo) else (info.task, str(info.root_seed))
             success = None if outcome is None else outcome.success
         items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
         word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]

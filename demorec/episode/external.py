@@ -1,6 +1,6 @@
-"""Collected episodes: demonstrations that somebody else's robot, simulator or program made.
+"""External episodes: demonstrations that somebody else's robot, simulator or program made.
 
-Nothing is known of them but what came: vectors and pictures, each with the stamp of its own clock. There is no scene,
+Nothing is known of them but what came: vectors and images, each with the stamp of its own clock. There is no scene,
 no seed, no gripper and no phase, and time may be uneven. Every frame says which sample of each stream it holds and how
 old that is; what was not there is absent, never invented.
 
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Pose
 
-COLLECTED_VERSION = 1
-"""Of the recordings of collected episodes. A reader knows every version up to this one."""
+EXTERNAL_VERSION = 1
+"""Of the recordings of external episodes. A reader knows every version up to this one."""
 
 NO_PICTURE = -1
-"""Stands for the number of a picture where a frame has none."""
+"""Stands for the number of an image where a frame has none."""
 
 Kept = Literal["", "h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
 DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
@@ -59,14 +59,14 @@ class Camera:
     Attributes:
         name: Unique; also its topic.
         width, height: Pixels.
-        kept: The codec of its pictures where they come coded and stay as they are; "" where they come as pixels, which
+        kept: The codec of its images where they come encoded and stay as they are; "" where they come as pixels, which
             the recorder codes. Of a depth camera ROS's name for its distances, whose every bit stays: "16UC1" (whole
             millimetres, 0 where nothing was measured) or "32FC1" (metres, 0 or not finite where nothing was).
         intrinsics: K row by row, 9 numbers in pixels; None when unknown.
         distortion: Of the plumb bob model (k1, k2, p1, p2, k3); empty for none.
         mount: The link of the URDF that carries it; "" when unknown.
         mount_from_camera: Pose in the frame of that link, OpenCV axes; None when unknown.
-        source: Where its pictures came from, in words.
+        source: Where its images came from, in words.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Camera:
 
     @property
     def is_depth(self) -> bool:
-        """Whether its pictures are distances."""
+        """Whether its images are distances."""
         return self.kept in DEPTH_UNITS
 
 
@@ -98,7 +98,7 @@ class SourceFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """How a collected episode came here.
+    """How an external episode came here.
 
     Attributes:
         kind: By the `Recorder` in somebody's program, by `demorec import`, or read in place from a dataset.
@@ -133,7 +133,7 @@ class EpisodeInfo:
     scene: ClassVar[None] = None
     attempt: ClassVar[int] = 0
 
-    format_version: int = COLLECTED_VERSION
+    format_version: int = EXTERNAL_VERSION
     episode_index: int
     instruction: str
     robot: str
@@ -170,8 +170,8 @@ class SampledFrame:
     Attributes:
         time_ns: Its stamp; frames come in order, at whatever distances. What it holds is `time_ns - stamp_ns` old.
         samples: Feature -> what it holds; every feature.
-        pictures: Camera -> number of the picture that it holds, counted from 0 in each camera. One picture may be held
-            by several frames, or by none; a camera that is left out has no picture at this frame.
+        pictures: Camera -> number of the image that it holds, counted from 0 in each camera. One image may be held
+            by several frames, or by none; a camera that is left out has no image at this frame.
         subtask: What the robot begins to do with this frame, in the words of whoever said it; "" where nothing new was
             said.
     """
@@ -184,14 +184,14 @@ class SampledFrame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Columns:
-    """All numbers of a collected episode, one row a frame (T rows); the pictures are read on their own.
+    """All numbers of an external episode, one row a frame (T rows); the images are read on their own.
 
     Attributes:
         time_ns: (T,) stamps of the frames.
         features: Feature -> (T, D) in its own dtype.
         stamps: Feature -> (T,) stamps of the samples.
-        pictures: Camera -> (T,) number of the picture that a frame holds, NO_PICTURE for none.
-        picture_stamps: Camera -> (P,) stamps of its pictures.
+        pictures: Camera -> (T,) number of the image that a frame holds, NO_PICTURE for none.
+        picture_stamps: Camera -> (P,) stamps of its images.
     """
 
     time_ns: NDArray[np.int64]
@@ -210,7 +210,7 @@ class Columns:
         return self.time_ns - self.stamps[feature]
 
     def picture_age_ns(self, camera: str) -> NDArray[np.int64]:
-        """(N,) how old the pictures are, of the N frames that hold one of this camera."""
+        """(N,) how old the images are, of the N frames that hold one of this camera."""
         numbers = self.pictures[camera]
         held = np.flatnonzero(numbers != NO_PICTURE)
         ages: NDArray[np.int64] = self.time_ns[held] - self.picture_stamps[camera][numbers[held]]

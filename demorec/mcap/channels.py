@@ -13,7 +13,7 @@ from demorec.episode.episode import SimulatedInfo
 from demorec.mcap import messages
 from demorec.mcap.cdr import encode
 from demorec.mcap.description import body_description, robot_description
-from demorec.mcap.labels import segment_names, to_labels
+from demorec.mcap.lossless import segment_names, to_labels
 from demorec.mcap.transforms import FrameTree, camera_frame
 
 JOINT_STATES = "/joint_states"
@@ -83,9 +83,9 @@ PICTURE_STREAMS = (
     "segmentation",
     "histogram",
 )
-"""Streams of a camera that come from its pictures; H.265 is only kept, in collected episodes."""
+"""Streams of a camera that come from its images; H.265 is only kept, in external episodes."""
 
 
 def video_topic(camera: str, codec: str) -> str:
-    """Where the coded pictures of a camera, in colour or of distances, are read from."""
+    """Where the encoded images of a camera, in colour or of distances, are read from."""
     return camera_topic(camera, _VIDEO_STREAMS[codec])

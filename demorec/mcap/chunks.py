@@ -104,7 +104,7 @@ def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int
     limits.check_chunk(size, num_bytes)
     stored = memoryview(record)[start : start + num_bytes]
     if compression == b"zstd":
-        # Where the compressed data tell their size, that much is reserved, whatever is said here to be the most.
+        # Where the compressed data state their size, that much is reserved, whatever is said here to be the most.
         if zstandard.frame_content_size(stored) not in (size, -1):
             raise ValueError("a chunk of another size than its compressed data")
         content = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)

@@ -1,7 +1,7 @@
 """Random access to an MCAP file that trusts nothing: every byte that is used was covered by a checksum, where its
 writer left one (0 stands for none), and nothing unpacks to more than `Limits` allows.
 
-The summary at the end tells where each chunk is and which topics it holds, so one topic is read without touching the
+The summary at the end states where each chunk is and which topics it holds, so one topic is read without touching the
 others, one chunk at a time. The mcap library parses the records; what this adds is the checking, and one error.
 """
 

@@ -1,4 +1,4 @@
-"""What the readers of all recordings share: an open MCAP file, its topics and its coded pictures."""
+"""What the readers of all recordings share: an open MCAP file, its topics and its encoded images."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
-from demorec.core.errors import RecordingError
+from demorec.core.errors import RecordingError, without_path
 from demorec.core.files import Closing
 from demorec.core.plain import to_json, to_plain
 from demorec.episode.episode import Outcome, SimulatedInfo
 from demorec.episode.external import EpisodeInfo
 from demorec.mcap import messages, metadata
-from demorec.mcap.channels import camera_topic
+from demorec.mcap.channels import camera_topic, video_topic
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container, damage_as_recording_error
-from demorec.mcap.pixels import PixelCounter, PixelStatistics
-from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode
+from demorec.mcap.pictures import PixelCounter, PixelStatistics, read_pixel_statistics
+from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
+
+_READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
+"""Codec -> what takes a packet out of its message, where that is no CompressedImage."""
 
 
 class EpisodeFile[C](Closing):
@@ -47,7 +50,13 @@ class EpisodeFile[C](Closing):
         self.path = Path(path)
         self._container = Container(self.path)
         try:
-            self._read_metadata()
+            found = self._container.metadata(self._record)
+            if found is None:
+                raise self._other_file()
+            try:
+                self._read_metadata(found)
+            except RecordingError as error:
+                raise RecordingError(f"{without_path(error, self.path)}: {self.path}") from error
         except BaseException:
             self.close()
             raise
@@ -57,8 +66,12 @@ class EpisodeFile[C](Closing):
         self._container.close()
 
     @abstractmethod
-    def _read_metadata(self) -> None:
-        """Read what is known without reading messages."""
+    def _other_file(self) -> RecordingError:
+        """That the file is no recording of this kind."""
+
+    @abstractmethod
+    def _read_metadata(self, found: Mapping[str, str]) -> None:
+        """Read what is known without reading the numbers."""
 
     def _read_end(self, topic: str) -> None:
         """Read how it ended; RecordingError unless its end is that of as many frames as `topic` has messages."""
@@ -132,18 +145,25 @@ class EpisodeFile[C](Closing):
 
     @abstractmethod
     def video_settings(self, camera: str) -> VideoSettings:
-        """How the pictures of a camera were coded."""
+        """How the images of a camera were encoded."""
 
-    @abstractmethod
     def packets(self, camera: str) -> Iterator[VideoPacket]:
-        """The coded pictures of a camera, in order."""
+        """The encoded images of a camera, in order; `frame_index` is their number, by which frames hold them."""
+        codec = self.video_settings(camera).codec
+        read = _READERS.get(codec, messages.read_compressed_image)
+        for number, (time_ns, data) in enumerate(self._pictures(video_topic(camera, codec), read)):
+            yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
+
+    def _pictures[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+        """As `_read`, of a topic of images."""
+        return self._read(topic, read)
 
     @abstractmethod
     def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
-        """camera -> all its coded pictures, in memory together."""
+        """camera -> all its encoded images, in memory together."""
 
     def images(self, camera: str) -> Iterator[Rgb]:
-        """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order."""
+        """The decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
         return decode(self.video_settings(camera), self.packets(camera))
 
     @abstractmethod
@@ -155,11 +175,11 @@ class EpisodeFile[C](Closing):
         """What some frames, in rising order, show of a camera that has images, (H, W, 3) uint8 RGB; in one pass."""
 
     def picture(self, camera: str, number: int) -> Rgb:
-        """One decoded picture of a camera, (H, W, 3) uint8 RGB, by its own number."""
+        """One decoded image of a camera, (H, W, 3) uint8 RGB, by its own number."""
         return next(self._images(camera, [number]))
 
     def _images(self, camera: str, numbers: Sequence[int]) -> Iterator[Rgb]:
-        """Some decoded pictures, read in one pass, each decoded from the keyframe before it on."""
+        """Some decoded images, read in one pass, each decoded from the keyframe before it on."""
         packets = list(islice(self.packets(camera), max(numbers, default=-1) + 1))
         for number in numbers:
             keyframe = max(index for index, packet in enumerate(packets[: number + 1]) if packet.is_keyframe)
@@ -167,9 +187,9 @@ class EpisodeFile[C](Closing):
             yield picture
 
     def pixel_statistics(self, camera: str) -> PixelStatistics:
-        """Histograms of a camera's pictures: as written, or counted now where none were written."""
+        """Histograms of a camera's images: as written, or counted now where none were written."""
         self.video_settings(camera)
-        for _, statistics in self._read(camera_topic(camera, "histogram"), messages.read_pixel_statistics):
+        for _, statistics in self._read(camera_topic(camera, "histogram"), read_pixel_statistics):
             return statistics
         counter = PixelCounter()
         for picture in self.images(camera):

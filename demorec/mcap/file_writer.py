@@ -27,7 +27,7 @@ class WriteStats:
         path: The finished file.
         num_frames: Frames in it.
         num_bytes: Its size.
-        video_bytes: camera -> bytes of its coded colour pictures.
+        video_bytes: camera -> bytes of its encoded colour images.
     """
 
     path: Path
@@ -86,4 +86,4 @@ class FileWriter[C: PictureCoder](Closing):
 
     @abstractmethod
     def _write_rest(self) -> None:
-        """Write what has not been written yet; RecordingError when an encoder keeps pictures to itself."""
+        """Write what has not been written yet; RecordingError when an encoder keeps images to itself."""

@@ -1,4 +1,4 @@
-"""The messages that are written one by one: pictures, text, and what is said once."""
+"""The messages that are written one by one: images, text, and what is said once; and any message by its fields."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
-from demorec.mcap.cdr import CdrReader, encode
+from demorec.mcap.cdr import HEADER, CdrReader, encode
 from demorec.mcap.chunks import Block
-from demorec.mcap.pixels import PixelStatistics
+from demorec.mcap.ros2 import DEFINITIONS, Types, types_of
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -31,8 +32,6 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 LABEL_INFO = "vision_msgs/msg/LabelInfo"
 
-_MOST_PIXELS = 1 << 50
-"""Of one value in a histogram: sums of them stay exact in float64."""
 _LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
 
 
@@ -114,7 +113,7 @@ def read_image(data: bytes) -> bytes:
 
 
 def read_compressed_image(data: bytes) -> bytes:
-    """The coded picture of a `compressed_image`."""
+    """The encoded image of a `compressed_image`."""
     start = _compressed_image_start(data)
     (length,) = _U32.unpack_from(data, start - 4)
     picture = data[start : start + length]
@@ -124,7 +123,7 @@ def read_compressed_image(data: bytes) -> bytes:
 
 
 def _compressed_image_start(data: bytes) -> int:
-    """Where the picture begins in a message, its length in the four bytes before."""
+    """Where the image begins in a message, its length in the four bytes before."""
     # Encapsulation (4 bytes) and stamp (8), then two strings and the octets, each after its length, which starts at a
     # multiple of four.
     position = 12
@@ -135,7 +134,7 @@ def _compressed_image_start(data: bytes) -> int:
 
 
 def coded_pictures(block: Block, codec: str) -> Block:
-    """The coded pictures alone, given the messages of a camera; ValueError for what is no picture."""
+    """The encoded images alone, given the messages of a camera; ValueError for what is no image."""
     if codec == "av1":
         return _one_by_one(block, read_protobuf_video)
     if not len(block):
@@ -143,7 +142,7 @@ def coded_pictures(block: Block, codec: str) -> Block:
     start = _compressed_image_start(next(iter(block.messages())))
     heads = block.heads(start)
     constant = np.ones(start, dtype=np.bool_)
-    constant[4:12] = constant[-4:] = False  # stamp, length of the picture
+    constant[4:12] = constant[-4:] = False  # stamp, length of the image
     if not (heads[:, constant] == heads[0, constant]).all():
         return _one_by_one(block, read_compressed_image)
     lengths = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
@@ -170,7 +169,7 @@ def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) 
 
 
 def read_protobuf_video(data: bytes) -> bytes:
-    """The coded picture of a `protobuf_video`."""
+    """The encoded image of a `protobuf_video`."""
     for name, value in protobuf_fields(data):
         if name == "data":
             return value
@@ -206,25 +205,9 @@ def _varint(data: bytes, position: int) -> tuple[int, int]:
     raise ValueError("a video message that ends within a number")
 
 
-def pixel_statistics(statistics: PixelStatistics) -> bytes:
-    """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many pictures were counted."""
-    dimensions = (("red, green, blue", 3, 3 * 256), ("value", 256, 256))
-    data_offset = 1  # what comes in front of the table
-    values = np.concatenate(([statistics.num_images], statistics.counts.reshape(-1)))
-    return encode(INT64_ARRAY, (dimensions, data_offset), values)
-
-
-def read_pixel_statistics(data: bytes) -> PixelStatistics:
-    """Inverse of `pixel_statistics`."""
-    _, values = CdrReader(data).values(INT64_ARRAY)
-    if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
-        raise ValueError("a histogram of other numbers than counts")
-    return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256).copy())
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
-    """What a `camera_info` message says: picture size in pixels and K (3, 3)."""
+    """What a `camera_info` message says: image size in pixels and K (3, 3)."""
 
     width: int
     height: int
@@ -255,7 +238,7 @@ def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
 
 
 def label_info(labels: Sequence[tuple[int, str]]) -> bytes:
-    """vision_msgs/LabelInfo: which number stands for what in segmentation pictures."""
+    """vision_msgs/LabelInfo: which number stands for what in segmentation images."""
     return encode(LABEL_INFO, (_stamp(0), ""), labels, 0.0)
 
 
@@ -263,3 +246,50 @@ def read_label_info(data: bytes) -> dict[int, str]:
     """Inverse of `label_info`."""
     _, labels = islice(CdrReader(data).values(LABEL_INFO), 2)
     return dict(labels)
+
+
+Value = bool | int | float | str | bytes
+
+
+def message_fields(schema: str, data: bytes) -> dict[str, Value]:
+    """Any message taken apart by the definition of its type, so that what differs can be named.
+
+    Name of each field, as in `pose.position.x` or `position[3]`, -> its value, in order. A sequence also has its
+    length, as `position.length`; octets (an encoded image) are one value.
+
+    Args:
+        schema: Type of the message, one that recordings use.
+        data: The message.
+
+    Raises:
+        ValueError: The message is not of this type, or the type is unknown.
+    """
+    if schema == PROTOBUF_VIDEO:
+        return dict(protobuf_fields(data))
+    if schema not in DEFINITIONS:
+        raise ValueError(f"no recording has messages of the type {schema!r}")
+    if data[:4] != HEADER:
+        raise ValueError("a message of another encapsulation")
+    reader = CdrReader(data, text=lambda raw: raw.decode(errors="backslashreplace").removesuffix("\0"))
+    found = dict(_leaves(types_of(schema), "", "", reader.values(schema)))
+    if reader.num_left:
+        raise ValueError(f"a message with {reader.num_left} bytes too many")
+    return found
+
+
+def _leaves(types: Types, kind: str, prefix: str, values: Any) -> Iterator[tuple[str, Value]]:
+    """Path and value of every field of a struct."""
+    for field, value in zip(types[kind], values, strict=True):
+        path = prefix + field.name
+        if not field.is_array or isinstance(value, bytes):
+            items = [(path, value)]
+        else:
+            if field.length is None:
+                yield f"{path}.length", len(value)
+            numbers = value.tolist() if isinstance(value, np.ndarray) else value
+            items = [(f"{path}[{index}]", item) for index, item in enumerate(numbers)]
+        for place, item in items:
+            if field.kind in types:
+                yield from _leaves(types, field.kind, f"{place}.", item)
+            else:
+                yield place, item

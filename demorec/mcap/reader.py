@@ -1,4 +1,4 @@
-"""Reads a recording: numbers as columns, pictures as packets, one chunk in memory at a time."""
+"""Reads a recording: numbers as columns, images as packets, one chunk in memory at a time."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from demorec.episode.episode import Event, JointSample, SimulatedColumns, Simula
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.depth import decode_depth
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.labels import LabelDecoder, from_labels
+from demorec.mcap.lossless import LabelDecoder, decode_depth, from_labels
 from demorec.mcap.streams import ColumnArrays, FrameStream, frame_streams, merged_columns
-from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, is_keyframe
+from demorec.mcap.video import Rgb, VideoSettings
 from demorec.robots.urdf import check_primitives
 
 
 class NotSimulatedError(RecordingError):
-    """The recording is one of a collected episode, which `Recording` reads."""
+    """The recording is one of an external episode, which `Recording` reads."""
 
 
 class RecordingReader(EpisodeFile[metadata.CameraStreams]):
-    """What one file holds: numbers as columns, pictures as packets or decoded, labels; a context manager.
+    """What one file holds: numbers as columns, images as packets or decoded, labels; a context manager.
 
     Attributes:
         path: Of the file.
@@ -46,24 +45,21 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
     _said: tuple[tuple[int, bytes], ...] | None = None
     """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
-    """topic -> segmentation pictures and the names in them, once `coded_pictures` has come by them."""
+    """topic -> segmentation images and the names in them, once `coded_pictures` has come by them."""
 
-    def _read_metadata(self) -> None:
-        found = self._container.metadata(metadata.EPISODE)
-        if found is None and metadata.EXTERNAL in self._container.metadata_names:
-            raise NotSimulatedError(
+    def _other_file(self) -> RecordingError:
+        if metadata.EXTERNAL in self._container.metadata_names:
+            return NotSimulatedError(
                 "This needs an episode that demorec simulated; this one was collected from another robot or program "
                 f"and has no scene: {self.path}"
             )
-        if found is None:
-            raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
-        try:
-            self.info, self._cameras = metadata.read_episode_metadata(found)
-            self._read_end(channels.GRIPPER)
-            if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
-                raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
-        except RecordingError as error:
-            raise RecordingError(f"{error}: {self.path}") from error
+        return RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
+
+    def _read_metadata(self, found: Mapping[str, str]) -> None:
+        self.info, self._cameras = metadata.read_episode_metadata(found)
+        self._read_end(channels.GRIPPER)
+        if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
+            raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -71,15 +67,15 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         return tuple(camera.name for camera in self.info.scene.cameras if camera.name in self._cameras)
 
     def video_settings(self, camera: str) -> VideoSettings:
-        """How the pictures of a camera were coded."""
+        """How the images of a camera were encoded."""
         return self._camera(camera).video
 
     def has_depth(self, camera: str) -> bool:
-        """Whether depth pictures of a camera were recorded."""
+        """Whether depth images of a camera were recorded."""
         return self._camera(camera).depth
 
     def has_segmentation(self, camera: str) -> bool:
-        """Whether segmentation pictures of a camera were recorded."""
+        """Whether segmentation images of a camera were recorded."""
         return self._camera(camera).segmentation
 
     @property
@@ -102,7 +98,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         return (np.arange(self.num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)
 
     def columns(self) -> SimulatedColumns:
-        """All numbers, one row a frame, to the bit as they were written."""
+        """All numbers, one row a frame, bit-exact as they were written."""
         streams = frame_streams(self.info)
         times = self._frame_times()
         topics = [stream.topic for stream in streams]
@@ -155,16 +151,8 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
             if event.name != channels.PHASE_EVENT:
                 yield time_ns, event
 
-    def packets(self, camera: str) -> Iterator[VideoPacket]:
-        """The coded pictures of a camera, one a frame, in order."""
-        codec = self.video_settings(camera).codec
-        read = messages.read_protobuf_video if codec == "av1" else messages.read_compressed_image
-        for index, data in enumerate(self._pictures(channels.video_topic(camera, codec), read)):
-            time_ns = frame_time_ns(index, self.info.fps)
-            yield VideoPacket(frame_index=index, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
-
     def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
-        """camera -> its coded pictures, one a frame, all read in one pass; they are in memory together."""
+        """camera -> its encoded images, one a frame, all read in one pass; they are in memory together."""
         codecs = {camera: self.video_settings(camera).codec for camera in cameras}
         topics = {camera: channels.video_topic(camera, codec) for camera, codec in codecs.items()}
         labels = [self._segmentation_topic(camera) for camera in cameras if self.has_segmentation(camera)]
@@ -192,21 +180,23 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         return pictures
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """Depth pictures, (H, W) float32 metres in steps of a millimetre, 0 where nothing was hit, one a frame."""
+        """Depth images, (H, W) float32 metres in steps of a millimetre, 0 where nothing was hit, one a frame."""
         if not self.has_depth(camera):
             raise RecordingError(f"The recording has no depth pictures of the camera {camera!r}: {self.path}")
         topic, size = channels.camera_topic(camera, "depth"), self._size(camera)
-        yield from self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size))
+        for _, depth in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size)):
+            yield depth
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
-        """Segmentation pictures, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
+        """Segmentation images, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
         topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
-        yield from self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data)))
+        for _, labels in self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
+            yield labels
 
     def segmentation_at(
         self, cameras: Sequence[str], frames: Collection[int]
     ) -> Iterator[tuple[str, int, NDArray[np.uint16]]]:
-        """(camera, frame, (H, W) labels) of some frames, read in one pass; the other pictures stay packed.
+        """(camera, frame, (H, W) labels) of some frames, read in one pass; the other images stay packed.
 
         Labels are what `segment_labels` tells, less to compute than the values of `segmentation`.
 
@@ -236,7 +226,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         return channels.camera_topic(camera, "segmentation")
 
     def _size(self, camera: str) -> tuple[int, int]:
-        """(height, width) of all pictures of a camera."""
+        """(height, width) of all images of a camera."""
         settings = self.video_settings(camera)
         return settings.height, settings.width
 
@@ -255,15 +245,15 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
             return names
         return {}
 
-    def _pictures[P](self, topic: str, read: Callable[[bytes], P]) -> Iterator[P]:
-        """The pictures of a topic that has one message a frame."""
+    def _pictures[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+        """As `_read`; RecordingError unless there is one image at the time of each frame."""
         count = 0
         for time_ns, picture in self._read(topic, read):
             if count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps):
                 raise RecordingError(
                     f"Picture {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
                 )
-            yield picture
+            yield time_ns, picture
             count += 1
         self._check_num_pictures(topic, count)
 
@@ -274,7 +264,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
             )
 
     def image(self, camera: str, frame: int) -> Rgb:
-        """The decoded picture of one frame, (H, W, 3) uint8 RGB, decoded from the keyframe before it on.
+        """The decoded image of one frame, (H, W, 3) uint8 RGB, decoded from the keyframe before it on.
 
         Raises:
             IndexError: There is no such frame; negative ones count from the end.
@@ -297,10 +287,10 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
 
     def digest(self) -> str:
-        """SHA-256 (hex) of the content: metadata, numbers, phases, events, coded pictures.
+        """SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.
 
-        Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold the same
-        episode to the bit. A column that the format version does not have is not part of it, so that recordings of
+        Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold bit for bit
+        the same episode. A column that the format version does not have is not part of it, so that recordings of
         older versions keep their digests.
         """
         result = self._digest_of_description()

@@ -20,14 +20,12 @@ from demorec.episode.episode import frame_time_ns
 from demorec.episode.external import Origin
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import SalvagedMessage, salvage
-from demorec.mcap.external.metadata import read_external_metadata
-from demorec.mcap.external.reader import Recording
-from demorec.mcap.external.streams import FRAMES, feature_streams
-from demorec.mcap.opening import open_recording
+from demorec.mcap.external_reader import Recording
+from demorec.mcap.metadata import read_external_metadata
 from demorec.mcap.part_file import PartFile
-from demorec.mcap.recording import SimulatedRecording
+from demorec.mcap.recording import SimulatedRecording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
-from demorec.mcap.streams import frame_streams
+from demorec.mcap.streams import FRAMES, feature_streams, frame_streams
 
 _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
@@ -124,8 +122,8 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
             info, _ = metadata.read_episode_metadata(item.metadata)
             return bool(origin) and info.origin == origin
         if isinstance(item, Metadata) and item.name == metadata.EXTERNAL:
-            collected, _, _ = read_external_metadata(item.metadata)
-            return collected.origin.kind == "import" and collected.origin == origin
+            external, _, _ = read_external_metadata(item.metadata)
+            return external.origin.kind == "import" and external.origin == origin
         if isinstance(item, str):
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
         if item is not None:
@@ -209,7 +207,7 @@ def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames
 
 
 def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
-    """Pictures come before the frames that hold them, so what is there of the frames has its pictures."""
+    """Images come before the frames that hold them, so what is there of the frames has its images."""
     info, _, _ = read_external_metadata(episode)
     topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
     num_frames = min(counts[topic] for topic in topics)

@@ -1,9 +1,13 @@
 """The streams with one message a frame, one row each: topic, ROS 2 type, layout, encoding and decoding.
 
-`frame_streams` is the table. A row says which values of a frame its message holds (`parts`) and which columns of
-`SimulatedColumns` they become when a recording is read (`columns`); the writer, the reader, recovery and the checks go
-through the rows and know no topic by name. `since` is the format version that brought a stream: in older recordings it
-is neither expected nor written, and what it would tell is None.
+`frame_streams` is the table of a simulated episode. A row says which values of a frame its message holds (`parts`) and
+which columns of `SimulatedColumns` they become when a recording is read (`columns`); the writer, the reader, recovery
+and the checks go through the rows and know no topic by name. `since` is the format version that brought a stream: in
+older recordings it is neither expected nor written, and what it would hold is None.
+
+Any other episode has a topic for each feature (`feature_streams`), and `/frames`, which says which sample of every
+feature and which image of every camera a frame holds: the features' stamps, then the cameras' image numbers. Messages
+of features are stored with the frame's time; those that begin with a header have the sample's stamp there.
 """
 
 from __future__ import annotations
@@ -15,9 +19,11 @@ from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Frame, Observation, SimulatedColumns, SimulatedInfo
+from demorec.episode.external import EpisodeInfo, Feature
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
 from demorec.mcap.channels import (
@@ -31,14 +37,12 @@ from demorec.mcap.channels import (
     camera_topic,
     object_topic,
 )
-from demorec.mcap.transforms import WORLD, FrameTree
+from demorec.mcap.transforms import POSE_SLOTS, WORLD, FrameTree, transforms_layout
 from demorec.robots.robot import RobotSpec
 
 GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""
 
-POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
-"""Position and quaternion xyzw in a layout."""
 _WRENCH_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
 
 ColumnArrays = dict[str, Array | dict[str, Array]]
@@ -55,7 +59,7 @@ class FrameValues(NamedTuple):
 
     @classmethod
     def of(cls, frame: Frame) -> FrameValues:
-        """Those of a frame, without its pictures."""
+        """Those of a frame, without its images."""
         poses = {name: image.world_from_camera for name, image in frame.images.items()}
         return cls(frame.observation, frame.action, frame.command, poses)
 
@@ -142,12 +146,6 @@ def tf_stream(frames: FrameTree) -> FrameStream:
     )
 
 
-def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
-    """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
-    rows = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames)
-    return layout(messages.TRANSFORMS, rows)
-
-
 def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
     """The columns of several streams as arguments of `SimulatedColumns`; the mappings are there even when empty."""
     merged: dict[str, Any] = {"object_poses": {}, "world_from_camera": {}}
@@ -164,7 +162,7 @@ def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
 
 
 def observation_at(columns: SimulatedColumns, frame: int) -> Observation:
-    """The observation of a frame, to the bit."""
+    """The observation of a frame, bit-exact."""
     return Observation(
         joint_position=columns.joint_position[frame].copy(),
         joint_velocity=columns.joint_velocity[frame].copy(),
@@ -266,3 +264,65 @@ def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> F
         parts=parts,
         columns=lambda values: {column: {key: values}} if key else {column: values},
     )
+
+
+FRAMES = "/frames"
+SUBTASK = "/language/subtask"
+"""What is begun at a frame, where somebody said it: std_msgs/String."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureStream:
+    """The messages of a feature, one a frame.
+
+    Attributes:
+        topic: Where: "/observation/state".
+        schema: ROS 2 type.
+        layout: Of its messages, which hold D values.
+        dtype: Of the feature.
+    """
+
+    topic: str
+    schema: str
+    layout: Layout
+    dtype: str
+
+    def encode(self, stamps: Sequence[int], vectors: Sequence[NDArray[Any]]) -> list[bytes]:
+        """One message for each sample; float64 holds every bit of a float32."""
+        return self.layout.encode(np.array(stamps, dtype=np.int64), np.array(vectors, dtype=np.float64))
+
+    def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
+        """(T, D) in the feature's dtype, of T messages; ValueError for messages of another layout."""
+        return self.layout.decode_rows(rows).astype(self.dtype)
+
+
+def feature_streams(info: EpisodeInfo) -> dict[str, FeatureStream]:
+    """Feature -> its messages: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
+    streams = {}
+    for feature in info.features:
+        schema = messages.JOINT_STATE if any(feature.joints) else messages.FLOAT64_ARRAY
+        streams[feature.name] = FeatureStream(
+            topic="/" + feature.name.replace(".", "/"),
+            schema=schema,
+            layout=_joints_layout(feature) if any(feature.joints) else _array_layout(schema, feature.names),
+            dtype=feature.dtype,
+        )
+    return streams
+
+
+def frames_layout(info: EpisodeInfo) -> Layout:
+    """Of `/frames`: std_msgs/Int64MultiArray, whose label names the columns."""
+    columns = [feature.name for feature in info.features] + [camera.name for camera in info.cameras]
+    return _array_layout(messages.INT64_ARRAY, columns)
+
+
+def _joints_layout(feature: Feature) -> Layout:
+    """Velocity and effort are empty: they are not known, and zeros would be invented."""
+    names = tuple(joint or name for name, joint in zip(feature.names, feature.joints, strict=True))
+    return layout(messages.JOINT_STATE, (Slot.TIME, ""), names, (Slot.VALUE,) * len(names), (), ())
+
+
+def _array_layout(schema: str, columns: Sequence[str]) -> Layout:
+    count = len(columns)
+    dimension = (",".join(columns), count, count)
+    return layout(schema, ((dimension,), 0), (Slot.VALUE,) * count)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from demorec.episode.episode import SuccessCheck
-from demorec.mcap.external.reader import Recording
-from demorec.mcap.recording import SimulatedRecording
+import numpy as np
+
+from demorec.episode.episode import Outcome, SuccessCheck
+from demorec.episode.external import NO_PICTURE, Origin
+from demorec.mcap.external_reader import Recording
+from demorec.mcap.recording import AnyRecording, SimulatedRecording, open_recording
 from demorec.mcap.video import VideoSettings
 
 
@@ -23,22 +25,53 @@ class StreamSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FeatureSummary:
+    """One feature: its elements, and the oldest sample that a frame holds, in seconds."""
+
+    name: str
+    dtype: str
+    elements: tuple[str, ...]
+    units: tuple[str, ...]
+    source: str
+    oldest: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class CameraSummary:
-    """One camera: how its pictures were coded, and what beside colour was recorded."""
+    """One camera.
+
+    Attributes:
+        name, mount: What it is called, and the link that carries it ("" when unknown).
+        video: How its images are encoded.
+        depth, segmentation: Whether these were recorded: of a simulated camera beside colour, of a depth camera alone.
+        is_kept: Whether its images are encoded as they came.
+        pictures: How many images there are.
+        frames_without: How many frames hold none.
+        oldest: Of those that frames hold, in seconds.
+        source: Where they came from, in words.
+    """
 
     name: str
     mount: str
     video: VideoSettings
     depth: bool
-    segmentation: bool
+    segmentation: bool = False
+    is_kept: bool = False
+    pictures: int
+    frames_without: int = 0
+    oldest: float = 0.0
+    source: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSummary:
-    """What `demorec info` tells of a recording; times in seconds.
+    """What `demorec info` says of a recording; times in seconds.
 
     Attributes:
-        success: None when a crash cut the episode off.
+        task, root_seed, physics_hz: None of an episode that demorec did not simulate.
+        success: None when nobody said, or a crash cut the episode off (`is_recovered`).
+        rate: Mean frames per second; 0 of a single frame.
+        features: Of an episode that demorec did not simulate.
         digest: Of the content.
     """
 
@@ -47,82 +80,131 @@ class RecordingSummary:
     format_version: int
     episode_index: int
     attempt: int
-    root_seed: int
-    task: str
+    root_seed: int | None
+    task: str | None
     instruction: str
     robot: str
+    has_urdf: bool
     objects: tuple[str, ...]
     success: bool | None
+    is_recovered: bool
     failure_phase: str
     failure_reason: str
     checks: tuple[SuccessCheck, ...]
     retries: int
+    drops: Mapping[str, int]
     frames: int
     fps: int
-    physics_hz: int
+    physics_hz: int | None
     seconds: float
+    rate: float
+    features: tuple[FeatureSummary, ...]
     cameras: tuple[CameraSummary, ...]
     streams: tuple[StreamSummary, ...]
-    origin: str
+    origin: str | Origin
     config_digest: str
     digest: str
     final_state_digest: str
     versions: Mapping[str, str]
 
-
-def common_facts(recording: SimulatedRecording | Recording) -> dict[str, Any]:
-    """What summaries of both kinds of recordings tell, by the names of their attributes."""
-    info, outcome = recording.info, recording.outcome
-    return {
-        "path": str(recording.path),
-        "bytes": recording.path.stat().st_size,
-        "format_version": info.format_version,
-        "episode_index": info.episode_index,
-        "instruction": info.instruction,
-        "success": None if outcome is None else outcome.success,
-        "frames": recording.num_frames,
-        "fps": info.fps,
-        "streams": tuple(
-            StreamSummary(topic=topic, type=kind, messages=count) for topic, (kind, count) in recording.topics.items()
-        ),
-        "origin": info.origin,
-        "digest": recording.digest(),
-        "versions": info.versions,
-    }
+    @property
+    def is_simulated(self) -> bool:
+        """Whether demorec simulated the episode."""
+        return self.task is not None
 
 
 def summarize(path: Path) -> RecordingSummary:
-    """Read a recording, all of its content included, and tell what it holds.
+    """Read a recording, all of its content included, and say what it holds.
 
     Raises:
         RecordingError: It is none, or damaged.
     """
-    with SimulatedRecording(path) as recording:
-        info, outcome = recording.info, recording.outcome
+    with open_recording(path) as recording:
+        info, simulated = recording.info, recording.simulated
+        outcome = recording.outcome or Outcome(num_frames=recording.num_frames)
+        seconds, rate = _length(recording)
         return RecordingSummary(
-            **common_facts(recording),
+            path=str(path),
+            bytes=path.stat().st_size,
+            format_version=info.format_version,
+            episode_index=info.episode_index,
             attempt=info.attempt,
-            root_seed=info.root_seed,
-            task=info.task,
-            robot=info.robot.name,
-            objects=tuple(body.name for body in info.scene.movable),
-            failure_phase="" if outcome is None else outcome.failure_phase,
-            failure_reason="" if outcome is None else outcome.failure_reason,
-            checks=() if outcome is None else outcome.checks,
-            retries=0 if outcome is None else outcome.num_retries,
-            physics_hz=info.physics_hz,
-            seconds=recording.num_frames / info.fps,
-            cameras=tuple(
-                CameraSummary(
-                    name=camera.name,
-                    mount=camera.mount,
-                    video=recording.video_settings(camera.name),
-                    depth=recording.has_depth(camera.name),
-                    segmentation=recording.has_segmentation(camera.name),
-                )
-                for camera in info.scene.cameras
-                if camera.name in recording.cameras
+            root_seed=None if simulated is None else simulated.root_seed,
+            task=None if simulated is None else simulated.task,
+            instruction=info.instruction,
+            robot=info.robot_name,
+            has_urdf=isinstance(recording, SimulatedRecording) or bool(recording.info.urdf),
+            objects=() if simulated is None else tuple(body.name for body in simulated.scene.movable),
+            success=outcome.success,
+            is_recovered=recording.is_recovered,
+            failure_phase=outcome.failure_phase,
+            failure_reason=outcome.failure_reason,
+            checks=outcome.checks,
+            retries=outcome.num_retries,
+            drops=outcome.drops,
+            frames=recording.num_frames,
+            fps=info.fps,
+            physics_hz=None if simulated is None else simulated.physics_hz,
+            seconds=seconds,
+            rate=rate,
+            features=() if isinstance(recording, SimulatedRecording) else tuple(_features(recording)),
+            cameras=tuple(_cameras(recording)),
+            streams=tuple(
+                StreamSummary(topic=topic, type=kind, messages=count)
+                for topic, (kind, count) in recording.topics.items()
             ),
-            config_digest=info.config_digest,
-            final_state_digest="" if outcome is None else outcome.final_state_digest,
+            origin=info.origin,
+            config_digest="" if simulated is None else simulated.config_digest,
+            digest=recording.digest(),
+            final_state_digest=outcome.final_state_digest,
+            versions=info.versions,
+        )
+
+
+def _length(recording: AnyRecording) -> tuple[float, float]:
+    """Seconds, and mean frames per second."""
+    if isinstance(recording, SimulatedRecording):
+        return recording.num_frames / recording.info.fps, float(recording.info.fps)
+    times = recording.columns().time_ns
+    seconds = float(times[-1] - times[0]) / 1e9 if len(times) else 0.0
+    return seconds, (len(times) - 1) / seconds if seconds else 0.0
+
+
+def _features(recording: Recording) -> Iterator[FeatureSummary]:
+    for feature in recording.info.features:
+        yield FeatureSummary(
+            name=feature.name,
+            dtype=feature.dtype,
+            elements=feature.names,
+            units=feature.units,
+            source=feature.source,
+            oldest=float(np.abs(recording.columns().age_ns(feature.name)).max(initial=0)) / 1e9,
+        )
+
+
+def _cameras(recording: AnyRecording) -> Iterator[CameraSummary]:
+    if isinstance(recording, SimulatedRecording):
+        mounts = {camera.name: camera.mount for camera in recording.info.scene.cameras}
+        for name in recording.cameras:
+            yield CameraSummary(
+                name=name,
+                mount=mounts[name],
+                video=recording.video_settings(name),
+                depth=recording.has_depth(name),
+                segmentation=recording.has_segmentation(name),
+                pictures=recording.num_images(name),
+            )
+        return
+    columns = recording.columns()
+    for camera in recording.info.cameras:
+        yield CameraSummary(
+            name=camera.name,
+            mount=camera.mount,
+            video=recording.video_settings(camera.name),
+            depth=camera.is_depth,
+            is_kept=bool(camera.kept),
+            pictures=recording.num_images(camera.name),
+            frames_without=int((columns.pictures[camera.name] == NO_PICTURE).sum()),
+            oldest=float(np.abs(columns.picture_age_ns(camera.name)).max(initial=0)) / 1e9,
+            source=camera.source,
         )

@@ -1,24 +1,30 @@
 """The coordinate frames of an episode (ROS: TF): which frame hangs on which, and how the moving ones move.
 
-Every link of the robot, every body and every camera is a frame. What the joints and the physics move is on `/tf` at
-each frame, the rest on `/tf_static`.
+Every link of the robot, every body and every camera is a frame, of an episode that demorec did not simulate every link
+of a robot that is described. What the joints and the physics move is on `/tf` at each frame, the rest on `/tf_static`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, quat_multiply
 from demorec.episode.episode import Observation, SimulatedInfo
+from demorec.episode.external import EpisodeInfo, Feature, SampledFrame, Vector
+from demorec.mcap import messages
+from demorec.mcap.cdr import Layout, Slot, layout
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf, joint_motion
 
 WORLD = "world"
 RERUN_ROOT = "tf#/"
 """Rerun's name of its scene's root: without this one row its 3D view finds no way to any of the frames."""
+
+POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
+"""Position and quaternion xyzw in a layout."""
 
 Row = tuple[str, str, Pose]
 """Parent frame, child frame, parent_from_child."""
@@ -27,6 +33,12 @@ Row = tuple[str, str, Pose]
 def camera_frame(camera: str) -> str:
     """Coordinate frame of a camera, in OpenCV axes (ROS: "optical")."""
     return f"camera_{camera}"
+
+
+def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
+    """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
+    rows = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames)
+    return layout(messages.TRANSFORMS, rows)
 
 
 class FrameTree:
@@ -114,3 +126,63 @@ class MovingJoints:
         result[..., :3] = self._origin + self._slide * position[..., None]
         result[..., 3:] = self._sine * sine + self._cosine * cosine
         return result
+
+
+class JointPositions:
+    """Which elements of the observations are the positions of which joints.
+
+    Attributes:
+        joints: Their names, each once.
+    """
+
+    def __init__(self, features: Sequence[Feature]) -> None:
+        places: dict[str, tuple[str, int, float]] = {}
+        for feature in features:
+            if feature.name.partition(".")[0] != "observation":
+                continue
+            units = feature.units or ("",) * len(feature.names)
+            for index, (joint, unit) in enumerate(zip(feature.joints, units, strict=False)):
+                if joint:
+                    factor = math.radians(1.0) if unit == "deg" else 1.0
+                    places.setdefault(joint, (feature.name, index, factor))
+        self.joints = tuple(places)
+        self._places = tuple(places.values())
+
+    def of(self, features: Mapping[str, Vector]) -> Array:
+        """(..., n) rad or m, from features (..., D)."""
+        columns = [features[name][..., index] * factor for name, index, factor in self._places]
+        return np.stack(columns, axis=-1).astype(np.float64)
+
+
+class ExternalTree:
+    """Which coordinate frames hang on which; a joint of the URDF that is not observed stays at 0.
+
+    Attributes:
+        static: Rows that never change.
+        is_moving: Whether any joint is known to move.
+    """
+
+    def __init__(self, info: EpisodeInfo) -> None:
+        urdf = Urdf.parse(info.urdf)
+        self._positions = JointPositions(info.features)
+        self._joints = MovingJoints(urdf, self._positions.joints)
+        self._layout = transforms_layout(self._joints.moving)
+        self.is_moving = bool(self._joints.moving)
+        self.static: tuple[Row, ...] = (
+            (RERUN_ROOT, WORLD, Pose()),
+            (WORLD, urdf.root, Pose()),
+            *self._joints.static,
+            *(
+                (camera.mount or urdf.root, camera_frame(camera.name), camera.mount_from_camera)
+                for camera in info.cameras
+                if camera.mount_from_camera is not None
+            ),
+        )
+
+    def encode(self, frames: Sequence[SampledFrame]) -> list[bytes]:
+        """tf2_msgs/TFMessage of each frame, at its time."""
+        names = frames[0].samples
+        features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in names}
+        values = self._joints.values(self._positions.of(features))
+        times = np.array([frame.time_ns for frame in frames], dtype=np.int64)
+        return self._layout.encode(times, values.reshape(len(frames), -1))

@@ -1,6 +1,6 @@
-"""Pictures to coded packets and back.
+"""Images to encoded packets and back.
 
-Every picture is coded once, while recording; the packets go into the recording as they are and later into the
+Every image is encoded once, while recording; the packets go into the recording as they are and later into the
 dataset unchanged. One encoder per camera and episode, one thread each (the same bits on every machine of a type, and
 a pool of workers already fills the cores), no reordering: packet t shows frame t.
 """
@@ -30,7 +30,7 @@ Codec = Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
 # SVT-AV1 tells its settings on standard error unless this says "errors only"; it reads it when it starts.
 os.environ.setdefault("SVT_LOG", "1")
 
-# Code points of ITU-T H.273, the same in H.264 and AV1: sRGB pictures through the matrix that libswscale uses by itself
+# Code points of ITU-T H.273, the same in H.264 and AV1: sRGB images through the matrix that libswscale uses by itself
 # (BT.601, 16 to 235). Without them a player guesses, and many guess BT.709: (200, 30, 30) then shows as (214, 45, 28).
 _LIMITED_RANGE = 1
 _PRIMARIES_BT709 = 1
@@ -39,20 +39,20 @@ _MATRIX_BT601 = 6
 
 
 _PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
-"""Codec -> FFmpeg's name of the pixel format, of codecs whose every picture stands by itself."""
+"""Codec -> FFmpeg's name of the pixel format, of codecs whose every image stands by itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoSettings:
-    """How the pictures of one camera were coded: what a dataset's metadata and an mp4 file need to know.
+    """How the images of one camera were encoded: what a dataset's metadata and an mp4 file need to know.
 
     Attributes:
         codec: Of the bit stream; of depth the encoding of its distances.
-        encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that came coded.
+        encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that came encoded.
         width, height: Pixels.
-        fps: Pictures per second.
+        fps: Images per second.
         pix_fmt: FFmpeg's name of the pixel format.
-        gop: Pictures from one keyframe to the next; 0 when unknown, of packets that came coded.
+        gop: Images from one keyframe to the next; 0 when unknown, of packets that came encoded.
         crf: Constant rate factor; None for jpeg.
         preset: Encoder preset; "" for jpeg.
         options: Further encoder options, as given to FFmpeg.
@@ -73,7 +73,7 @@ class VideoSettings:
 
 
 def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoSettings:
-    """Those of packets that came coded, of which nobody knows how."""
+    """Those of packets that came encoded, of which nobody knows how."""
     return VideoSettings(
         codec=codec,
         encoder="",
@@ -90,7 +90,7 @@ def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoS
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VideoPacket:
-    """One coded picture: an H.264 or H.265 access unit (Annex B), an AV1 temporal unit (OBUs) or a JPEG file.
+    """One encoded image: an H.264 or H.265 access unit (Annex B), an AV1 temporal unit (OBUs) or a JPEG file.
 
     Attributes:
         frame_index: Which frame it shows.
@@ -106,12 +106,12 @@ class VideoPacket:
 
 
 class Encoder(Protocol):
-    """Codes the pictures of one camera, in order."""
+    """Codes the images of one camera, in order."""
 
     settings: VideoSettings
 
     def encode(self, picture: Rgb) -> list[bytes]:
-        """Take one picture; return the packets that are ready, oldest first."""
+        """Take one image; return the packets that are ready, oldest first."""
 
     def finish(self) -> list[bytes]:
         """Return the packets that were held back."""
@@ -222,7 +222,7 @@ def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[
     """Decode packets in order, from a keyframe on: (H, W, 3) uint8 RGB, one a packet.
 
     Raises:
-        RecordingError: A packet cannot be decoded, has another size, or pictures are missing at the end.
+        RecordingError: A packet cannot be decoded, has another size, or images are missing at the end.
     """
     shape = (settings.height, settings.width, 3)
     pictures = _decode_jpeg(settings, packets) if settings.codec == "jpeg" else _decode_stream(settings, packets)
@@ -253,7 +253,7 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
     decoder = {"av1": "libdav1d", "h265": "hevc"}.get(settings.codec, settings.codec)
     context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
     context.thread_count = 1
-    # A few bytes can announce pictures of gigabytes; coded pictures are whole blocks of at most 128 pixels.
+    # A few bytes can announce images of gigabytes; encoded images are whole blocks of at most 128 pixels.
     context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
     num_packets = num_pictures = 0
     try:
@@ -274,7 +274,7 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
 
 
 def is_keyframe(codec: str, data: bytes) -> bool:
-    """Whether a coded picture can be decoded without those before it.
+    """Whether an encoded image can be decoded without those before it.
 
     H.264 (ITU-T H.264, table 7-1): an access unit with a slice of type 5 (IDR). H.265 (ITU-T H.265, table 7-1): one
     with a slice of the types 16 to 21 (IRAP). AV1: our encoder puts a sequence header (OBU type 1) in front of

@@ -1,32 +1,101 @@
 """Writes an episode as it happens into NAME.mcap.part, which becomes NAME.mcap when it is complete.
 
 Frames are gathered for one simulated second and then written at once, each stream as a batch, the numbers and the
-pictures in chunks of their own: so a reader of the numbers never decompresses a picture, the recorder costs little,
+images in chunks of their own: so a reader of the numbers never decompresses an image, the recorder costs little,
 and a crash loses at most the last second.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import Event, Frame, JointSample, SimulatedInfo, frame_time_ns
+from demorec.episode.episode import CameraImages, Event, Frame, JointSample, SimulatedInfo, frame_time_ns
+from demorec.episode.scene import SceneCamera
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.cdr import encode
+from demorec.mcap.channels import camera_topic
 from demorec.mcap.file_writer import FileWriter
 from demorec.mcap.frame_check import FrameCheck, check_joint_names
-from demorec.mcap.pictures import CameraRecorder
+from demorec.mcap.lossless import DEPTH_FORMAT, LABELS_FORMAT, encode_depth, encode_labels
+from demorec.mcap.metadata import CameraStreams
+from demorec.mcap.pictures import Message, PictureCoder
 from demorec.mcap.streams import FrameValues, frame_streams, tf_stream
-from demorec.mcap.transforms import FrameTree
+from demorec.mcap.transforms import FrameTree, camera_frame
+
+_OTHERS: dict[str, tuple[str, Callable[[Any], bytes]]] = {
+    "depth": (DEPTH_FORMAT, encode_depth),
+    "segmentation": (LABELS_FORMAT, encode_labels),
+}
+"""Images beside colour: stream -> its format, and how one is encoded."""
+
+
+class CameraRecorder(PictureCoder):
+    """Codes what a camera sees and keeps it until it is written.
+
+    Attributes:
+        streams: What is recorded; depth and segmentation when the first frame has them.
+    """
+
+    def __init__(self, camera: SceneCamera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
+        self._camera = camera
+        super().__init__(camera, video, fps, compiled=True)
+        self.streams = CameraStreams(
+            video=self.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
+        )
+        frame_id = camera_frame(camera.name)
+        self._layouts = {kind: messages.PictureMessages(frame_id, form) for kind, (form, _) in _OTHERS.items()}
+        self._others: list[list[Message]] = []
+
+    def add(self, frame: Frame) -> None:
+        """Take the camera's images of the next frame.
+
+        Raises:
+            RecordingError: An image is missing or of another size.
+        """
+        name = self._camera.name
+        images = frame.images.get(name)
+        if images is None:
+            raise RecordingError(f"Frame {frame.frame_index} has no picture of the camera {name!r}.")
+        self._check(frame.frame_index, "colour", images.color, True)
+        for kind in _OTHERS:
+            self._check(frame.frame_index, kind, getattr(images, kind), getattr(self.streams, kind))
+        self._code(images.color)
+        self.last_ns = frame.time_ns
+        others: list[Message] = []
+        for kind, (_, pack) in _OTHERS.items():
+            if (pixels := getattr(images, kind)) is not None:
+                data = self._layouts[kind].compressed_image(frame.time_ns, pack(pixels))
+                others.append((camera_topic(name, kind), messages.COMPRESSED_IMAGE, data))
+        self._others.append(others)
+
+    def _check(self, frame_index: int, kind: str, pixels: NDArray[Any] | None, is_recorded: bool) -> None:
+        size = (self._camera.height, self._camera.width)
+        if (pixels is not None) != is_recorded or (pixels is not None and pixels.shape[:2] != size):
+            found = "is missing" if pixels is None else f"has shape {pixels.shape}"
+            raise RecordingError(
+                f"The {kind} picture of the camera {self._camera.name!r} at frame {frame_index} {found}: every frame "
+                f"has the same pictures of {size[1]}x{size[0]} pixels."
+            )
+
+    def take_messages(self, time_ns: list[int]) -> Iterator[list[Message]]:
+        """The messages of the oldest frames that are not yet written, one list a frame."""
+        count = len(time_ns)
+        for time, packet, others in zip(time_ns, self._packets[:count], self._others[:count], strict=True):
+            yield self.topics.of(time, packet) + others
+        del self._packets[:count]
+        del self._others[:count]
 
 
 class _Pending(NamedTuple):
-    """A frame that waits to be written, without its pictures.
+    """A frame that waits to be written, without its images.
 
     Attributes:
         time_ns: When.
@@ -49,7 +118,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
     Args:
         path: The file to be made; its folder must exist.
         info: Written first.
-        video: How colour pictures are coded.
+        video: How colour images are encoded.
         overwrite: Whether a recording of that name may be replaced.
 
     Raises:
@@ -81,7 +150,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
 
         Raises:
             RecordingError: Frames out of order, vectors of another length, other objects or cameras than the scene's,
-                numbers that are not finite, pictures missing or of another size, or a full disk.
+                numbers that are not finite, images missing or of another size, or a full disk.
         """
         due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
@@ -107,7 +176,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
             self._write_pending()
 
     def _begin(self, first: Frame | None) -> None:
-        """Write what is said once, as soon as it is known which pictures there are."""
+        """Write what is said once, as soon as it is known which images there are."""
         for camera in self._info.scene.cameras if first is not None else ():
             assert first is not None
             if camera.name not in first.images:
@@ -123,7 +192,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
         self._file.flush()
 
     def _write_pending(self) -> None:
-        """Write the frames whose pictures have all left the encoders: numbers first, then pictures."""
+        """Write the frames whose images have all left the encoders: numbers first, then images."""
         num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self.num_frames)
         frames = self._pending[: num_ready - self._num_written]
         if not frames:

@@ -16,7 +16,7 @@ from demorec.core.geometry import Array
 from demorec.episode.episode import Action, Frame, SimulatedInfo, SuccessCheck
 from demorec.episode.features import ACTION, STATE, ActionKind
 from demorec.mcap import SimulatedRecording
-from demorec.mcap.frames import frames_of
+from demorec.mcap.recording import frames_of
 from demorec.mcap.streams import action_at
 
 

@@ -25,7 +25,7 @@ from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.episode.episode import Outcome
 from demorec.episode.external import EpisodeInfo, Origin, SourceFile, Vector
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.episode.validity import find_problems
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
@@ -186,7 +186,7 @@ class _Plan:
                 origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
                 versions={"demorec": version("demorec"), "av": version("av")},
             )
-            if wrong := what_is_wrong(self.info):
+            if wrong := find_problems(self.info):
                 raise Hdf5FitError("; ".join(wrong))
             self.num_frames, self.has_last = episode.num_frames, episode.has_last
             self.success = success_of(file, place, mapping, episode.num_rows)

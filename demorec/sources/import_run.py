@@ -18,8 +18,8 @@ import numpy as np
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.episode.external import EpisodeInfo, Origin, SourceFile
-from demorec.mcap.external.frame_check import MAX_STAMP_NS, MAX_SUBTASK
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.episode.validity import find_problems
+from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.video import size_problem
 from demorec.robots.urdf import Urdf
@@ -201,7 +201,7 @@ class _Import:
 
     def _problems(self, episode: PlannedEpisode) -> Iterator[str]:
         """What no recording can hold, found before anything of the bag is written."""
-        yield from what_is_wrong(episode.info)
+        yield from find_problems(episode.info)
         for name, plan in episode.plans.items():
             if not plan.kept and (problem := size_problem(self.video, plan.head.width, plan.head.height)):
                 yield f"camera {name}: {problem}"

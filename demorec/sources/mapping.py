@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from demorec.core.plain import digest
 from demorec.core.registry import nearest_match
-from demorec.mcap.external.validity import MAX_CAMERAS, MAX_FEATURES
+from demorec.episode.validity import MAX_CAMERAS, MAX_FEATURES
 
 SourceKind = Literal["bag", "hdf5"]
 Unit = Literal["", "rad", "degree", "percent", "m", "mm"]

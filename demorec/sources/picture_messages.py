@@ -17,7 +17,7 @@ from PIL import Image, UnidentifiedImageError
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import in_words
-from demorec.mcap.depth import decode_millimetres
+from demorec.mcap.lossless import decode_millimetres
 from demorec.mcap.video import is_keyframe
 from demorec.sources.fields import FieldError, picture_bytes, whole
 from demorec.sources.ros_types import Values

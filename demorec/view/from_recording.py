@@ -17,7 +17,7 @@ from demorec.episode.episode import SimulatedColumns
 from demorec.episode.external import NO_PICTURE, Columns, EpisodeInfo
 from demorec.mcap import AnyRecording, Recording, SimulatedRecording, open_recording
 from demorec.mcap.channels import description_topic
-from demorec.mcap.external.transforms import JointPositions
+from demorec.mcap.transforms import JointPositions
 from demorec.runs.run_file import EPISODES, FAILED
 from demorec.view.episode import Curves, PlayedEpisode, Video, millimetres, timed
 

@@ -22,7 +22,7 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.depth import quantised
 from demorec.mcap import Recording
-from demorec.mcap.depth import encode_millimetres
+from demorec.mcap.lossless import encode_millimetres
 from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.sources import find_episodes
 

@@ -333,7 +333,7 @@ def world_from(frame: str, tree: dict[str, tuple[str, np.ndarray[Any, Any]]]) ->
 
 def test_segment_names_are_pybullets_links() -> None:
     pybullet = pytest.importorskip("pybullet")
-    from demorec.mcap.labels import segment_names
+    from demorec.mcap.lossless import segment_names
 
     info, _, _ = make_episode(num_frames=1)
     names = dict(segment_names(info))

@@ -15,6 +15,7 @@ from support.mcap import sealed
 
 from demorec.episode.episode import Event
 from demorec.mcap import channels, messages
+from demorec.mcap.pictures import pixel_statistics, read_pixel_statistics
 
 Edit = Callable[[Message], list[Message]]
 INFO = channels.camera_topic("front", "camera_info")
@@ -110,8 +111,8 @@ def counted_twice(m: Message) -> list[Message]:
     """The histogram of twice as many pictures."""
     if m[0] != channels.camera_topic("front", "histogram"):
         return [m]
-    told = messages.read_pixel_statistics(m[2])
-    return [(m[0], m[1], messages.pixel_statistics(replace(told, num_images=2 * told.num_images)), m[3])]
+    told = read_pixel_statistics(m[2])
+    return [(m[0], m[1], pixel_statistics(replace(told, num_images=2 * told.num_images)), m[3])]
 
 
 def event_at(change: Callable[[Event], list[Event]]) -> Edit:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from demorec.mcap.pixels import PixelCounter
+from demorec.mcap.pictures import PixelCounter
 
 
 @pytest.mark.parametrize("compiled", [False, True])

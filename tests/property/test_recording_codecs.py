@@ -22,12 +22,10 @@ from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
 from demorec.mcap.cdr import CdrReader, Slot, layout
-from demorec.mcap.depth import decode_depth, encode_depth
-from demorec.mcap.description import body_description, robot_description
-from demorec.mcap.labels import LabelDecoder, decode_labels, encode_labels
+from demorec.mcap.description import Primitive, body_description, fit_primitives, robot_description
+from demorec.mcap.lossless import LabelDecoder, decode_depth, decode_labels, encode_depth, encode_labels
 from demorec.mcap.messages import JOINT_STATE
 from demorec.mcap.ros2 import DEFINITIONS
-from demorec.mcap.shapes import Primitive, fit_primitives
 from demorec.robots.assets import asset_path
 
 pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)

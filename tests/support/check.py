@@ -24,8 +24,8 @@ from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepar
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
-from demorec.mcap.frames import decoded_images, frames_of
 from demorec.mcap.part_file import PartFile
+from demorec.mcap.recording import decoded_images, frames_of
 from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 from support.mcap import metadata_of
 

@@ -207,9 +207,9 @@ def test_a_run_is_told_and_checked(collected_run: Path, capsys: pytest.CaptureFi
     assert (code, "2 (2 success)" in told, "stack the cups" in told) == (0, True, True)
     code, told, _ = run(capsys, "info", collected_run / "episodes" / "episode_000001.mcap", "--json")
     plain = json.loads(told)
-    assert (plain["kind"], plain["frames"], plain["robot"]) == ("collected recording", 20, "two_joints")
+    assert (plain["kind"], plain["frames"], plain["robot"]) == ("external recording", 20, "two_joints")
     code, told, _ = run(capsys, "info", collected_run / "episodes")
-    assert (code, told.count("(collected)")) == (0, 2)
+    assert (code, told.count("(external)")) == (0, 2)
 
 
 def test_a_run_of_other_files_is_a_failure(collected_run: Path, tmp_path: Path) -> None:

@@ -34,9 +34,9 @@ from demorec.episode.external import (
     SampledFrame,
     SourceFile,
 )
+from demorec.episode.validity import find_problems
 from demorec.mcap import EpisodeWriter, Recording, SimulatedRecording, recover
-from demorec.mcap.external.transforms import JointPositions
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.mcap.transforms import JointPositions
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 45, 100])
@@ -237,7 +237,7 @@ def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str,
 
 
 def test_a_good_description_has_nothing_wrong() -> None:
-    assert what_is_wrong(make_external().info) == []
+    assert find_problems(make_external().info) == []
 
 
 def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.episode.external import NO_PICTURE, Camera, Feature
 from demorec.mcap import Recording
-from demorec.mcap.external.writer import EpisodeWriter
+from demorec.mcap.external_writer import EpisodeWriter
 from demorec.mcap.recorder.encoder import Encoder
 from demorec.robots.panda import PANDA
 from demorec.runs.external import load_external_run

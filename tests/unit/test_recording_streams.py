@@ -16,7 +16,7 @@ from support.recording import make_episode, write_episode
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import FORMAT_VERSION, Frame, Outcome, SimulatedColumns, SimulatedInfo
 from demorec.mcap import SimulatedRecording, SimulatedWriter, recover
-from demorec.mcap.frames import frames_of
+from demorec.mcap.recording import frames_of
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.mcap.streams import FrameValues, frame_streams, merged_columns
 

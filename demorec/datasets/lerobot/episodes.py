@@ -39,7 +39,7 @@ from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages, codec_of
 from demorec.episode.episode import Outcome, frame_time_ns
 from demorec.episode.external import Camera, Columns, EpisodeInfo, Feature, Kept, Origin
 from demorec.episode.features import DEPTH_SUFFIX, IMAGE_PREFIX, STATE
-from demorec.mcap.external.frame_check import MAX_SUBTASK
+from demorec.mcap.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
 _SUCCESS, _EPISODE = "next.success", "episode_index"

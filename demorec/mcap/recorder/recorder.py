@@ -26,9 +26,9 @@ from demorec.episode.external import (
     Sample,
     SampledFrame,
 )
+from demorec.episode.validity import find_problems
 from demorec.mcap import EpisodeWriter
-from demorec.mcap.external.frame_check import SampledFrameCheck
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.mcap.frame_check import SampledFrameCheck
 from demorec.mcap.recorder.encoder import Buffers, Encoder, WaitingImages, WhenFull
 from demorec.mcap.recorder.vectors import (
     NamedVectors,
@@ -291,7 +291,7 @@ class Recorder(Closing):
         """Refuse at once what no first frame could make good."""
         placeholder = Feature(name="observation.state", names=("0",))
         asked = self._info(self._features or (placeholder,), 0, self._task or "placeholder")
-        wrong = what_is_wrong(asked)
+        wrong = find_problems(asked)
         sizes = [size_problem(self._video, camera.width, camera.height) for camera in self._cameras]
         wrong += list(filter(None, sizes))
         if self.when_full not in get_args(WhenFull):
@@ -341,7 +341,7 @@ class Recorder(Closing):
     def described(self, info: EpisodeInfo, vectors: NamedVectors) -> EpisodeInfo:
         """An episode whose first frame has these vectors; ConfigError when the run has episodes of another kind."""
         info = replace(info, features=self._features or features_of(vectors, self._robot))
-        if wrong := what_is_wrong(info):
+        if wrong := find_problems(info):
             raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
         self._folder.check_fits(info)
         return info

@@ -18,7 +18,7 @@ from demorec.core.plain import parse_json
 from demorec.episode.episode import SimulatedInfo
 from demorec.mcap.channels import camera_topic
 from demorec.mcap.container import Container
-from demorec.mcap.fields import Value, message_fields
+from demorec.mcap.messages import Value, message_fields
 from demorec.mcap.metadata import EPISODE
 from demorec.replay.deep.difference import Difference, Differences
 

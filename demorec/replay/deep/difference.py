@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from demorec.mcap.fields import Value
+from demorec.mcap.messages import Value
 
 _SHOWN = reprlib.Repr(maxstring=80, maxother=80)
 

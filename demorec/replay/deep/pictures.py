@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.mcap import SimulatedRecording
-from demorec.mcap.depth import decode_depth
-from demorec.mcap.fields import message_fields
-from demorec.mcap.labels import decode_labels
+from demorec.mcap.lossless import decode_depth, decode_labels
+from demorec.mcap.messages import message_fields
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld

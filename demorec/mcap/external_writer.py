@@ -1,7 +1,7 @@
-"""Writes a collected episode as it comes into NAME.mcap.part, which becomes NAME.mcap when it is complete.
+"""Writes an external episode as it comes into NAME.mcap.part, which becomes NAME.mcap when it is complete.
 
-As in `demorec.mcap.writer`, a second is gathered and written at once. The pictures of it go in front of the frames
-that hold them, so that whatever a crash leaves of the frames has its pictures.
+As in `demorec.mcap.writer`, a second is gathered and written at once. The images of it go in front of the frames
+that hold them, so that whatever a crash leaves of the frames has its images.
 """
 
 from __future__ import annotations
@@ -15,25 +15,23 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.external import NO_PICTURE, Camera, EpisodeInfo, SampledFrame
-from demorec.mcap import messages
+from demorec.episode.validity import find_problems
+from demorec.mcap import messages, metadata
 from demorec.mcap.cdr import encode
 from demorec.mcap.channels import TF, TF_STATIC, camera_topic, description_topic
-from demorec.mcap.depth import encode_distances
-from demorec.mcap.external import metadata
-from demorec.mcap.external.frame_check import SampledFrameCheck
-from demorec.mcap.external.streams import FRAMES, SUBTASK, feature_streams, frames_layout
-from demorec.mcap.external.transforms import ExternalTree
-from demorec.mcap.external.validity import what_is_wrong
 from demorec.mcap.file_writer import FileWriter
+from demorec.mcap.frame_check import SampledFrameCheck
+from demorec.mcap.lossless import encode_distances
 from demorec.mcap.metadata import EXTERNAL
 from demorec.mcap.pictures import PictureCoder
-from demorec.mcap.transforms import camera_frame
+from demorec.mcap.streams import FRAMES, SUBTASK, feature_streams, frames_layout
+from demorec.mcap.transforms import ExternalTree, camera_frame
 
 _SECOND_NS = 1_000_000_000
 
 
 class _Pictures(PictureCoder):
-    """The pictures of one camera on their way into the file."""
+    """The images of one camera on their way into the file."""
 
     def __init__(self, camera: Camera, video: VideoConfig, fps: int) -> None:
         super().__init__(camera, video, fps)
@@ -45,7 +43,7 @@ class _Pictures(PictureCoder):
         return self.num_ready - len(self._packets)
 
     def add(self, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
-        """Take the next picture; return its number."""
+        """Take the next image; return its number."""
         number = self.num_taken + len(self._stamps)
         self._stamps.append(stamp_ns)
         self.last_ns = stamp_ns
@@ -58,7 +56,7 @@ class _Pictures(PictureCoder):
         return number
 
     def take(self) -> list[tuple[int, bytes]]:
-        """Stamp and bytes of the pictures that have left the encoder, each once."""
+        """Stamp and bytes of the images that have left the encoder, each once."""
         packets, self._packets = self._packets, []
         taken = list(zip(self._stamps, packets, strict=False))
         del self._stamps[: len(packets)]
@@ -66,14 +64,14 @@ class _Pictures(PictureCoder):
 
 
 class EpisodeWriter(FileWriter[_Pictures]):
-    """Context manager that writes one collected episode; left without `finish`, NAME.mcap.part stays for `recover`.
+    """Context manager that writes one external episode; left without `finish`, NAME.mcap.part stays for `recover`.
 
     Frames must not be changed after they were given.
 
     Args:
         path: The file to be made; its folder must exist.
         info: Written first.
-        video: How pictures are coded that come as pixels.
+        video: How images are encoded that come as pixels.
         overwrite: Whether a recording of that name may be replaced.
         begins: Whether all of `info` is known. Else only file and encoders are opened, and `begin` must follow.
 
@@ -113,7 +111,7 @@ class EpisodeWriter(FileWriter[_Pictures]):
         self._write_description()
 
     def _describe(self, info: EpisodeInfo) -> None:
-        if wrong := what_is_wrong(info):
+        if wrong := find_problems(info):
             raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
         self._info = info
         self._check = SampledFrameCheck(info)
@@ -144,12 +142,12 @@ class EpisodeWriter(FileWriter[_Pictures]):
             raise
 
     def picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
-        """Add the next picture of a camera, and return its number, by which frames hold it.
+        """Add the next image of a camera, and return its number, by which frames hold it.
 
         Args:
             camera: One of the episode's.
             stamp_ns: When it was taken, by the camera's clock; later than the one before.
-            data: (H, W, 3) uint8 RGB; for a camera whose pictures are kept an access unit (H.264 and H.265 with start
+            data: (H, W, 3) uint8 RGB; for a camera whose images are kept an access unit (H.264 and H.265 with start
                 codes), a temporal unit (AV1) or a JPEG file, which stays as it is; for a depth camera (H, W) uint16
                 millimetres or float32 metres.
 
@@ -165,7 +163,7 @@ class EpisodeWriter(FileWriter[_Pictures]):
 
         Raises:
             RecordingError: Features missing or unknown, of another length or type, numbers that are not finite, stamps
-                that go backwards, a picture that is not there, or a full disk.
+                that go backwards, an image that is not there, or a full disk.
         """
         self._check.check_frame(frame)
         self._check.note_frame(frame)
@@ -211,7 +209,7 @@ class EpisodeWriter(FileWriter[_Pictures]):
         del self._pending[: len(frames)]
 
     def _count_ready(self) -> int:
-        """Of the pending frames, how many have all their pictures written: an encoder may hold some back."""
+        """Of the pending frames, how many have all their images written: an encoder may hold some back."""
         for index, frame in enumerate(self._pending):
             if any(number >= self._cameras[name].num_taken for name, number in frame.pictures.items()):
                 return index

@@ -1,10 +1,10 @@
-"""Reads the recording of a collected episode: numbers as columns, pictures as packets."""
+"""Reads the recording of an external episode: numbers as columns, images as packets."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,21 +13,16 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.episode.external import DEPTH_UNITS, NO_PICTURE, Columns, EpisodeInfo
-from demorec.mcap import messages
+from demorec.episode.validity import find_problems
+from demorec.mcap import messages, metadata
 from demorec.mcap.channels import description_topic, video_topic
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.depth import decode_distances
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.external import metadata
-from demorec.mcap.external.streams import FRAMES, SUBTASK, feature_streams, frames_layout
-from demorec.mcap.external.validity import what_is_wrong
+from demorec.mcap.lossless import decode_distances
 from demorec.mcap.metadata import EXTERNAL
-from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, is_keyframe
-
-_READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
-"""Codec -> what takes a packet out of its message, where that is no CompressedImage."""
-
+from demorec.mcap.streams import FRAMES, SUBTASK, feature_streams, frames_layout
+from demorec.mcap.video import Rgb, VideoSettings
 
 _TABLE_BYTES = 1 << 20
 """Of chunks whose numbers are taken out together: taking out takes several times as much memory as they have."""
@@ -44,7 +39,7 @@ class _Table:
     def __init__(self, length: int, decode: Callable[[NDArray[np.uint8]], NDArray[Any]]) -> None:
         self._length, self._decode = length, decode
         self._times: list[NDArray[np.int64]] = []
-        self._values = [decode(np.empty((0, length), np.uint8))]  # tells how many there are in a row
+        self._values = [decode(np.empty((0, length), np.uint8))]  # states how many there are in a row
 
     def add(self, block: Block) -> None:
         """Take messages; ValueError for those of another layout."""
@@ -57,7 +52,7 @@ class _Table:
 
 
 class Recording(EpisodeFile[VideoSettings]):
-    """What one file holds of a collected episode; a context manager.
+    """What one file holds of an external episode; a context manager.
 
     Attributes:
         path: Of the file.
@@ -66,24 +61,20 @@ class Recording(EpisodeFile[VideoSettings]):
         num_frames: Length.
 
     Raises:
-        RecordingError: No recording of a collected episode, cut off, damaged, or of an unknown format version; so do
+        RecordingError: No recording of an external episode, cut off, damaged, or of an unknown format version; so do
             all methods.
     """
 
     _record = EXTERNAL
     info: EpisodeInfo
 
-    def _read_metadata(self) -> None:
-        found = self._container.metadata(EXTERNAL)
-        if found is None:
-            raise RecordingError(f"The file holds no collected episode: {self.path}")
-        try:
-            info, self._cameras, urdf_sha256 = metadata.read_external_metadata(found)
-            self._read_end(FRAMES)
-            self.info = self._with_urdf(info, urdf_sha256)
-        except RecordingError as error:
-            text = str(error).removesuffix(f": {self.path}")
-            raise RecordingError(f"{text}: {self.path}") from error
+    def _other_file(self) -> RecordingError:
+        return RecordingError(f"The file holds no external episode: {self.path}")
+
+    def _read_metadata(self, found: Mapping[str, str]) -> None:
+        info, self._cameras, urdf_sha256 = metadata.read_external_metadata(found)
+        self._read_end(FRAMES)
+        self.info = self._with_urdf(info, urdf_sha256)
 
     def _with_urdf(self, info: EpisodeInfo, sha256: str) -> EpisodeInfo:
         if not sha256:
@@ -94,7 +85,7 @@ class Recording(EpisodeFile[VideoSettings]):
         if metadata.urdf_sha256(urdf) != sha256:
             raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
         described = dataclasses.replace(info, urdf=urdf)
-        if wrong := what_is_wrong(described):
+        if wrong := find_problems(described):
             raise RecordingError(f"The URDF of the recording does not fit its metadata ({wrong[0]})")
         return described
 
@@ -128,11 +119,11 @@ class Recording(EpisodeFile[VideoSettings]):
         return ()
 
     def video_settings(self, camera: str) -> VideoSettings:
-        """How the pictures of a camera were coded."""
+        """How the images of a camera were encoded."""
         return self._camera(camera)
 
     def columns(self) -> Columns:
-        """All numbers, one row a frame, to the bit as they were written, and which pictures the frames hold."""
+        """All numbers, one row a frame, bit-exact as they were written, and which images the frames hold."""
         return self._columns
 
     @cached_property
@@ -184,27 +175,20 @@ class Recording(EpisodeFile[VideoSettings]):
         return tuple(found)
 
     def _stamps(self, topic: str) -> NDArray[np.int64]:
-        """(N,) of the messages of a topic, one chunk of them in memory at a time: pictures may take gigabytes."""
+        """(N,) of the messages of a topic, one chunk of them in memory at a time: images may take gigabytes."""
         return np.fromiter((message.time_ns for message in self._container.messages((topic,))), dtype=np.int64)
 
     def _picture_topic(self, camera: str) -> str:
         return video_topic(camera, self.video_settings(camera).codec)
 
-    def packets(self, camera: str) -> Iterator[VideoPacket]:
-        """The coded pictures of a camera in order; `frame_index` is their number, by which frames hold them."""
-        codec = self.video_settings(camera).codec
-        read = _READERS.get(codec, messages.read_compressed_image)
-        for number, (time_ns, data) in enumerate(self._read(self._picture_topic(camera), read)):
-            yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
-
     def images(self, camera: str) -> Iterator[Rgb]:
-        """The decoded pictures of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
+        """The decoded images of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
         if camera in self.depth_cameras:
             raise RecordingError(f"The camera {camera!r} measures distances and sees no colours: {self.path}")
         return super().images(camera)
 
     def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
-        """The pictures of a depth camera in order, as they came: (H, W) uint16 millimetres or float32 metres."""
+        """The images of a depth camera in order, as they came: (H, W) uint16 millimetres or float32 metres."""
         if camera not in self.depth_cameras:
             raise RecordingError(f"The recording has no depth camera {camera!r}: {self.path}")
         settings = self.video_settings(camera)
@@ -219,7 +203,7 @@ class Recording(EpisodeFile[VideoSettings]):
             yield values.astype(np.float32) / unit
 
     def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
-        """camera -> all its coded pictures, in memory together."""
+        """camera -> all its encoded images, in memory together."""
         topics = {camera: self._picture_topic(camera) for camera in cameras}
         blocks = self._container.blocks(tuple(topics.values()))
         with damage_as_recording_error(self.path):
@@ -229,7 +213,7 @@ class Recording(EpisodeFile[VideoSettings]):
             }
 
     def image(self, camera: str, frame: int) -> Rgb | None:
-        """The decoded picture that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
+        """The decoded image that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
 
         Raises:
             IndexError: There is no such frame; negative ones count from the end.
@@ -247,7 +231,7 @@ class Recording(EpisodeFile[VideoSettings]):
         return self._images(camera, held[list(frames)].tolist())
 
     def digest(self) -> str:
-        """SHA-256 (hex) of the content: metadata, numbers, stamps, coded pictures; not of what versions wrote it."""
+        """SHA-256 (hex) of the content: metadata, numbers, stamps, encoded images; not of what versions wrote it."""
         result = self._digest_of_description()
         columns = self.columns()
         result.update(columns.time_ns.tobytes())
