@@ -152,10 +152,10 @@ def _camera(summary: RecordingSummary, camera: CameraSummary) -> Iterator[str]:
         yield f"quality {video.jpeg_quality}" if video.codec == "jpeg" else f"GOP {video.gop}, crf {video.crf}"
         yield from (name for name, there in (("depth", camera.depth), ("segmentation", camera.segmentation)) if there)
         return
-    yield f"{camera.pictures} pictures"
+    yield counted(camera.pictures, "image")
     yield f"at most {1000 * camera.oldest:.3g} ms old"
     if camera.frames_without:
-        yield f"{camera.frames_without} frames without"
+        yield f"{counted(camera.frames_without, 'frame')} without"
     if camera.source:
         yield camera.source
 

@@ -157,7 +157,7 @@ class Recording(EpisodeFile[VideoSettings]):
             count = len(picture_stamps[name])
             if len(numbers) and not NO_PICTURE <= int(numbers.min()) <= int(numbers.max()) < count:
                 raise RecordingError(
-                    f"A frame holds a picture of the camera {name!r} that is none of its {count}: {self.path}"
+                    f"A frame holds an image of the camera {name!r} that is none of its {count}: {self.path}"
                 )
         return Columns(
             time_ns=time_ns, features=features, stamps=stamps, pictures=pictures, picture_stamps=picture_stamps

@@ -222,7 +222,7 @@ class EpisodeWriter(FileWriter[_Pictures]):
     def _write_rest(self) -> None:
         self.flush()
         if self._pending:
-            raise RecordingError(f"The video encoder kept pictures of the last {len(self._pending)} frames to itself.")
+            raise RecordingError(f"The video encoder kept images of the last {len(self._pending)} frames to itself.")
 
     def discard(self) -> None:
         """Give the episode up and remove what was written of it."""

@@ -69,7 +69,7 @@ class FrameCheck:
         if seen.object_poses.keys() != self._objects:
             raise _other_names(frame, "poses of the objects", seen.object_poses, self._objects)
         if not frame.images.keys() <= self._cameras:
-            raise _other_names(frame, "pictures of the cameras", frame.images, self._cameras)
+            raise _other_names(frame, "images of the cameras", frame.images, self._cameras)
         poses = [seen.base_from_tcp, action.base_from_tcp_target, command.base_from_tcp_target]
         poses += seen.object_poses.values()
         poses += [images.world_from_camera for images in frame.images.values()]
@@ -113,7 +113,7 @@ def _other_names(frame: Frame, what: str, found: Iterable[str], known: Iterable[
 def _refuse_not_finite(frame: Frame) -> None:
     owners: dict[str, Any] = {"observation": frame.observation, "action": frame.action, "command": frame.command}
     owners |= {f"joint sample at {sample.time_ns} ns": sample for sample in frame.joint_samples}
-    owners |= {f"picture of {name}": images for name, images in frame.images.items()}
+    owners |= {f"image of {name}": images for name, images in frame.images.items()}
     for owner, value in owners.items():
         for field in fields(value):
             if not _is_finite(getattr(value, field.name)):
@@ -155,7 +155,7 @@ class SampledFrameCheck:
                 f"{', '.join(self._cameras) or 'none'}."
             )
         _check_picture(known, data)
-        self._check_stamp(f"the picture of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
+        self._check_stamp(f"the image of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
 
     def note_picture(self, camera: str, stamp_ns: int) -> None:
         """The camera's next image was taken."""
@@ -182,9 +182,7 @@ class SampledFrameCheck:
         for camera, number in frame.pictures.items():
             if camera not in self._cameras or not 0 <= number < self._num_pictures[camera]:
                 count = self._num_pictures.get(camera, 0)
-                raise RecordingError(
-                    f"The camera {camera!r} has no picture {number} for {what}, it has {count} so far."
-                )
+                raise RecordingError(f"The camera {camera!r} has no image {number} for {what}, it has {count} so far.")
         if len(frame.subtask) > MAX_SUBTASK or not frame.subtask.isprintable():
             raise RecordingError(f"The subtask of {what} is no single line of at most {MAX_SUBTASK} characters.")
         for name in self._features:
@@ -217,8 +215,7 @@ def _check_picture(camera: Camera, data: NDArray[Any] | bytes) -> None:
     if camera.kept and not camera.is_depth:
         if not isinstance(data, bytes) or not data:
             raise RecordingError(
-                f"The picture of the camera {camera.name!r} is {type(data).__name__}, it must be bytes of "
-                f"{camera.kept}."
+                f"The image of the camera {camera.name!r} is {type(data).__name__}, it must be bytes of {camera.kept}."
             )
         return
     kind = np.dtype(DEPTH_TYPES.get(camera.kept, np.uint8))
@@ -226,7 +223,7 @@ def _check_picture(camera: Camera, data: NDArray[Any] | bytes) -> None:
     if not isinstance(data, np.ndarray) or data.dtype != kind or data.shape != shape:
         found = f"{data.dtype} of shape {data.shape}" if isinstance(data, np.ndarray) else type(data).__name__
         raise RecordingError(
-            f"The picture of the camera {camera.name!r} is {found}, it must be {kind} of shape {shape}: height, "
+            f"The image of the camera {camera.name!r} is {found}, it must be {kind} of shape {shape}: height, "
             f"width{'' if camera.is_depth else ', RGB'}."
         )
 

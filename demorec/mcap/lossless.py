@@ -63,14 +63,14 @@ def decode_millimetres(data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]
     from demorec.mcap import kernels
 
     if len(data) < _RVL_HEAD.size or (len(data) - _RVL_HEAD.size) % 4:
-        raise ValueError(f"a depth picture of {len(data)} bytes")
+        raise ValueError(f"a depth image of {len(data)} bytes")
     _, _, _, width, height = _RVL_HEAD.unpack_from(data)
     if (height, width) != size:
-        raise ValueError(f"a depth picture of {width}x{height} pixels, expected {size[1]}x{size[0]}")
+        raise ValueError(f"a depth image of {width}x{height} pixels, expected {size[1]}x{size[0]}")
     words = np.frombuffer(data, dtype="<u4", offset=_RVL_HEAD.size).astype(np.uint32)
     flat = np.zeros(width * height, dtype=np.uint16)
     if not kernels.rvl_decode(words, flat):
-        raise ValueError("a depth picture whose runs do not fit its size")
+        raise ValueError("a depth image whose runs do not fit its size")
     return flat.reshape(height, width)
 
 
@@ -84,7 +84,7 @@ def decode_distances(encoding: str, data: bytes, size: tuple[int, int]) -> NDArr
     if encoding == "16UC1":
         return decode_millimetres(data, size)
     if len(data) != 4 * size[0] * size[1]:
-        raise ValueError(f"a depth picture of {len(data)} bytes, expected {size[1]}x{size[0]} pixels of 4")
+        raise ValueError(f"a depth image of {len(data)} bytes, expected {size[1]}x{size[0]} pixels of 4")
     return np.frombuffer(data, "<f4").astype(np.float32).reshape(size)
 
 
@@ -158,20 +158,20 @@ class LabelDecoder:
     def labels(self, data: bytes) -> NDArray[np.uint16]:
         """(H, W) the labels as they are in the file, of which half of the time is saved; ValueError as of `decode`."""
         if len(data) < _PNG_HEAD.size:
-            raise ValueError("a segmentation picture that is cut off")
+            raise ValueError("a segmentation image that is cut off")
         signature, width, height, depth, color = _PNG_HEAD.unpack_from(data)
         if signature != _PNG_SIGNATURE or (depth, color) != _GREY_16:
-            raise ValueError("a segmentation picture that is no PNG file of 16-bit numbers")
+            raise ValueError("a segmentation image that is no PNG file of 16-bit numbers")
         if (height, width) != self._size:  # before anything is unpacked
-            raise ValueError(f"a segmentation picture of {width}x{height} pixels")
+            raise ValueError(f"a segmentation image of {width}x{height} pixels")
         packet = av.Packet(data)
         packet.is_keyframe = True  # else FFmpeg takes it for the difference to the image before
         try:
             frames = self._decoder.decode(packet)
         except av.FFmpegError as error:
-            raise ValueError("a segmentation picture that is damaged") from error
+            raise ValueError("a segmentation image that is damaged") from error
         if len(frames) != 1 or frames[0].format.name != "gray16be" or (frames[0].height, frames[0].width) != self._size:
-            raise ValueError("a segmentation picture that is damaged")
+            raise ValueError("a segmentation image that is damaged")
         lines = np.frombuffer(frames[0].planes[0], dtype=">u2").reshape(height, -1)  # FFmpeg may pad lines
         return lines[:, :width].astype(np.uint16)
 

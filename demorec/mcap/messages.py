@@ -118,7 +118,7 @@ def read_compressed_image(data: bytes) -> bytes:
     (length,) = _U32.unpack_from(data, start - 4)
     picture = data[start : start + length]
     if len(picture) != length:
-        raise ValueError("a picture that is cut off")
+        raise ValueError("an image that is cut off")
     return picture
 
 
@@ -147,7 +147,7 @@ def coded_pictures(block: Block, codec: str) -> Block:
         return _one_by_one(block, read_compressed_image)
     lengths = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
     if (lengths > block.lengths - start).any():
-        raise ValueError("a picture that is cut off")
+        raise ValueError("an image that is cut off")
     return replace(block, starts=block.starts + start, lengths=lengths)
 
 
@@ -173,7 +173,7 @@ def read_protobuf_video(data: bytes) -> bytes:
     for name, value in protobuf_fields(data):
         if name == "data":
             return value
-    raise ValueError("a video message without a picture")
+    raise ValueError("a video message without an image")
 
 
 _VIDEO_FIELDS = {1: "timestamp", 2: "frame_id", 3: "data", 4: "format"}

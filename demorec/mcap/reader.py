@@ -168,11 +168,11 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
             if len(wrong) or len(block) > self.num_frames:
                 index = int(wrong[0]) if len(wrong) else self.num_frames
                 raise RecordingError(
-                    f"Picture {index} of {topic} is at {block.time_ns[index]} ns, not at its frame's time: {self.path}"
+                    f"Image {index} of {topic} is at {block.time_ns[index]} ns, not at its frame's time: {self.path}"
                 )
             if len(block) != self.num_frames:
                 raise RecordingError(
-                    f"The recording has {self.num_frames} frames, but {len(block)} pictures of camera {camera}: "
+                    f"The recording has {self.num_frames} frames, but {len(block)} images of camera {camera}: "
                     f"{self.path}"
                 )
             with damage_as_recording_error(self.path):
@@ -182,7 +182,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """Depth images, (H, W) float32 metres in steps of a millimetre, 0 where nothing was hit, one a frame."""
         if not self.has_depth(camera):
-            raise RecordingError(f"The recording has no depth pictures of the camera {camera!r}: {self.path}")
+            raise RecordingError(f"The recording has no depth images of the camera {camera!r}: {self.path}")
         topic, size = channels.camera_topic(camera, "depth"), self._size(camera)
         for _, depth in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size)):
             yield depth
@@ -211,7 +211,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
                 block, first = blocks[topic], counts[camera]
                 counts[camera] += len(block)
                 if not np.array_equal(block.time_ns, times[first : counts[camera]]):
-                    raise RecordingError(f"Pictures of {topic} are not at the times of the frames: {self.path}")
+                    raise RecordingError(f"Images of {topic} are not at the times of the frames: {self.path}")
                 chosen = np.array([index for index in range(len(block)) if first + index in frames], dtype=np.intp)
                 for index, message in zip(chosen.tolist(), block.select(chosen).messages(), strict=True):
                     with damage_as_recording_error(self.path):
@@ -222,7 +222,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
 
     def _segmentation_topic(self, camera: str) -> str:
         if not self.has_segmentation(camera):
-            raise RecordingError(f"The recording has no segmentation pictures of the camera {camera!r}: {self.path}")
+            raise RecordingError(f"The recording has no segmentation images of the camera {camera!r}: {self.path}")
         return channels.camera_topic(camera, "segmentation")
 
     def _size(self, camera: str) -> tuple[int, int]:
@@ -251,7 +251,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         for time_ns, picture in self._read(topic, read):
             if count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps):
                 raise RecordingError(
-                    f"Picture {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
+                    f"Image {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
                 )
             yield time_ns, picture
             count += 1
@@ -260,7 +260,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
     def _check_num_pictures(self, topic: str, count: int) -> None:
         if count != self.num_frames:
             raise RecordingError(
-                f"The recording has {self.num_frames} frames, but {count} pictures on {topic}: {self.path}"
+                f"The recording has {self.num_frames} frames, but {count} images on {topic}: {self.path}"
             )
 
     def image(self, camera: str, frame: int) -> Rgb:

@@ -199,7 +199,7 @@ def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
     result = []
     for packet in packets:
         if packet.dts != packet.pts:
-            raise RecordingError(f"The video encoder reordered its pictures (pts {packet.pts}, dts {packet.dts}).")
+            raise RecordingError(f"The video encoder reordered its images (pts {packet.pts}, dts {packet.dts}).")
         result.append(bytes(packet))
     return result
 
@@ -229,7 +229,7 @@ def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[
     for picture in pictures:
         if picture.shape != shape:
             raise RecordingError(
-                f"A picture is {picture.shape[1]}x{picture.shape[0]} pixels where the metadata says "
+                f"An image is {picture.shape[1]}x{picture.shape[0]} pixels where the metadata says "
                 f"{settings.width}x{settings.height}."
             )
         yield picture
@@ -243,10 +243,10 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
                     raise OSError(f"{image.width}x{image.height} pixels")
                 yield np.asarray(image.convert("RGB"))
         except UnidentifiedImageError as error:
-            raise RecordingError(f"The picture of frame {packet.frame_index} is no JPEG.") from error
+            raise RecordingError(f"The image of frame {packet.frame_index} is no JPEG.") from error
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             reason = in_words(error)
-            raise RecordingError(f"The picture of frame {packet.frame_index} is no valid JPEG ({reason}).") from error
+            raise RecordingError(f"The image of frame {packet.frame_index} is no valid JPEG ({reason}).") from error
 
 
 def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
@@ -270,7 +270,7 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
     except (av.FFmpegError, ValueError) as error:
         raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_pictures}.") from error
     if num_pictures != num_packets:
-        raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_pictures} pictures.")
+        raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_pictures} images.")
 
 
 def is_keyframe(codec: str, data: bytes) -> bool:

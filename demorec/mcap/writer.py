@@ -63,7 +63,7 @@ class CameraRecorder(PictureCoder):
         name = self._camera.name
         images = frame.images.get(name)
         if images is None:
-            raise RecordingError(f"Frame {frame.frame_index} has no picture of the camera {name!r}.")
+            raise RecordingError(f"Frame {frame.frame_index} has no image of the camera {name!r}.")
         self._check(frame.frame_index, "colour", images.color, True)
         for kind in _OTHERS:
             self._check(frame.frame_index, kind, getattr(images, kind), getattr(self.streams, kind))
@@ -81,8 +81,8 @@ class CameraRecorder(PictureCoder):
         if (pixels is not None) != is_recorded or (pixels is not None and pixels.shape[:2] != size):
             found = "is missing" if pixels is None else f"has shape {pixels.shape}"
             raise RecordingError(
-                f"The {kind} picture of the camera {self._camera.name!r} at frame {frame_index} {found}: every frame "
-                f"has the same pictures of {size[1]}x{size[0]} pixels."
+                f"The {kind} image of the camera {self._camera.name!r} at frame {frame_index} {found}: every frame "
+                f"has the same images of {size[1]}x{size[0]} pixels."
             )
 
     def take_messages(self, time_ns: list[int]) -> Iterator[list[Message]]:
@@ -180,7 +180,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
         for camera in self._info.scene.cameras if first is not None else ():
             assert first is not None
             if camera.name not in first.images:
-                raise RecordingError(f"Frame 0 has no picture of the camera {camera.name!r}.")
+                raise RecordingError(f"Frame 0 has no image of the camera {camera.name!r}.")
             self._cameras[camera.name] = CameraRecorder(
                 camera, first.images[camera.name], video=self._video, fps=self._info.fps
             )
@@ -251,4 +251,4 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
             self._begin(None)
         self._write_pending()
         if self._pending:
-            raise RecordingError(f"The video encoder kept the last {len(self._pending)} pictures to itself.")
+            raise RecordingError(f"The video encoder kept the last {len(self._pending)} images to itself.")

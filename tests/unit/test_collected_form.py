@@ -188,13 +188,13 @@ BAD: dict[str, tuple[Callable[[EpisodeWriter, SampledFrame], object], str]] = {
     "negative time": (_frame(time_ns=-1), "allowed are 0 to"),
     "float time": (_frame(time_ns=1.5), "must be a whole number of nanoseconds"),
     "feature goes back": (_sample("action", np.zeros(3), 7), "The feature 'action' of frame 1 has the stamp 7 ns"),
-    "no such picture": (_frame(pictures={"top": 9}), "has no picture 9 for frame 1, it has 1 so far"),
-    "no such camera": (_frame(pictures={"front": 0}), "camera 'front' has no picture 0"),
+    "no such picture": (_frame(pictures={"top": 9}), "has no image 9 for frame 1, it has 1 so far"),
+    "no such camera": (_frame(pictures={"front": 0}), "camera 'front' has no image 0"),
     "unknown camera": (_picture("tip", 5, PIXELS), "Unknown camera 'tip'.*'top'"),
     "size": (_picture("top", 2 * 10**18, PIXELS[:-1]), r"uint8 of shape \(47, 64, 3\), it must be uint8 of shape"),
     "float picture": (_picture("top", 2 * 10**18, PIXELS / 255), "is float64 of shape"),
     "bytes for pixels": (_picture("top", 2 * 10**18, b"x"), "is bytes, it must be uint8"),
-    "picture goes back": (_picture("top", 5, PIXELS), "picture of the camera 'top' has the stamp 5 ns, the one before"),
+    "picture goes back": (_picture("top", 5, PIXELS), "image of the camera 'top' has the stamp 5 ns, the one before"),
 }
 
 

@@ -62,7 +62,7 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     ),
     "an unknown camera": (
         lambda f: replace(f, images={**f.images, "top": f.images["front"]}),
-        "pictures of the cameras front, top, the scene has front",
+        "images of the cameras front, top, the scene has front",
     ),
     "no wrench": (
         lambda f: observed(f, wrench=None),
@@ -104,7 +104,7 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: replace(
             f, images={n: replace(i, world_from_camera=pose_of_nan(i.world_from_camera)) for n, i in f.images.items()}
         ),
-        "world_from_camera in its picture of front that is not finite",
+        "world_from_camera in its image of front that is not finite",
     ),
 }
 

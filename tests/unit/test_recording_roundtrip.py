@@ -179,9 +179,9 @@ def test_labels_that_were_read_with_the_coded_pictures_are_not_unpacked_again(
 def test_without_depth_it_says_so(tmp_path: Path) -> None:
     with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
         assert not recording.has_depth("front")
-        with pytest.raises(RecordingError, match="no depth pictures"):
+        with pytest.raises(RecordingError, match="no depth images"):
             next(recording.depth("front"))
-        with pytest.raises(RecordingError, match="no segmentation pictures"):
+        with pytest.raises(RecordingError, match="no segmentation images"):
             next(recording.segmentation("front"))
         with pytest.raises(RecordingError, match=r"no camera 'top', its cameras are front, wrist"):
             next(recording.images("top"))

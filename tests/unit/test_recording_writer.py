@@ -109,16 +109,16 @@ def test_pictures_are_complete(tmp_path: Path) -> None:
     with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
         writer.write(frames[0])
         wrist = frames[1].images["wrist"]
-        with pytest.raises(RecordingError, match="no picture of the camera 'wrist'"):
+        with pytest.raises(RecordingError, match="no image of the camera 'wrist'"):
             writer.write(replace(frames[1], images={"front": frames[1].images["front"]}))
     with SimulatedWriter(tmp_path / "b.mcap", info) as writer:
         writer.write(frames[0])
-        with pytest.raises(RecordingError, match="depth picture of the camera 'wrist' at frame 1 is missing"):
+        with pytest.raises(RecordingError, match="depth image of the camera 'wrist' at frame 1 is missing"):
             writer.write(replace(frames[1], images={**frames[1].images, "wrist": replace(wrist, depth=None)}))
     with SimulatedWriter(tmp_path / "c.mcap", info) as writer:
         writer.write(frames[0])
         small = replace(wrist, color=np.zeros((24, 32, 3), dtype=np.uint8))
-        with pytest.raises(RecordingError, match=r"colour picture .* has shape \(24, 32, 3\).* of 64x48 pixels"):
+        with pytest.raises(RecordingError, match=r"colour image .* has shape \(24, 32, 3\).* of 64x48 pixels"):
             writer.write(replace(frames[1], images={**frames[1].images, "wrist": small}))
 
 
