@@ -57,7 +57,7 @@ _VELOCITY_S = 0.3
 _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
-"""After a new command fingers need so long to arrive, closing at 0.2 m/s from an opening of 0.1 m; a jaw may need longer."""
+"""After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
 _STILL_FRAMES = 19
 """Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
 _FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1

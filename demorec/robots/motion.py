@@ -19,8 +19,8 @@ PEAK_VELOCITY = 1.875
 PEAK_ACCELERATION = 5.774
 
 _ROUNDS, _ROUNDS_WITH_FREEDOM = 5, 20
-"""How often a motion is slowed down at most. Where a joint of an arm of few joints meets its limit, the others take over
-from one step to the next: of such a kink, half the speed takes but half the acceleration, not three quarters of it."""
+"""How often a motion is slowed down at most. Where a joint of an arm of few joints meets its limit, the others take
+over from one step to the next, and at half the speed the acceleration of such a kink is half, not a quarter."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -203,7 +203,7 @@ class RobotSpec:
         arm_joints: Names of the arm's joints, base to flange.
         tcp_link: Link whose frame is the tool centre point: z out of the hand, y along the fingers' motion.
         hand_link: Link that carries the wrist camera and the fingers; the force-torque sensor is where it is mounted.
-        home_q: (n_arm,) rest configuration, rad; where it holds the fingers low, layouts leave the place below them free.
+        home_q: (n_arm,) rest configuration, rad. Layouts of a small arm leave free what its fingers hang over too low.
         position_lower, position_upper: (n_arm,) rad.
         velocity_limit: (n_arm,) rad/s.
         acceleration_limit: (n_arm,) rad/s^2.

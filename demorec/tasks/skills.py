@@ -298,7 +298,8 @@ class Expert:
         yield from self.move(grasp, speed=DESCEND_SPEED, until=lambda: world.pressed_from_above(name))
 
         self.phase = "close"
-        yield from self.set_gripper(self._closed_width, max_seconds=max(1.5, self._stroke_seconds), done=steady_width(world))
+        seconds = max(1.5, self._stroke_seconds)
+        yield from self.set_gripper(self._closed_width, max_seconds=seconds, done=steady_width(world))
         held = self.holds(name)
         if held:
             self.phase = "lift"
