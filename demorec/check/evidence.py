@@ -56,6 +56,7 @@ class Motion:
         ee_pose: (T, 7) of the hand, if there.
         sensors: Name -> (T, n) of what is measured.
         contact: (T,) N, force on the fingers; None where nobody measures it.
+        stroke_s: How long the gripper takes from closed to open, seconds; 0 where it is not known.
     """
 
     where: str
@@ -76,6 +77,7 @@ class Motion:
     ee_pose: Array | None = None
     sensors: Mapping[str, Array] = field(default_factory=dict)
     contact: Array | None = None
+    stroke_s: float = 0.0
 
     @property
     def gripper(self) -> int | None:
@@ -123,6 +125,7 @@ def motion_of_simulated(info: SimulatedInfo, c: SimulatedColumns, urdf: Urdf) ->
         ee_pose=c.base_from_tcp,
         sensors=sensors,
         contact=c.contact_force,
+        stroke_s=robot.gripper.stroke_seconds(),
     )
 
 

@@ -57,7 +57,7 @@ _VELOCITY_S = 0.3
 _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
-"""After a new command the fingers need so long to arrive; they close at 0.2 m/s from an opening of 0.1 m."""
+"""After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
 _STILL_FRAMES = 19
 """Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
 _FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1
@@ -434,11 +434,12 @@ def gripper_follows(subject: Moving) -> Iterator[Found]:
 
 
 def _followed(motion: Motion, place: int, command: Array) -> Found:
-    opening, wait = motion.state[:, place], math.ceil(_SETTLE_S * motion.fps)
+    settle_s = max(_SETTLE_S, motion.stroke_s + 0.1)
+    opening, wait = motion.state[:, place], math.ceil(settle_s * motion.fps)
     span = float(motion.upper[place] - motion.lower[place])
     reach = span if math.isfinite(span) else float(np.ptp(command))
     if len(command) <= wait:
-        return NotMeasured(why=f"an episode is shorter than {_SETTLE_S} s")
+        return NotMeasured(why=f"an episode is shorter than {settle_s:g} s")
     # Of increments and speeds nothing is told: they are small beside the opening, and come back to 0.
     if reach < 0.2 * float(np.ptp(opening)) or reach < 1e-4:
         return NotMeasured(why="the gripper's command is none of its opening, or never changes")

@@ -12,11 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
-from demorec.robots.kinematics import ArmKinematics
+from demorec.robots.kinematics import WHOLE_POSE, ArmKinematics
 
 # Peaks of the quintic time law u^3 (10 - 15 u + 6 u^2) over unit time and distance.
 PEAK_VELOCITY = 1.875
 PEAK_ACCELERATION = 5.774
+
+_ROUNDS, _ROUNDS_WITH_FREEDOM = 5, 20
+"""How often a motion is slowed down at most. Where a joint of an arm of few joints meets its limit, the others take
+over from one step to the next, and at half the speed the acceleration of such a kink is half, not a quarter."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,7 +91,7 @@ def plan_straight(
         PEAK_VELOCITY * angle / (limits.angular_velocity * turn_speed),
         math.sqrt(PEAK_ACCELERATION * angle / limits.angular_acceleration),
     )
-    for _ in range(5):
+    for _ in range(_ROUNDS if arm.freedom == WHOLE_POSE else _ROUNDS_WITH_FREEDOM):
         steps = max(1, math.ceil(seconds / dt))
         path = arm.straight_path(
             start=start,

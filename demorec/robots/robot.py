@@ -49,6 +49,10 @@ class ParallelGripper:
         """Positions (..., n_joints), m, of the finger joints at openings (...), metres."""
         return np.asarray(np.multiply.outer(width, np.full(len(self.joints), 0.5)))
 
+    def stroke_seconds(self) -> float:
+        """How long the fingers take from closed to open, s."""
+        return self.max_width / (len(self.joints) * self.joint_speed)
+
     def width(self, joint_position: Array) -> Array:
         """Openings (...), metres, at positions (..., n_joints), m, of the finger joints."""
         return np.asarray(joint_position.sum(axis=-1))
@@ -135,6 +139,10 @@ class JawGripper:
         position, opening = np.array(self.opening).T
         return np.asarray(np.interp(width, opening, position)[..., np.newaxis])
 
+    def stroke_seconds(self) -> float:
+        """How long the jaw takes from closed to open, s."""
+        return abs(self.opening[-1][0] - self.opening[0][0]) / self.joint_speed
+
     def width(self, joint_position: Array) -> Array:
         """Openings (...), metres, at positions (..., 1), rad."""
         position, opening = self._rising()
@@ -195,7 +203,7 @@ class RobotSpec:
         arm_joints: Names of the arm's joints, base to flange.
         tcp_link: Link whose frame is the tool centre point: z out of the hand, y along the fingers' motion.
         hand_link: Link that carries the wrist camera and the fingers; the force-torque sensor is where it is mounted.
-        home_q: (n_arm,) rest configuration, rad.
+        home_q: (n_arm,) rest configuration, rad. Layouts of a small arm leave free what its fingers hang over too low.
         position_lower, position_upper: (n_arm,) rad.
         velocity_limit: (n_arm,) rad/s.
         acceleration_limit: (n_arm,) rad/s^2.

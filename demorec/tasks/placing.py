@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -14,6 +14,7 @@ from demorec.core.geometry import Pose
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal, Rgba, Scene, Shape
 from demorec.robots.robot import RobotSpec
+from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.furniture import COLORS, cube, robot_at_origin, table_and_floor
@@ -28,6 +29,10 @@ TRAY_FLOOR = 0.004
 """Height of a tray's floor above its lower face, metres (tray.urdf)."""
 MAX_DISTURBANCE = 0.02
 """How far an object that is not to be moved may end from where it was, metres."""
+TALLEST = 0.07
+"""Height, metres, above which no thing on the table reaches."""
+HAND_AND_THING = 0.07
+"""Half the width of a finger and half the diagonal of a thing, metres, with a little air between."""
 
 Layout = tuple[Sequence[Body], Sequence[Goal]]
 """What is on the table, and the goals."""
@@ -74,8 +79,10 @@ class TableTask(PlacingTask):
 
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         """Draw a layout."""
-        bodies, goals = self.layout(sampler)
         scale = robot.task_scale
+        if scale != 1.0:
+            sampler.is_free = _beside_the_hand(robot, joint_spread=sampler.ranges.number("joint_spread"))
+        bodies, goals = self.layout(sampler)
         if scale != 1.0:
             bodies = [_scaled_body(body, scale) for body in bodies]
             goals = [replace(goal, onto_from_goal=_scaled_pose(goal.onto_from_goal, scale)) for goal in goals]
@@ -92,6 +99,30 @@ class TableTask(PlacingTask):
             bases=[scene.body(goal.onto).color_name for goal in scene.goals if goal.onto],
             targets=[body.color_name for body in scene.bodies if body.role == "target"],
         )
+
+
+def _beside_the_hand(robot: RobotSpec, *, joint_spread: float) -> Callable[[tuple[float, float]], bool]:
+    """Whether a thing at a point (x, y) of a layout, before it is scaled, is not where the open hand is at the start.
+
+    Arms of scale 1 rest with the hand above everything; a small one may rest with it among the things.
+
+    Args:
+        robot: Whose hand it is.
+        joint_spread: By how much each joint may be off the home configuration, rad.
+    """
+    home, gripper, scale = arm_kinematics(robot).forward(np.array(robot.home_q)), robot.gripper, robot.task_scale
+    off = joint_spread * math.hypot(*home.position.tolist())
+    if home.position[2] - gripper.finger_depth - off > scale * TALLEST:
+        return lambda point: True
+    # Seen from above, in the hand's axes: a jaw opens to one side of the TCP.
+    middle = home.apply(np.array([0.0, gripper.object_offset(gripper.max_width), 0.0]))
+    half = np.array([scale * HAND_AND_THING, gripper.max_width / 2 + scale * HAND_AND_THING]) + off
+
+    def is_free(point: tuple[float, float]) -> bool:
+        away = np.array([scale * point[0], scale * point[1], middle[2]]) - middle
+        return bool((np.abs(away @ home.rotation)[:2] > half).any())
+
+    return is_free
 
 
 def _scaled_body(body: Body, scale: float) -> Body:

@@ -70,6 +70,7 @@ class Sampler:
         ranges: Resolved ranges of the run, for what `named` draws and for the initial joints.
         split: "train" keeps every point out of the held-out rectangle, "eval" puts the first one into it.
         fixed: Whether the task's exact layout is wanted, of those that have one.
+        is_free: Whether something may lie at a point (x, y), beside what a caller of `point` accepts.
     """
 
     rng: np.random.Generator
@@ -77,6 +78,7 @@ class Sampler:
     ranges: Ranges = PRESETS["mild"]
     split: Literal["all", "train", "eval"] = "all"
     fixed: bool = False
+    is_free: Callable[[tuple[float, float]], bool] = lambda point: True
     _used: int = field(default=0, init=False)
     _points: int = field(default=0, init=False)
 
@@ -129,7 +131,7 @@ class Sampler:
             candidate = (self.placement(*region.x), self.placement(*region.y))
             far = all(math.dist(candidate, other) >= min_distance for other in away_from)
             allowed = self.split != "train" or not held_out.contains(candidate)
-            if far and allowed and region.contains(candidate) and accept(candidate):
+            if far and allowed and region.contains(candidate) and self.is_free(candidate) and accept(candidate):
                 return candidate
         raise SceneError(
             f"No place was found for {what} in {MAX_TRIES} tries: x {region.x}, y {region.y}, {min_distance:g} m from "

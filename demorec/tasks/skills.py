@@ -92,6 +92,8 @@ class Expert:
             joint_acceleration=0.8 * np.array(robot.acceleration_limit),
         )
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
+        # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
+        self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
         self._base_from_world = self.world.arm.world_from_base.inverse()
 
     @property
@@ -211,7 +213,7 @@ class Expert:
 
     def open_gripper(self, *, max_seconds: float) -> Iterator[Step]:
         """Open the hand and hold still until it is open, or until the time is over."""
-        open_enough = self.open_width - 0.002
+        open_enough = self.open_width - 0.002 * self._scale
         yield from self.set_gripper(
             self.open_width, max_seconds=max_seconds, done=lambda: self.world.arm.gripper_width() > open_enough
         )
@@ -296,7 +298,8 @@ class Expert:
         yield from self.move(grasp, speed=DESCEND_SPEED, until=lambda: world.pressed_from_above(name))
 
         self.phase = "close"
-        yield from self.set_gripper(self._closed_width, max_seconds=1.5, done=steady_width(world))
+        seconds = max(1.5, self._stroke_seconds)
+        yield from self.set_gripper(self._closed_width, max_seconds=seconds, done=steady_width(world))
         held = self.holds(name)
         if held:
             self.phase = "lift"
@@ -356,7 +359,7 @@ class Expert:
             return False
 
         self.phase = "release"
-        yield from self.open_gripper(max_seconds=1.0)
+        yield from self.open_gripper(max_seconds=max(1.0, self._stroke_seconds))
         self.phase = "retreat"
         here = self.tcp_target()
         away = raised(here, self._scale * max(0.1, self.behaviour.approach_height))

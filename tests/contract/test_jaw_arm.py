@@ -20,9 +20,12 @@ from demorec.cli import generate_dataset_main
 from demorec.core.geometry import Pose
 from demorec.core.plain import from_json, to_json
 from demorec.robots.kinematics import ArmKinematics, Freedom
+from demorec.robots.motion import MotionLimits, plan_straight
 from demorec.robots.robot import JawGripper, RobotSpec
 from demorec.robots.urdf import Urdf
 from demorec.tasks.grasping import hand_down
+from demorec.tasks.pick_place import PickPlace
+from demorec.tasks.sampling import Sampler
 from demorec.testing import RobotContract
 
 FOLDER = Path(__file__).parents[1] / "support" / "jaw_arm"
@@ -50,6 +53,7 @@ def test_the_jaw_opens_as_far_as_its_tip_is_away(q: float, speed: float) -> None
 def test_a_jaw_beyond_its_rows_is_as_closed_or_as_open_as_it_gets() -> None:
     assert JAW.joint_position(0.0).tolist() == [pytest.approx(-0.34)]
     assert JAW.width(np.array([1.5])) == JAW.max_width
+    assert JAW.stroke_seconds() == pytest.approx(0.80), "from -0.34 to 0.46 rad at 1 rad/s"
     larger = JAW.scaled(2.0)
     assert (larger.max_width, larger.force) == (2 * JAW.max_width, JAW.force)
 
@@ -107,6 +111,43 @@ def test_what_cannot_be_reached_is_said_in_words(wanted: Pose, freedom: Freedom 
     assert (ARM.inverse(wanted, start=rest, rest=rest, freedom=freedom) is None) == bool(words)
 
 
+def test_a_motion_that_takes_a_joint_to_its_limit_is_slowed_down_until_it_fits() -> None:
+    start = np.array([0.0294, 0.0749, 0.3795, 1.1461, -0.0056])
+    goal, limits = (
+        hand_down((0.241, -0.0668, 0.0547), -0.3297),
+        MotionLimits(joint_velocity=np.full(5, 2.4), joint_acceleration=np.full(5, 16.0)),
+    )
+    rest = ARM.turned_towards(HOME, goal.position)
+    path = plan_straight(ARM, start=start, goal=goal, rest=rest, speed=0.6, limits=limits, dt=1 / 30)
+    assert path is not None
+    assert path[:, 3].max() == pytest.approx(JAW_ARM.position_upper[3] - 0.01, abs=1e-3)
+    assert np.abs(np.diff(path, axis=0)).max() * 30 <= 2.4
+    assert np.abs(np.diff(path, 2, axis=0)).max() * 900 <= 16.0
+
+
+@pytest.mark.parametrize(
+    ("home", "is_low"), [(JAW_ARM.home_q, True), ((0.0, -0.0426, 0.0715, 1.5419, 0.0), False)], ids=["low", "high"]
+)
+def test_nothing_lies_where_the_hand_rests_unless_it_rests_above(
+    home: tuple[float, ...], *, is_low: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("demorec.robots.assets._modules_with_models", {"my_arms"})
+    monkeypatch.syspath_prepend(FOLDER)
+    robot = replace(JAW_ARM, urdf="my_arms:jaw_arm.urdf", home_q=home)
+    gaps = []
+    for seed in range(100):
+        scene = PickPlace().sample_scene(robot, Sampler(np.random.default_rng(seed)))
+        cube = scene.body("red_cube")
+        # The fingers' boxes in jaw_arm.urdf, at home: the fixed one is 12 mm thick and begins at y = 0.010 m.
+        point, outline = cube.world_from_body.position[:2], ((0.153, 0.167), (0.010 - JAW.max_width - 0.01, 0.022))
+        beyond = [max(low - v, v - high, 0.0) for v, (low, high) in zip(point, outline, strict=True)]
+        gaps.append(math.hypot(*beyond) - math.sqrt(0.5) * cube.shape.size[0])
+    if is_low:
+        assert min(gaps) > 0.008, "0.05 rad of a joint are 8 mm of the hand"
+    else:
+        assert min(gaps) < 0, "the place below a high hand is used"
+
+
 def test_it_makes_and_checks_a_dataset_with_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,10 +157,10 @@ def test_it_makes_and_checks_a_dataset_with_the_command(
     monkeypatch.delitem(sys.modules, "my_arms", raising=False)
     out = tmp_path / "run"
     flags = ["--robot", "my_arms:JAW_ARM", "--cameras", "none", "--seed", "3", "--workers", "1", "--out", out]
-    assert exit_code(*flags, "--num-episodes", "2", program=generate_dataset_main) == 0
+    assert exit_code(*flags, "--num-episodes", "3", program=generate_dataset_main) == 0
     assert exit_code("replay", out / "episodes" / "episode_000000.mcap", "--allow", "my_arms") == 0
     told = capsys.readouterr().out
-    assert "2 of 2 asked" in told
+    assert "3 of 3 asked" in told
     assert "none failed, 0 warnings" in told
     assert "identical, succeeds" in told
 
