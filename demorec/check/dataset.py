@@ -258,8 +258,7 @@ class Dataset:
         """Raise ConfigError for a dataset of collected episodes, which no simulator can make or replay."""
         if any(row["episode_info"] is None for row in self.sidecar):
             raise ConfigError(
-                "The episodes of this dataset were collected from another robot or program and have no scene: "
-                f"{self.path}"
+                f"The episodes of this dataset were recorded by another robot or program and have no scene: {self.path}"
             )
 
     def described(self) -> list[DescribedEpisode]:

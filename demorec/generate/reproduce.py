@@ -186,7 +186,7 @@ def _read_dataset(source: Path) -> Original:
         rows = _rows(source)
         if any(row["episode_info"] is None for row in rows):
             raise ConfigError(
-                f"The episodes of this dataset were collected from another robot or program, not generated: {source}"
+                f"The episodes of this dataset were recorded by another robot or program, not generated: {source}"
             )
         if len(configs) != 1:
             raise ConfigError(

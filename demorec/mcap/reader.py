@@ -50,7 +50,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
     def _other_file(self) -> RecordingError:
         if metadata.EXTERNAL in self._container.metadata_names:
             return NotSimulatedError(
-                "This needs an episode that demorec simulated; this one was collected from another robot or program "
+                "This needs an episode that demorec simulated; this one was recorded by another robot or program "
                 f"and has no scene: {self.path}"
             )
         return RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")

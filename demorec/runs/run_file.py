@@ -206,7 +206,7 @@ def load_run_file(folder: Path) -> RunFile:
             raise ValueError("no JSON object")
         if plain.get("kind") == COLLECTED:
             raise ConfigError(
-                f"The episodes of this run were collected from another robot or program, not generated: {folder}"
+                f"The episodes of this run were recorded by another robot or program, not generated: {folder}"
             )
         if plain.get("format", 0) > RUN_FORMAT:
             raise ConfigError(

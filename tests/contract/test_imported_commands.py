@@ -13,26 +13,26 @@ from demorec.check import dataset_files
 from demorec.cli import main
 from demorec.sources.import_run import import_bags
 
-COLLECTED = "collected from another robot or program"
+EXTERNAL = "recorded by another robot or program"
 ROWS: dict[str, tuple[int, str]] = {
     "view RUN --save NEW.rrd": (0, "kB: "),
     "view DATASET --save NEW.rrd": (0, "kB: "),
     "check RUN": (0, "2 checked, 0 failed, 0 with warnings."),
     "check DATASET": (0, "1 checked, 0 failed, 0 with warnings."),
-    "check RUN --deep": (1, COLLECTED),
-    "check DATASET --deep": (1, COLLECTED),
+    "check RUN --deep": (1, EXTERNAL),
+    "check DATASET --deep": (1, EXTERNAL),
     "report RUN --out NEW.html": (0, "1 episode"),
     "report DATASET --out NEW.html": (0, "1 episode"),
-    "replay RECORDING": (1, COLLECTED),
-    "replay DATASET": (2, COLLECTED),
-    "render RECORDING --out NEW": (1, COLLECTED),
+    "replay RECORDING": (1, EXTERNAL),
+    "replay DATASET": (2, EXTERNAL),
+    "render RECORDING --out NEW": (1, EXTERNAL),
     "export lerobot RUN --out NEW": (0, "1 episode, 24 frames"),
     "export hdf5 RUN --out NEW.hdf5": (0, "1 episode, 24 frames"),
     "evaluate --policy RUN": (2, "No policy"),
     "correct --policy RUN": (2, "No policy"),
-    "improve RUN --config-path MAPPING --out NEW": (2, COLLECTED),
-    "reproduce RUN --out NEW": (2, COLLECTED),
-    "reproduce DATASET --out NEW": (2, COLLECTED),
+    "improve RUN --config-path MAPPING --out NEW": (2, EXTERNAL),
+    "reproduce RUN --out NEW": (2, EXTERNAL),
+    "reproduce DATASET --out NEW": (2, EXTERNAL),
     "import BAG --mapping MAPPING --out RUN": (0, "1 of 1 bags had been imported before."),
     "recover RECORDING --out NEW.mcap": (0, "Complete: all 24 frames"),
     "info RUN": (0, "unknown  24 "),

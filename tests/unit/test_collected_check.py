@@ -239,6 +239,6 @@ def test_what_needs_a_scene_says_so(collected_run: Path, command: str, capsys: p
     out = [] if command == "replay" else ["--out", collected_run.parent / "x"]
     code, _, error = run(capsys, command, collected_run, *out)
     assert code in (1, 2)
-    assert "collected from another robot or program" in error
+    assert "recorded by another robot or program" in error
     assert len(error.strip().splitlines()) == 1
     assert not (collected_run.parent / "x").exists()

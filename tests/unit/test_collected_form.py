@@ -155,7 +155,7 @@ def test_the_description_says_where_it_came_from(tmp_path: Path) -> None:
 
 def test_what_needs_a_scene_says_why_it_cannot_be(tmp_path: Path) -> None:
     path = write_external(tmp_path / "a.mcap")
-    with pytest.raises(RecordingError, match="collected from another robot or program and has no scene"):
+    with pytest.raises(RecordingError, match="recorded by another robot or program and has no scene"):
         SimulatedRecording(path)
 
 
