@@ -54,7 +54,7 @@ RENAMED = {
     "dataset_coverage": "coverage",
     "effort_bears_the_arm": "effort_matches_dynamics",
 }
-"""Names of checks up to version 0.20 -> the check that has the law now."""
+"""Names of checks up to version 0.2.0 -> the check that has the law now."""
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
 
