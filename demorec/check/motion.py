@@ -54,12 +54,16 @@ _ALIKE = 3.0
 """Times the movement of the state that an action of its unit may move: teleoperation is scaled to half or double."""
 _VELOCITY_S = 0.3
 """Over which velocities are added up: filters of drivers are 20 to 100 ms late, which cancels over longer times."""
+_SLOW = 0.05
+"""Root mean square speed, rad/s or m/s, above which a joint is judged even where others move ten times as far."""
 _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
 """After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
 _STILL_FRAMES = 19
 """Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
+_LARGEST = 2.0
+"""How many times as large as its model a robot may be built, or as small."""
 _FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1
 """By which fixed mounts are found, and metres at which a turn counts beside a distance."""
 
@@ -205,13 +209,14 @@ def velocity_matches_position(subject: Moving) -> Found:
     pairs = [motion for motion in subject.motions.all if motion.velocity is not None and len(motion.state) > 1]
     if not pairs:
         return Lacking(need=VELOCITIES)
-    sums = np.zeros((3, len(pairs[0].names)))
+    sums, count = np.zeros((3, len(pairs[0].names))), 0
     for motion in pairs:
         assert motion.velocity is not None
         mean = (motion.velocity[1:] + motion.velocity[:-1]) / 2
         ways = np.vstack([np.zeros(mean.shape[1]), np.cumsum(mean * motion.steps_s[:, None], axis=0)])
         reach = min(max(1, round(_VELOCITY_S * motion.fps)), len(ways) - 1)
         told, moved = ways[reach:] - ways[:-reach], motion.state[reach:] - motion.state[:-reach]
+        count += len(moved)
         sums += [(moved * told).sum(axis=0), (told * told).sum(axis=0), (moved * moved).sum(axis=0)]
     known = np.flatnonzero(np.isfinite(sums[0]) & (sums[2] > 0))
     if not len(known):
@@ -221,9 +226,10 @@ def velocity_matches_position(subject: Moving) -> Found:
     if pairs[0].fps < _FEW_FPS:  # two velocities say little of the way between: what joints do in truth shows in all
         found, names = found.sum(axis=1, keepdims=True), ["all joints"]
     product, square, total = found
-    ratio, share = product / np.maximum(square, 1e-12), total / total.max()
-    # Of a joint that hardly moves, noise decides.
-    off = np.abs(ratio - 1) * (share > 0.01) * min(1.0, pairs[0].fps / _FEW_FPS)
+    ratio = product / np.maximum(square, 1e-12)
+    # Of a joint that hardly moves, beside the others or at all, noise decides.
+    moves = (total > 0.01 * total.max()) | (total > count * (_SLOW * _VELOCITY_S) ** 2)
+    off = np.abs(ratio - 1) * moves * min(1.0, pairs[0].fps / _FEW_FPS)
     worst = int(np.argmax(off))
     return Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
 
@@ -357,17 +363,22 @@ def stuck_sensors(subject: Moving) -> Iterator[Found]:
             yield Measurement(value=length, frame=start + 1 if length else None, detail=label)
 
 
-@motion_check(
+@check(
+    group="physics",
+    on=("external", "dataset"),  # of simulated recordings the mounts are known: `forward_kinematics` judges these
     measures="how far the EE pose strays from the joints' forward kinematics, between fixed mounts, nine tenths of it",
     unit="m",
     warn=0.02,
     fail=0.05,
     needs=EE_POSES,
-    reads=(STATE, EE_POSE, "/{feature}", "/joint_states", "/ee_pose"),
+    reads=(STATE, EE_POSE, "/{feature}"),
 )
 def pose_follows_joints(subject: Moving) -> Iterator[Found]:
     """The hand goes where the joints take it, whatever its frame and the base's are: catches exchanged joints,
-    zeros that are off, other orders of a quaternion. 0.1 m are added for each rad of rotation."""
+    other units and orders of a quaternion, and some zeros that are off. 0.1 m are added for each rad of rotation.
+
+    A robot that is known by the names of its joints may be built larger or smaller, to half or double.
+    """
     motions = subject.motions.all
     for motion in motions[:: max(1, len(motions) // _FITTED_EPISODES)]:
         if motion.ee_pose is None or motion.urdf is None:
@@ -384,7 +395,7 @@ def pose_follows_joints(subject: Moving) -> Iterator[Found]:
 
 
 def _mounted(links: Array, poses: Array) -> Array:
-    """(T,) metres by which poses (T, 4, 4) are off X @ links @ Y, for the fixed X and Y that fit best."""
+    """(T,) metres by which poses (T, 4, 4) are off X @ links @ Y, for the fixed X and Y and the size that fit best."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
@@ -393,23 +404,28 @@ def _mounted(links: Array, poses: Array) -> Array:
         out[:3, :3], out[:3, 3] = Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:]
         return out
 
+    def placed(numbers: Array, links: Array) -> Array:
+        sized = links.copy()
+        sized[:, :3, 3] *= _LARGEST ** math.tanh(numbers[12])
+        return np.asarray(fixed(numbers[:6]) @ sized @ fixed(numbers[6:12]))
+
     rows = np.unique(np.linspace(0, len(links) - 1, _FITTED_FRAMES).astype(int))
 
     def residual(numbers: Array) -> Array:
-        off = fixed(numbers[:6]) @ links[rows] @ fixed(numbers[6:]) - poses[rows]
+        off = placed(numbers, links[rows]) - poses[rows]
         return np.asarray((off[:, :3] * [_LEVER, _LEVER, _LEVER, 1.0]).reshape(-1))
 
     best = None
     for yaw in np.arange(4) * (math.pi / 2):  # bases that are turned may be far from each other's fit
         start = np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0])
         mount = np.linalg.inv(fixed(start) @ links[0]) @ poses[0]
-        guess = np.concatenate([start, Rotation.from_matrix(mount[:3, :3]).as_rotvec(), mount[:3, 3]])
+        guess = np.concatenate([start, Rotation.from_matrix(mount[:3, :3]).as_rotvec(), mount[:3, 3], [0.0]])
         found = least_squares(residual, guess)
         best = found if best is None or found.cost < best.cost else best
         if best.cost < 1e-3 * _LEVER * len(rows):
             break
     assert best is not None
-    return displacement(fixed(best.x[:6]) @ links @ fixed(best.x[6:]), poses)
+    return displacement(placed(best.x, links), poses)
 
 
 @motion_check(

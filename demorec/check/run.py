@@ -275,7 +275,7 @@ def duplicates(subject: CheckedRun | ExternalRun | Dataset) -> Found:
     warn=0.35,
     fail=0.6,
     on=("run", "dataset"),
-    needs=f"{SCENE} of each of {MIN_EPISODES} episodes",
+    needs=f"{MIN_EPISODES} episodes, each with {SCENE}",
     reads=(
         "info.scene.bodies.world_from_body", "info.scene.bodies.shape", "info.scene.goals.onto",
         "info.scene.goals.onto_from_goal", "demorec/",

@@ -85,7 +85,8 @@ class Generate:
             return 0
 
         from demorec.cli.generate_report import check_run, print_result
-        from demorec.generate.run import generate, terminate_as_interrupt
+        from demorec.core.processes import terminate_as_interrupt
+        from demorec.generate.run import generate
 
         with ExitStack() as stack:
             watch = stack.enter_context(_viewer(options.out)) if self.view else None

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import errno
 import signal
-import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
-from demorec.core.processes import available_cores
+from demorec.core.processes import available_cores, handled
 from demorec.core.tables import load_robot
 from demorec.generate.contents import Inspector
 from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Lost, Made, Raised, Report
@@ -273,24 +272,5 @@ class Interrupts:
 def catch_interrupts() -> Iterator[Interrupts]:
     """Catch SIGINT and SIGTERM inside."""
     interrupts = Interrupts()
-    with _handled(interrupts.handle, signal.SIGINT, signal.SIGTERM):
+    with handled(interrupts.handle, signal.SIGINT, signal.SIGTERM):
         yield interrupts
-
-
-def terminate_as_interrupt() -> AbstractContextManager[None]:
-    """Inside, SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that every `finally` runs."""
-    return _handled(signal.default_int_handler, signal.SIGTERM)
-
-
-@contextmanager
-def _handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals) -> Iterator[None]:
-    """Handle signals like this inside; leaves them alone outside the main thread, where Python cannot catch them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, usual in before.items():
-            signal.signal(number, usual)

@@ -6,7 +6,6 @@ import hashlib
 import json
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice
 from pathlib import Path
 from typing import ClassVar
 
@@ -179,12 +178,22 @@ class EpisodeFile[C](Closing):
         return next(self._images(camera, [number]))
 
     def _images(self, camera: str, numbers: Sequence[int]) -> Iterator[Rgb]:
-        """Some decoded images, read in one pass, each decoded from the keyframe before it on."""
-        packets = list(islice(self.packets(camera), max(numbers, default=-1) + 1))
-        for number in numbers:
-            keyframe = max(index for index, packet in enumerate(packets[: number + 1]) if packet.is_keyframe)
-            *_, picture = decode(self.video_settings(camera), packets[keyframe : number + 1])
-            yield picture
+        """Some decoded images, in rising order, each decoded from the keyframe before it on.
+
+        They are read in one pass, with no more in memory than the packets since the last keyframe.
+        """
+        waiting, group = list(numbers), list[VideoPacket]()
+        for number, packet in enumerate(self.packets(camera)):
+            if not waiting:
+                return
+            if packet.is_keyframe:
+                group.clear()
+            group.append(packet)
+            if number == waiting[0]:
+                *_, image = decode(self.video_settings(camera), group)
+                while waiting and waiting[0] == number:
+                    yield image
+                    waiting.pop(0)
 
     def pixel_statistics(self, camera: str) -> PixelStatistics:
         """Histograms of a camera's images: as written, or counted now where none were written."""

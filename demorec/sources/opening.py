@@ -53,7 +53,6 @@ def opened(
     *,
     imports_datasets: bool,
     tell: Callable[[str], None],
-    progress: Callable[[str], None] = lambda path: None,
 ) -> Iterator[list[Opened]]:
     """Give each path as something that holds recordings, or as a dataset.
 
@@ -63,7 +62,6 @@ def opened(
             decide.
         imports_datasets: Whether datasets are opened as recordings.
         tell: Called with what was left out, and by which mapping, a line each.
-        progress: Called with each path that is read.
 
     Raises:
         ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
@@ -79,7 +77,6 @@ def opened(
             if kind is None:
                 found.append(Opened(source=path, path=path))
                 continue
-            progress(str(path))
             run = Path(folder) / str(number) / path.resolve().name
             run.parent.mkdir()
             if kind == "dataset":

@@ -6,29 +6,14 @@ names it: its episodes are called "demo.hdf5: episode 3".
 
 from __future__ import annotations
 
-import signal
-import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.cli.shared.output import renamed, tell
 from demorec.core.errors import DemorecError
+from demorec.core.processes import terminate_as_interrupt
 from demorec.runs.find import find
-
-
-@contextmanager
-def _orderly_end() -> Iterator[None]:
-    """Let SIGTERM end the process as Ctrl-C does, so that nothing temporary stays."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -52,7 +37,7 @@ def reading(
         return
     from demorec.sources.opening import opened
 
-    with _orderly_end(), opened(paths, mapping, imports_datasets=imports_datasets, tell=tell) as found:
+    with terminate_as_interrupt(), opened(paths, mapping, imports_datasets=imports_datasets, tell=tell) as found:
         names = {str(one.path): str(one.source) for one in found if one.path != one.source}
         with renamed(names) as in_users_words:
             try:

@@ -56,7 +56,14 @@ _EXACT = 2**53
 """Up to which float64 holds every whole number."""
 _KNOWN = ("episode_index", "source", "success", "failure_reason", "root_seed", "cameras", "robot_digest")
 """What is taken from the sidecar for a recording; the rest is of simulated episodes alone."""
-_NO_PLACE = "recordings of other robots have no place for it"
+_NO_PLACE = "imported recordings hold none"
+_DONE, _REWARD = "next.done", "next.reward"
+_NEXT: Mapping[str, str] = {
+    _SUCCESS: "its last value becomes the outcome of the episode",
+    _DONE: "an export writes it anew, true in the last row of an episode",
+    _REWARD: "imported recordings hold an outcome, and no rewards",
+}
+"""Columns of LeRobot's environments -> what becomes of them."""
 
 
 class LeRobotDataset:
@@ -91,7 +98,7 @@ class LeRobotDataset:
                 if camera in self.keys:
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
                 self.keys[camera] = name
-            elif name not in AUTOMATIC_FEATURES and name != _SUCCESS:
+            elif name not in AUTOMATIC_FEATURES:
                 self.features += (_feature(name, feature),)
         self.left_out |= dict(self._left_out_beside())
         if missing := [name for name in ("timestamp", "task_index") if name not in self.info.features]:
@@ -114,7 +121,7 @@ class LeRobotDataset:
         if not self.has_one_robot:
             yield f"{SIDECAR_DIR}/robots", "not all episodes have the same robot there, as those of a run have"
         if any(row["root_seed"] is not None for row in self.known.values()):
-            yield f"{SIDECAR_DIR}/episodes", f"scene, phases and checks are of simulated episodes, and {_NO_PLACE}"
+            yield f"{SIDECAR_DIR}/episodes", "scenes, phases and conditions of success are not read back"
 
     def leave_out(self, feature: str, reason: str) -> None:
         """Let no recording have a feature; before the first one is asked for."""
@@ -456,10 +463,10 @@ def _is_finite(value: object) -> bool:
 
 def _why_left_out(name: str, feature: DatasetFeature) -> str:
     """Why a feature is in no recording, "" for one that is."""
-    if name in AUTOMATIC_FEATURES or name == _SUCCESS:
+    if name in AUTOMATIC_FEATURES:
         return ""
     if name.startswith("next."):
-        return _NO_PLACE
+        return _NEXT.get(name, _NO_PLACE)
     if feature.is_depth:
         return _why_no_distances(feature)
     if feature.dtype in ("video", "image"):
