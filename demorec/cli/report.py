@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.output import counted, say, size_in_words
 from demorec.cli.shared.paths import places_read, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.reading import reading
@@ -74,5 +74,5 @@ class Report:
         ):
             report = gather(path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
         size = write_page(report, self.out)
-        say(f"{counted(len(report.episodes), 'episode')}, {size / 1e6:.1f} MB: {self.out}")
+        say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")
         return 0
