@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,7 @@ class Motion:
         model: Text of a URDF with masses, or its name as by `asset_path`.
         commands: Name -> (T, D) of what else is known to be sent to the same elements, in the same units.
         ee_pose: (T, 7) of the hand, if there.
+        tcp_link: The link of which it is the pose, "" where that is not known.
         sensors: Name -> (T, n) of what is measured.
         contact: (T,) N, force on the fingers; None where nobody measures it.
         stroke_s: How long the gripper takes from closed to open, seconds; 0 where it is not known.
@@ -75,6 +76,7 @@ class Motion:
     model: str = ""
     commands: Mapping[str, Array] = field(default_factory=dict)
     ee_pose: Array | None = None
+    tcp_link: str = ""
     sensors: Mapping[str, Array] = field(default_factory=dict)
     contact: Array | None = None
     stroke_s: float = 0.0
@@ -168,7 +170,8 @@ def motions_of_dataset(
             continue
         spec, arm = robot.record.spec, _Arm.of(robot)
         opening = math.inf if spec is None else spec.gripper.max_width
-        yield _motion(where, info.fps, rows, names, units=robot.record.units, arm=arm, opening=opening)
+        motion = _motion(where, info.fps, rows, names, units=robot.record.units, arm=arm, opening=opening)
+        yield motion if spec is None else replace(motion, tcp_link=spec.tcp_link)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -384,6 +384,9 @@ def pose_follows_joints(subject: Moving) -> Iterator[Found]:
         if motion.ee_pose is None or motion.urdf is None:
             yield Lacking(need=EE_POSES)
             return
+        if motion.tcp_link:
+            yield NotMeasured(why="the link is known of which these are the poses, and forward_kinematics judges them")
+            continue
         if len(motion.state) < _FEWEST:
             yield NotMeasured(why=f"an episode has fewer than {_FEWEST} frames")
             continue

@@ -12,6 +12,7 @@ from demorec.check.report import CheckOptions, Subject, SubjectReport, check_sub
 from demorec.core.errors import ConfigError, ExportError, RecordingError, without_path
 from demorec.core.plain import to_plain
 from demorec.core.processes import in_turn
+from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.exported import exported
 from demorec.datasets.options import CommonOptions
 from demorec.episode.episode import Outcome
@@ -144,7 +145,8 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
 
 
 def _read_recording(recording: AnyRecording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
-    info, names = recording.info, recording.phases()
+    info, content = recording.info, exported(recording, CommonOptions())
+    names = () if content.simulated is None else content.simulated.columns.phase
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
@@ -172,17 +174,16 @@ def _read_recording(recording: AnyRecording, camera: str, strip_bytes: int) -> t
         facts=tuple(_facts_of(recording)),
         info=simulated,
     )
-    return episode, _components(recording)
+    return episode, _components(content)
 
 
-def _components(recording: AnyRecording) -> Components:
+def _components(content: ExportEpisode) -> Components:
     """State and action as an export has them; nothing of an episode that could not be exported."""
     counts: Components = {}
     try:
-        episode = exported(recording, CommonOptions())
         for feature in (STATE, ACTION):
-            if feature in episode.vectors:
-                count(counts, feature, episode.names[feature], episode.vectors[feature])
+            if feature in content.vectors:
+                count(counts, feature, content.names[feature], content.vectors[feature])
     except ExportError:  # no frames, or numbers that are not finite, which the checks report
         return {}
     return counts
