@@ -15,7 +15,7 @@ from demorec.check.base import Measurement, run_check
 from demorec.check.dataset import Dataset, Rows, read_rows
 from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
-from demorec.datasets.exported import exported
+from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import SIDECAR_DIR, is_dataset
@@ -130,7 +130,7 @@ def episode_differences(
     """
     try:
         with SimulatedRecording(recording_file) as recording:
-            exporting = exported(recording, options)
+            exporting = ExportEpisode(recording, options)
             expected = prepare_episode(exporting, options, encode_depth=False)
             record = EpisodeRecord.of(exporting)
             # Encoded anew, images have the bytes of the version and machine that encoded them.

@@ -1,11 +1,10 @@
 """An episode as every exporter writes it: which frames, which numbers, which images, whoever recorded it.
 
-`exported(recording, options)` gives one; the formats ask it and never what kind of recording it comes from.
+The formats ask an `ExportEpisode`, and never what kind of recording it comes from.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,14 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError, ExportError
+from demorec.core.plain import digest, to_json
 from demorec.core.registry import nearest_match
 from demorec.datasets.options import CommonOptions
-from demorec.episode.episode import SimulatedColumns
+from demorec.episode.episode import SimulatedColumns, interventions
+from demorec.episode.external import NO_PICTURE
 from demorec.episode.features import (
+    ACTION,
+    COMMAND,
+    DEPTH_SUFFIX,
     ENVIRONMENT_STATE,
     IMAGE_PREFIX,
+    STATE,
+    StateKind,
+    action_names,
+    action_vectors,
+    command_vectors,
+    observation_names,
+    observation_vectors,
 )
-from demorec.mcap import AnyRecording, SimulatedRecording
+from demorec.episode.sensed import SENSED, ObservationRows
+from demorec.mcap import AnyRecording, Recording, SimulatedRecording, channels
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 INTERVENTION = "intervention"
@@ -34,6 +46,7 @@ SCALARS: Mapping[str, Literal["float32", "bool"]] = {
     SUCCESS: "bool",
 }
 """Features of one number a frame, and their type."""
+_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,23 +64,7 @@ class ExportCamera:
     is_depth: bool = False
 
 
-class Simulated:
-    """What only an episode has that demorec simulated: its recording with all that is known of it, and its numbers.
-
-    Args:
-        recording: Open.
-    """
-
-    def __init__(self, recording: SimulatedRecording) -> None:
-        self.recording = recording
-
-    @cached_property
-    def columns(self) -> SimulatedColumns:
-        """All numbers, every frame; RecordingError for damage."""
-        return self.recording.columns()
-
-
-class ExportEpisode(ABC):
+class ExportEpisode:
     """What a dataset has of one recording, with these options.
 
     Args:
@@ -75,90 +72,144 @@ class ExportEpisode(ABC):
         options: Of the export.
 
     Attributes:
-        simulated: What only a simulated episode has; None for an external one.
+        simulated: The recording, if demorec simulated the episode; else None.
         fps: Of the dataset.
         names: Vector feature -> names of its D elements, all that recording and options offer.
         scalars: Of `SCALARS`, all that they offer.
         cameras: Those that the dataset shall have, in its order.
+        depth_left_out: Depth cameras of an external episode that were not asked for.
 
     Raises:
         ConfigError: Options that the recording cannot serve.
     """
 
-    simulated: Simulated | None
-    fps: int
-    names: Mapping[str, tuple[str, ...]]
-    scalars: tuple[str, ...]
-    cameras: tuple[ExportCamera, ...]
-
     def __init__(self, recording: AnyRecording, options: CommonOptions) -> None:
-        self.recording = recording
-        self.options = options
-
-    def _settle(
-        self, names: Mapping[str, tuple[str, ...]], scalars: tuple[str, ...], cameras: Collection[ExportCamera]
-    ) -> None:
-        """Take what is offered, and of the cameras those that are wanted."""
-        offered = [*names, *(camera.feature for camera in cameras), *scalars]
-        check_feature_names(self.options, [*offered, *(name for name in self.on_request if name not in offered)])
-        self.names, self.scalars = names, scalars
-        self.cameras = tuple(camera for camera in cameras if self.options.takes(camera.feature))
-
-    @property
-    def on_request(self) -> tuple[str, ...]:
-        """Features that a dataset has only when they are named."""
-        return ()
-
-    @property
-    def depth_left_out(self) -> tuple[str, ...]:
-        """Depth cameras that were not asked for."""
-        return ()
-
-    @property
-    def is_silent(self) -> bool:
-        """Whether there is nothing that language could be made of."""
-        return self.simulated is None and not self.subtasks
+        self.recording, self.options = recording, options
+        self.simulated: SimulatedRecording | None = None
+        self._state: StateKind = getattr(options, "state", "joint")
+        self._sensed: list[str] = []
+        self.names: dict[str, tuple[str, ...]]
+        self.depth_left_out: tuple[str, ...] = ()
+        self.scalars: tuple[str, ...] = (DONE,)
+        cameras = [ExportCamera(name=name, feature=IMAGE_PREFIX + name) for name in recording.cameras]
+        on_request: tuple[str, ...] = ()
+        info = recording.info
+        if isinstance(recording, SimulatedRecording):
+            self.simulated = recording
+            self.fps = info.fps // _frame_stride(info.fps, options.fps)
+            # Recordings of format version 1 have no wrench.
+            has_wrench = channels.WRENCH in recording.topics
+            sensed = [name for name in SENSED if name != "observation.wrench" or has_wrench]
+            on_request = (*sensed, COMMAND)
+            self._sensed = [name for name in sensed if name in options.features]
+            robot, scene = recording.info.robot, recording.info.scene
+            self.names = observation_names(
+                robot, scene, privileged=options.privileged, state=self._state, sensed=self._sensed
+            )
+            if COMMAND in options.features:
+                self.names[COMMAND] = action_names(robot, "joint")
+            self.names[ACTION] = action_names(robot, options.action)
+            if options.depth:
+                depth = [ExportCamera(name=c.name, feature=c.feature + DEPTH_SUFFIX, is_depth=True) for c in cameras]
+                cameras = [camera for pair in zip(cameras, depth, strict=True) for camera in pair]
+            self.scalars = (REWARD, DONE, SUCCESS)
+            if getattr(options, "intervention", False):
+                self.scalars = (INTERVENTION, *self.scalars)
+        else:
+            _check_external(recording, options)
+            self.fps = info.fps
+            self.names = {feature.name: feature.names for feature in recording.info.features}
+            if options.depth:
+                depth_cameras = recording.depth_cameras
+                cameras += [ExportCamera(name=n, feature=IMAGE_PREFIX + n, is_depth=True) for n in depth_cameras]
+            else:
+                self.depth_left_out = recording.depth_cameras
+        offered = [*self.names, *(camera.feature for camera in cameras), *self.scalars]
+        _check_feature_names(options, [*offered, *(name for name in on_request if name not in offered)])
+        self.cameras = tuple(camera for camera in cameras if options.takes(camera.feature))
 
     @property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
         """(frame, what is begun there) as an external source states it."""
-        return ()
+        return self.recording.subtasks if isinstance(self.recording, Recording) else ()
 
     @property
-    @abstractmethod
     def origin(self) -> str:
         """Where the episode comes from: "" for a generated one, "replay of DIGEST", or JSON of imported files."""
+        origin = self.recording.info.origin
+        return origin if isinstance(origin, str) else to_json(origin)
 
     @property
-    @abstractmethod
     def urdf(self) -> str:
         """The robot's URDF as text, "" where it is not known."""
+        recording = self.recording
+        if not isinstance(recording, SimulatedRecording):
+            return recording.info.urdf
+        return recording.description() if channels.description_topic() in recording.topics else ""
 
-    @property
-    @abstractmethod
-    def joints(self) -> Mapping[str, tuple[str, ...]]:
-        """Feature -> for each element the joint of the URDF of which it is the position, "" for none."""
+    def joints(self) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+        """Of features that have any: for each element the joint of the URDF of which it is the position, "" for none;
+        and the units of the elements, where they are known.
+        """
+        recording = self.recording
+        if not isinstance(recording, SimulatedRecording):
+            moving = [feature for feature in recording.info.features if any(feature.joints)]
+            units = {feature.name: feature.units for feature in moving if feature.units}
+            return {feature.name: feature.joints for feature in moving}, units
+        arm = recording.info.robot.arm_joints
+        pose = ("m",) * 3 + ("",) * 4 if self._state == "joint_ee" else ()
+        joints = (*arm, *("" for _ in self.names[STATE][len(arm) :]))
+        return {STATE: joints}, {STATE: (*("rad" for _ in arm), "m", *pose)}
 
-    @property
-    @abstractmethod
-    def units(self) -> Mapping[str, tuple[str, ...]]:
-        """Feature of `joints` -> units of its elements, where they are known."""
-
-    @abstractmethod
     def described_cameras(self) -> list[dict[str, Any]]:
         """What is known of each camera of the recording: name, width, height, intrinsics (K, row by row), mount,
         mount_from_camera and world_from_camera_start (position, quaternion xyzw); None for what is not."""
+        info = self.recording.info
+        found = []
+        for camera in info.cameras if info.scene is None else info.scene.cameras:
+            intrinsics, placed = camera.intrinsics, camera.mount_from_camera
+            row = {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "intrinsics": None if intrinsics is None else np.ravel(intrinsics).tolist(),
+                "mount": camera.mount or None,
+                "mount_from_camera": None if placed is None else placed.vector().tolist(),
+            }
+            if info.scene is not None:
+                row["world_from_camera_start"] = self.columns.world_from_camera[camera.name][0].tolist()
+            found.append(row)
+        return found
 
-    @abstractmethod
     def traits(self) -> Iterator[tuple[str, str]]:
         """What all recordings of a dataset must have in common, as (what, value) in words."""
-
-    def _camera_traits(self) -> Iterator[tuple[str, str]]:
+        recording = self.recording
+        yield "kind of episode", "external" if self.simulated is None else "simulated"
+        yield "fps", str(recording.info.fps)
+        if isinstance(recording, SimulatedRecording):
+            # A scaled arm (the tutorial's) has the same joints and limits; its lengths are in the sidecar.
+            robot = recording.info.robot
+            yield "robot", f"{robot.name} ({digest(robot.scaled(0.0))})"
+        else:
+            wanted = {name: elements for name, elements in self.names.items() if self.options.takes(name)}
+            yield "robot", recording.info.robot
+            yield "features", " ".join(wanted)
+            yield from ((f"feature {name}", ", ".join(elements)) for name, elements in wanted.items())
         yield "cameras", " ".join(camera.feature.removeprefix(IMAGE_PREFIX) for camera in self.cameras) or "none"
         for name in dict.fromkeys(camera.name for camera in self.cameras):
-            settings = self.recording.video_settings(name)
+            settings = recording.video_settings(name)
             yield f"size of camera {name}", f"{settings.width}x{settings.height}"
             yield f"codec of camera {name}", settings.codec
+        if self.simulated and self.options.privileged and self.options.takes(ENVIRONMENT_STATE):
+            names = self.names[ENVIRONMENT_STATE]
+            yield "objects and goals", " ".join(dict.fromkeys(name.partition(".")[0] for name in names))
+            yield "components of the environment state", f"{len(names)} ({digest(list(names))})"
+
+    @cached_property
+    def columns(self) -> SimulatedColumns:
+        """All numbers of a simulated episode, every frame; RecordingError for damage."""
+        assert self.simulated is not None
+        return self.simulated.columns()
 
     @cached_property
     def rows(self) -> NDArray[np.intp]:
@@ -175,7 +226,12 @@ class ExportEpisode(ABC):
             ExportError: The recording has no frames, or a number that is not finite.
             RecordingError: It is damaged.
         """
-        vectors = {name: values for name, values in self._vectors().items() if self.options.takes(name)}
+        recording = self.recording
+        if isinstance(recording, SimulatedRecording):
+            found = self._simulated_vectors(recording)
+        else:
+            found = recording.columns().features
+        vectors = {name: values for name, values in found.items() if self.options.takes(name)}
         for name, values in vectors.items():
             self._check_finite(name, values)
         return vectors
@@ -198,23 +254,77 @@ class ExportEpisode(ABC):
                 f"{self.recording.path}"
             )
 
-    @abstractmethod
-    def _vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
-        """Feature -> (T, D)."""
+    def _simulated_vectors(self, recording: SimulatedRecording) -> Mapping[str, NDArray[np.floating[Any]]]:
+        """Feature -> (T, D). With frames left out, an observation is that of the first frame of its group and an action
+        the last one of it: where the robot shall be when the next observation is taken.
+        """
+        info, rows, columns, options = recording.info, self.rows, self.columns, self.options
+        action_rows = np.minimum(rows + info.fps // self.fps - 1, recording.num_frames - 1)
+        vectors: dict[str, NDArray[np.floating[Any]]] = dict(
+            observation_vectors(
+                ObservationRows.of_columns(columns, rows),
+                info.robot,
+                info.scene,
+                privileged=options.privileged,
+                state=self._state,
+                sensed=self._sensed,
+                dtype=np.float64,
+            )
+        )
+        if COMMAND in self.names:
+            vectors[COMMAND] = command_vectors(columns, action_rows)
+        vectors[ACTION] = action_vectors(columns, info.scene, options.action, action_rows, dtype=np.float64)
+        return vectors
 
-    @property
-    @abstractmethod
+    @cached_property
     def scalar_columns(self) -> Mapping[str, NDArray[np.generic]]:
         """Feature of `scalars` -> (T,)."""
+        is_last = self.rows == self.rows[-1]
+        found: dict[str, NDArray[np.generic]] = {DONE: is_last}
+        if self.simulated is not None:
+            is_success = is_last & bool(self.recording.success)
+            found |= {REWARD: is_success.astype(np.float32), SUCCESS: is_success}
+            if INTERVENTION in self.scalars:
+                found[INTERVENTION] = interventions(self.columns.phase)[self.rows]
+        return {name: found[name] for name in self.scalars}
 
-    @abstractmethod
     def numbers(self, camera: ExportCamera) -> NDArray[np.int64]:
-        """(T,) which image of the camera each frame shows, of those that `recording.packets` gives.
+        """(T,) which image of the camera each frame shows, of those that `recording.packets` gives; of an external
+        episode also the camera's last one where that may be held.
 
         Raises:
             ConfigError: The recording has no such images.
             ExportError: A frame has none.
         """
+        if isinstance(recording := self.recording, Recording):
+            return self._held_numbers(recording, camera.name)
+        if camera.is_depth and not recording.has_depth(camera.name):
+            raise ConfigError(
+                f"--depth needs recordings with depth images (generate --depth), and the camera {camera.name!r} has "
+                f"none: leave it out: {recording.path}"
+            )
+        return self.rows.astype(np.int64)
+
+    def _held_numbers(self, recording: Recording, camera: str) -> NDArray[np.int64]:
+        columns = recording.columns()
+        numbers, stamps = columns.pictures[camera].copy(), columns.picture_stamps[camera]
+        longest = round(self.options.hold_pictures * _SECOND_NS)
+        without = np.flatnonzero(numbers == NO_PICTURE)
+        for frame in without.tolist():
+            before = int(numbers[frame - 1]) if frame else NO_PICTURE
+            age = int(columns.time_ns[frame] - stamps[before]) if before != NO_PICTURE else None
+            if age is None or age > longest:
+                last, hold = "none came before it", ""
+                if age is not None:
+                    last = f"the last one is {age / _SECOND_NS:.3g} s old"
+                    hold = "allow that one to be held (--hold-pictures SECONDS), or "
+                raise ExportError(
+                    f"Frame {frame} has no image of the camera {camera}, as {len(without)} of {len(numbers)} "
+                    f"frames, and {last}: {hold}leave the camera (--features) or the episode (--episodes) out: "
+                    f"{recording.path}"
+                )
+            numbers[frame] = before
+        return numbers
 
     def images(self, camera: ExportCamera) -> Iterator[NDArray[Any]]:
         """What the frames show, one a frame: (H, W, 3) uint8 RGB, of a depth camera (H, W) float32 metres.
@@ -239,7 +349,32 @@ class ExportEpisode(ABC):
             yield image
 
 
-def frame_stride(recording_fps: int, fps: int | None) -> int:
+def _check_external(recording: Recording, options: CommonOptions) -> None:
+    """Raise ConfigError for options that only a simulated episode can serve."""
+    fps, state = recording.info.fps, getattr(options, "state", "joint")
+    unknown = [kind for kind in getattr(options, "language", None) or () if kind != "subtask"]
+    scenic = ("privileged", "progress", "boxes")  # the last two of LeRobot datasets alone
+    needs_scene = [name for name in scenic if getattr(options, name, None) not in (None, False)]
+    problems = (
+        options.action != "joint"
+        and f"action is {options.action!r}, but external actions are exported as they came (joint)",
+        state != "joint" and f"state is {state!r}, but an external state is exported as it came (joint)",
+        options.depth
+        and not recording.depth_cameras
+        and "depth is asked for, but no camera of the recording measures distances",
+        unknown
+        and f"language names {unknown[0]!r}, but of an external episode only the subtasks are known that its source "
+        "states",
+        needs_scene and f"{needs_scene[0]} is asked for, which needs the scene of a simulated episode",
+        options.fps not in (None, fps)
+        and f"fps is {options.fps}, but the episode was recorded at {fps}, and whether frames can be left out of it "
+        "depends on what its actions mean",
+    )
+    for problem in filter(None, problems):
+        raise ConfigError(f"{problem}: {recording.path}")
+
+
+def _frame_stride(recording_fps: int, fps: int | None) -> int:
     """How many frames of the recording make one of the dataset.
 
     Raises:
@@ -255,7 +390,7 @@ def frame_stride(recording_fps: int, fps: int | None) -> int:
     return recording_fps // fps
 
 
-def check_feature_names(options: CommonOptions, offered: Collection[str]) -> None:
+def _check_feature_names(options: CommonOptions, offered: Collection[str]) -> None:
     """Raise ConfigError when `options.features` names one that is not among the offered ones."""
     for name in options.features:
         if name == ENVIRONMENT_STATE and name not in offered:

@@ -2,51 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
 from demorec.datasets.episode import ExportEpisode
-from demorec.datasets.exported import exported
 from demorec.datasets.options import CommonOptions, parse_episodes
 from demorec.episode.episode import POLICY_PHASE, Outcome, interventions
 from demorec.mcap import AnyRecording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportSource:
-    """One recording.
-
-    Attributes:
-        path: The file.
-        is_chosen: False for a failed attempt that only counts for the success rate.
-    """
-
-    path: Path
-    is_chosen: bool = True
-
-
-def find_recordings(paths: Sequence[Path], *, include_failures: bool) -> list[ExportSource]:
-    """The recordings in the given files, runs (folders with episodes/) and folders of recordings, in order.
+def find_recordings(paths: Sequence[Path]) -> list[Path]:
+    """The recordings in the given files, runs (folders with episodes/) and folders of recordings, in order; those of
+    failed attempts, too.
 
     Raises:
         ConfigError: A path is missing, holds no recording, or the same recording is given twice.
     """
-    found: list[ExportSource] = []
+    found: list[Path] = []
     for path in paths:
         there = expect(path, "recording", *EPISODE_FOLDERS)
-        of_path = [ExportSource(path=file) for file in there.recordings]
-        of_path += [ExportSource(path=file, is_chosen=include_failures) for file in there.failed]
-        expect_recordings(there, [source.path for source in of_path])
+        of_path = [*there.recordings, *there.failed]
+        expect_recordings(there, of_path)
         found += sorted(of_path, key=_attempt_order)
     seen: set[Path] = set()
-    for source in found:
-        resolved = source.path.resolve()
+    for file in found:
+        resolved = file.resolve()
         if resolved in seen:
-            raise ConfigError(f"The same recording is given twice: {source.path}")
+            raise ConfigError(f"The same recording is given twice: {file}")
         seen.add(resolved)
     return found
 
@@ -65,57 +50,27 @@ def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
     return POLICY_PHASE not in phases or bool(interventions(phases).any())
 
 
-def goes_in(source: ExportSource, recording: AnyRecording, options: CommonOptions) -> bool:
+def goes_in(recording: AnyRecording, options: CommonOptions) -> bool:
     """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out.
 
     An external episode of which nobody said whether it succeeded is no failure.
     """
-    return source.is_chosen and (not recording.has_failed or options.include_failures)
+    return options.include_failures or not recording.has_failed
 
 
-def places_of(sources: Iterable[ExportSource]) -> list[Path]:
+def places_of(files: Sequence[Path]) -> list[Path]:
     """What an export must not write over: the recordings, and a run's folders of them with all that is in there.
 
     A dataset that lies beside them, as a run's own does, may be replaced.
     """
-    files = [source.path for source in sources]
     folders = dict.fromkeys(file.absolute().parent for file in files)
     return [*(folder for folder in folders if folder.name in ("episodes", "failed")), *files]
 
 
-def _attempt_order(source: ExportSource) -> tuple[str, bool, str]:
+def _attempt_order(file: Path) -> tuple[str, bool, str]:
     """Failed attempts at an episode before the one that succeeded."""
-    episode, _, attempt = source.path.stem.partition(".")
+    episode, _, attempt = file.stem.partition(".")
     return episode, not attempt, attempt
-
-
-@dataclass(frozen=True, kw_only=True)
-class Profile:
-    """What all recordings of a dataset must have in common, as (what, value) in words.
-
-    Attributes:
-        traits: That.
-        depth_left_out: Depth cameras that were not asked for.
-        is_silent: Whether it is an external episode whose source states no subtask.
-    """
-
-    traits: tuple[tuple[str, str], ...] = ()
-    depth_left_out: tuple[str, ...] = field(default=(), compare=False)
-    is_silent: bool = field(default=False, compare=False)
-
-    @classmethod
-    def of(cls, episode: ExportEpisode) -> Profile:
-        """That of an episode."""
-        return cls(traits=tuple(episode.traits()), depth_left_out=episode.depth_left_out, is_silent=episode.is_silent)
-
-    def differences(self, other: Profile) -> tuple[str, ...]:
-        """How `other` differs, in words."""
-        mine, theirs = dict(self.traits), dict(other.traits)
-        return tuple(
-            f"{what} is {theirs[what]} instead of {mine[what]}"
-            for what in mine
-            if what in theirs and theirs[what] != mine[what]
-        )
 
 
 class Intake:
@@ -128,34 +83,26 @@ class Intake:
     Attributes:
         skipped_failures: Failed attempts that were left out so far.
         skipped_unknown: Recordings that were left out since they end before their outcome.
-        depth_left_out: Depth cameras that were not asked for.
-        silent: Names of recordings of external episodes whose source states no subtask.
         num_taken: Recordings that go in.
     """
 
-    def __init__(self, found: Sequence[ExportSource], options: CommonOptions) -> None:
-        self.skipped_failures = self.skipped_unknown = 0
-        self.depth_left_out: tuple[str, ...] = ()
-        self.silent: list[str] = []
-        self.num_taken = 0
+    def __init__(self, found: Sequence[Path], options: CommonOptions) -> None:
+        self.skipped_failures = self.skipped_unknown = self.num_taken = 0
         self._found = found
         self._options = options
-        self._first: tuple[Profile, Path] | None = None
+        self._first: tuple[Mapping[str, str], Path] | None = None
 
-    def take(self, path: Path, profile: Profile) -> None:
-        """Note a recording that goes in.
+    def take(self, path: Path, traits: Mapping[str, str]) -> None:
+        """Note a recording that goes in, and what it must have in common with the others (`ExportEpisode.traits`).
 
         Raises:
             ConfigError: It does not go together with the first one.
         """
         if self._first is None:
-            self._first = profile, path
-            self.depth_left_out = profile.depth_left_out
-        elif profile != self._first[0]:
+            self._first = traits, path
+        elif traits != self._first[0]:
             _refuse_differences(*self._first, self._found, self._options)
         self.num_taken += 1
-        if profile.is_silent:
-            self.silent.append(path.name)
 
     def leave_out(self, outcome: Outcome | None) -> None:
         """Note a failed attempt, or one of unknown outcome, that only counts for the success rate."""
@@ -181,18 +128,20 @@ class Intake:
 
 
 def _refuse_differences(
-    profile: Profile, reference: Path, sources: Iterable[ExportSource], options: CommonOptions
+    traits: Mapping[str, str], reference: Path, files: Iterable[Path], options: CommonOptions
 ) -> None:
     """Raise ConfigError with every difference between the reference and any of the recordings that go in.
 
     Called only when one is known to differ: then all headers are read, so that the user hears of everything at once.
     """
     files_by_difference: dict[str, list[str]] = {}
-    for source in sources:
-        with open_recording(source.path) as recording:
-            if is_wanted(recording, options) and goes_in(source, recording, options):
-                for difference in profile.differences(Profile.of(exported(recording, options))):
-                    files_by_difference.setdefault(difference, []).append(source.path.name)
+    for file in files:
+        with open_recording(file) as recording:
+            if is_wanted(recording, options) and goes_in(recording, options):
+                for what, value in ExportEpisode(recording, options).traits():
+                    if traits.get(what, value) != value:
+                        difference = f"{what} is {value} instead of {traits[what]}"
+                        files_by_difference.setdefault(difference, []).append(file.name)
     if files_by_difference:
         told = "; ".join(
             f"{difference} ({listed(files, 3, ', ')})" for difference, files in files_by_difference.items()

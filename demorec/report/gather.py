@@ -13,7 +13,6 @@ from demorec.core.errors import ConfigError, ExportError, RecordingError, withou
 from demorec.core.plain import to_plain
 from demorec.core.processes import in_turn
 from demorec.datasets.episode import ExportEpisode
-from demorec.datasets.exported import exported
 from demorec.datasets.options import CommonOptions
 from demorec.episode.episode import Outcome
 from demorec.episode.features import ACTION, STATE
@@ -145,8 +144,8 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
 
 
 def _read_recording(recording: AnyRecording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
-    info, content = recording.info, exported(recording, CommonOptions())
-    names = () if content.simulated is None else content.simulated.columns.phase
+    info, content = recording.info, ExportEpisode(recording, CommonOptions())
+    names = () if content.simulated is None else content.columns.phase
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")

@@ -16,7 +16,7 @@ from support.language import NOUNS, language_of, meant, phrases
 from demorec.annotate.grounding import outline_area, run_lengths
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import rotation_from_quat
-from demorec.datasets.exported import exported
+from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot import ExportOptions, dataset_digest
 from demorec.datasets.lerobot.boxes import coco_string
 from demorec.datasets.lerobot.prepare import prepare_episode
@@ -164,7 +164,7 @@ def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
     with SimulatedRecording(path) as recording:
         options = ExportOptions(language=())
         told = prepare_episode(
-            exported(recording, options), options, encode_depth=False, about=[2 * step, last]
+            ExportEpisode(recording, options), options, encode_depth=False, about=[2 * step, last]
         ).language
     there = {row: events for row, (_, events) in enumerate(frames) if events}
     assert len(there) > 3

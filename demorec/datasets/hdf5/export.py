@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import ConfigError, ExportError
 from demorec.core.replacing import check_replaceable, written_whole
 from demorec.core.tables import environment_name
-from demorec.datasets.episode import DONE, ExportEpisode, Simulated
-from demorec.datasets.exported import exported
+from demorec.datasets.episode import DONE, ExportEpisode
 from demorec.datasets.hdf5.file import (
     DATASET,
     ENV_ARGUMENTS,
@@ -27,15 +26,7 @@ from demorec.datasets.hdf5.file import (
 )
 from demorec.datasets.hdf5.options import Hdf5Options
 from demorec.datasets.options import ExportReport, ProgressCallback
-from demorec.datasets.sources import (
-    ExportSource,
-    Intake,
-    Profile,
-    find_recordings,
-    goes_in,
-    is_wanted,
-    places_of,
-)
+from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
 from demorec.episode.episode import SimulatedColumns, SimulatedInfo
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 from demorec.mcap import open_recording
@@ -58,7 +49,7 @@ def export_hdf5(
         RecordingError: A recording is damaged, or lacks images that were asked for.
     """
     options.validate()
-    found = find_recordings(sources, include_failures=options.include_failures)
+    found = find_recordings(sources)
 
     def check() -> None:
         check_replaceable(out, DATASET, overwrite=options.overwrite, sources=places_of(found))
@@ -77,16 +68,18 @@ def export_hdf5(
 
 
 def _write(
-    writer: RobomimicWriter, found: Sequence[ExportSource], out: Path, progress: ProgressCallback | None
+    writer: RobomimicWriter, found: Sequence[Path], out: Path, progress: ProgressCallback | None
 ) -> ExportReport:
     options = writer.options
     intake = Intake(found, options)
-    for done, source in enumerate(found, start=1):
-        with open_recording(source.path) as recording:
+    depth_left_out: tuple[str, ...] = ()
+    for done, path in enumerate(found, start=1):
+        with open_recording(path) as recording:
             if is_wanted(recording, options):
-                if goes_in(source, recording, options):
-                    episode = exported(recording, options)
-                    intake.take(source.path, Profile.of(episode))
+                if goes_in(recording, options):
+                    episode = ExportEpisode(recording, options)
+                    intake.take(path, dict(episode.traits()))
+                    depth_left_out = depth_left_out or episode.depth_left_out
                     writer.add(episode)
                 else:
                     intake.leave_out(recording.outcome)
@@ -103,7 +96,7 @@ def _write(
         skipped_failures=intake.skipped_failures,
         skipped_unknown=intake.skipped_unknown,
         skipped_unwanted=intake.skipped_unwanted,
-        depth_left_out=intake.depth_left_out,
+        depth_left_out=depth_left_out,
     )
 
 
@@ -167,7 +160,7 @@ class RobomimicWriter:
         demo["dones"] = dones
         _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
         if (simulated := episode.simulated) is not None:
-            _add_vectors(demo, "states", *_states(simulated.columns, episode.rows, simulated.recording.info))
+            _add_vectors(demo, "states", *_states(episode.columns, episode.rows, simulated.info))
         group = demo.create_group("obs")
         for name, (feature, elements) in observations.items():
             _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
@@ -234,11 +227,11 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
         assert arguments.keys() == EXTERNAL_ARGUMENTS
         described = {"env_name": EXTERNAL_ENVIRONMENT, "type": _GYM, "env_kwargs": arguments}
         return {"env_args": json.dumps(described), "fps": episode.fps}
-    return {**_environment(simulated, episode, arguments), "fps": episode.fps}
+    return {**_environment(simulated.info, episode, arguments), "fps": episode.fps}
 
 
-def _environment(simulated: Simulated, episode: ExportEpisode, arguments: dict[str, object]) -> dict[str, str | int]:
-    info, options = simulated.recording.info, episode.options
+def _environment(info: SimulatedInfo, episode: ExportEpisode, arguments: dict[str, object]) -> dict[str, str | int]:
+    options = episode.options
     cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
     arguments |= {
         "physics_hz": info.physics_hz,

@@ -19,20 +19,8 @@ from demorec.datasets.staging import sync_file
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
 
 
-@dataclass(frozen=True, kw_only=True)
-class EpisodeBoxes:
-    """What one camera sees in one episode.
-
-    Attributes:
-        width, height: Of the images, px.
-        num_frames: How many there are.
-        objects: What is seen, row by row.
-    """
-
-    width: int
-    height: int
-    num_frames: int
-    objects: tuple[SeenObject, ...]
+SeenByCamera = tuple[int, int, tuple[SeenObject, ...]]
+"""Width and height of a camera's images in an episode, px, and what is seen in them, row by row."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,12 +73,12 @@ class BoxWriter:
         for camera in self._cameras.values():
             camera.close()
 
-    def add(self, episode_index: int, boxes: Mapping[str, EpisodeBoxes], num_frames: int) -> None:
+    def add(self, episode_index: int, boxes: Mapping[str, SeenByCamera], num_frames: int) -> None:
         """What the cameras (features) see in the next episode."""
         for key, seen in boxes.items():
             if key not in self._cameras:
                 self._cameras[key] = _CameraFile(self._root / BOXES_DIR / f"{key}.json", key, self._fps)
-            self._cameras[key].add(episode_index, seen, self._num_frames)
+            self._cameras[key].add(episode_index, seen, self._num_frames, num_frames)
         self._num_frames += num_frames
 
     def finish(self) -> None:
@@ -112,12 +100,13 @@ class _CameraFile:
         self._num_annotations = 0
         self._num_images = 0
 
-    def add(self, episode_index: int, seen: EpisodeBoxes, first_index: int) -> None:
-        for row in range(seen.num_frames):
+    def add(self, episode_index: int, seen: SeenByCamera, first_index: int, num_frames: int) -> None:
+        width, height, objects = seen
+        for row in range(num_frames):
             image = {
                 "id": first_index + row,
-                "width": seen.width,
-                "height": seen.height,
+                "width": width,
+                "height": height,
                 "file_name": f"{self._key}/episode_{episode_index:06d}/frame_{row:06d}.png",
                 "episode_index": episode_index,
                 "frame_index": row,
@@ -125,7 +114,7 @@ class _CameraFile:
             }
             self._images.write((",\n" if self._num_images else "") + json.dumps(image))
             self._num_images += 1
-        for item in seen.objects:
+        for item in objects:
             category = self._categories.setdefault(item.noun, len(self._categories) + 1)
             self._num_annotations += 1
             annotation = {
@@ -135,7 +124,7 @@ class _CameraFile:
                 "bbox": list(item.box),
                 "area": item.area,
                 "iscrowd": 0,
-                "segmentation": {"size": [seen.height, seen.width], "counts": coco_string(item.counts)},
+                "segmentation": {"size": [height, width], "counts": coco_string(item.counts)},
                 "object": item.name,
                 "color": item.color,
                 "visible_fraction": item.visible_fraction,

@@ -10,7 +10,6 @@ import hashlib
 import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -98,30 +97,23 @@ THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
 _EPISODES, _MOMENTS, _SIDE, _LABEL, _GAP = 4, 5, 160, 18, 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class CardFacts:
-    """What the card tells that is not in the dataset's tables.
+def write_card(
+    root: Path, info: DatasetInfo, options: ExportOptions, configs: Mapping[str, Any], *, is_transcoded: bool
+) -> None:
+    """Write the card and the thumbnails of a finished dataset folder.
 
-    Attributes:
+    Args:
+        root: The folder.
+        info: Of it.
         options: Of the export.
-        configs: Config digest -> configuration of the runs.
-        is_transcoded: Whether any pictures were coded anew.
-        is_simulated: Whether demorec simulated the episodes.
+        configs: Config digest -> configuration of the runs; none where demorec simulated no episode.
+        is_transcoded: Whether any images were encoded anew.
     """
-
-    options: ExportOptions
-    configs: Mapping[str, Any]
-    is_transcoded: bool
-    is_simulated: bool
-
-
-def write_card(root: Path, info: DatasetInfo, about: CardFacts) -> None:
-    """Write the card and the thumbnails of a finished dataset folder."""
     has_sheet = write_thumbnails(root, info)
     there = root / CARD_PATH
     path = root / SECOND_CARD_PATH if has_own_card(root) else there
     path.unlink(missing_ok=True)
-    write_text(path, _marked("\n".join(_card(root, info, about, has_sheet)) + "\n"))
+    write_text(path, _marked("\n".join(_card(root, info, options, configs, is_transcoded, has_sheet)) + "\n"))
 
 
 def has_own_card(root: Path) -> bool:
@@ -139,22 +131,27 @@ def _marked(text: str) -> str:
     return text + _MARK.format(digest=hashlib.sha256(text.encode()).hexdigest()[:16])
 
 
-def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> Iterable[str]:
-    options = about.options
+def _card(
+    root: Path,
+    info: DatasetInfo,
+    options: ExportOptions,
+    configs: Mapping[str, Any],
+    is_transcoded: bool,
+    has_sheet: bool,
+) -> Iterable[str]:
+    is_simulated = bool(configs)
     tasks = read_tasks(root)
     minutes = info.total_frames / info.fps / 60
-    pictures = (
-        "some pictures were coded anew" if about.is_transcoded else "every video packet is the one that was recorded"
-    )
+    pictures = "some pictures were coded anew" if is_transcoded else "every video packet is the one that was recorded"
     yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
-    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if about.is_simulated else []))
+    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if is_simulated else []))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
     yield from (f"# {options.repo_id}", "")
     robot = markdown(str(info.robot_type))
     plural = "" if info.total_episodes == 1 else "s"
     whose = (
         f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
-        if about.is_simulated
+        if is_simulated
         else f"demonstration{plural} of {robot}"
     )
     yield (
@@ -173,15 +170,15 @@ def _card(root: Path, info: DatasetInfo, about: CardFacts, has_sheet: bool) -> I
     yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
     for key, item in info.features.items():
         name = f"`{key}`" if markdown(key) == key else markdown(key)
-        yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_meaning(key, item, about)} |"
+        yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_meaning(key, item, options, is_simulated)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
-    yield from (_SIMULATED_ROWS if about.is_simulated else _EXTERNAL_ROWS, "")
+    yield from (_SIMULATED_ROWS if is_simulated else _EXTERNAL_ROWS, "")
     yield from _success_section(root)
-    yield from ("## What stands beside", "", _BESIDE_SIMULATED if about.is_simulated else _BESIDE_EXTERNAL)
+    yield from ("## What stands beside", "", _BESIDE_SIMULATED if is_simulated else _BESIDE_EXTERNAL)
     yield from _robot_section(root)
     yield ""
-    if about.is_simulated:
-        yield from _origin_section(root, about)
+    if is_simulated:
+        yield from _origin_section(root, configs, options)
 
 
 def _robot_section(root: Path) -> Iterable[str]:
@@ -196,17 +193,12 @@ def _robot_section(root: Path) -> Iterable[str]:
         )
 
 
-def _meaning(key: str, item: DatasetFeature, about: CardFacts) -> str:
-    if (
-        not about.is_simulated
-        and not key.startswith(IMAGE_PREFIX)
-        and key not in AUTOMATIC_FEATURES
-        and key != "next.done"
-    ):
+def _meaning(key: str, item: DatasetFeature, options: ExportOptions, is_simulated: bool) -> str:
+    if not is_simulated and not key.startswith(IMAGE_PREFIX) and key not in AUTOMATIC_FEATURES and key != "next.done":
         return "as it was recorded"
     if key == ACTION:
-        return _ACTION_MEANING[about.options.action]
-    if key == STATE and about.options.state == "joint_ee":
+        return _ACTION_MEANING[options.action]
+    if key == STATE and options.state == "joint_ee":
         return f"{_MEANING[STATE]}, {_MEANING[EE_POSE]}"
     if item.is_depth:
         return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
@@ -217,14 +209,14 @@ def _meaning(key: str, item: DatasetFeature, about: CardFacts) -> str:
     return _MEANING.get(key, "filled in by LeRobot's rules")
 
 
-def _origin_section(root: Path, about: CardFacts) -> Iterable[str]:
+def _origin_section(root: Path, configs: Mapping[str, Any], options: ExportOptions) -> Iterable[str]:
     yield "## Origin"
     yield ""
-    for digest, config in about.configs.items():
+    for digest, config in configs.items():
         chosen = ", ".join(f"{key} {config[key]}" for key in ("task", "robot", "renderer", "seed") if key in config)
         yield f"- configuration `{markdown(digest) or 'unknown'}`: {markdown(chosen) or 'not recorded'}"
     yield ""
-    commands = making_commands(root, about.configs, about.options)
+    commands = making_commands(root, configs, options)
     if commands:
         yield from ("Made by these commands:", "", "```sh", *map(printable, commands), "```", "")
         yield "This makes it again, from what this folder says about itself, and compares every episode to the bit:"

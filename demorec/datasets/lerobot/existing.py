@@ -115,20 +115,19 @@ def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistic
     return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
 
 
-def features_to_append(
-    existing: Existing, offered: dict[str, DatasetFeature], *, fps: int, robot: str
-) -> tuple[str, ...]:
-    """Check that the recordings can give every feature of the dataset; return those that it does not have.
+def features_to_append(existing: Existing, new: DatasetInfo) -> tuple[str, ...]:
+    """Check that the recordings, of which alone `new` would be made, can give every feature of the dataset; return
+    those that it does not have.
 
     Raises:
         ConfigError: All differences in one message.
     """
-    info = existing.info
+    info, offered = existing.info, new.features
     wrong = []
-    if info.fps != fps:
-        wrong.append(f"fps is {info.fps}, the recordings give {fps}")
-    if info.robot_type not in (None, robot):
-        wrong.append(f"robot_type is {info.robot_type!r}, the recordings have {robot!r}")
+    if info.fps != new.fps:
+        wrong.append(f"fps is {info.fps}, the recordings give {new.fps}")
+    if info.robot_type not in (None, new.robot_type):
+        wrong.append(f"robot_type is {info.robot_type!r}, the recordings have {new.robot_type!r}")
     for name, feature in info.features.items():
         if name in AUTOMATIC_FEATURES:
             continue

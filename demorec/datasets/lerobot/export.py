@@ -17,13 +17,13 @@ import numpy as np
 from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, in_words
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
-from demorec.datasets.exported import exported
-from demorec.datasets.lerobot.boxes import BoxWriter, EpisodeBoxes
-from demorec.datasets.lerobot.card import CardFacts, has_own_card, write_card
+from demorec.datasets.episode import ExportEpisode
+from demorec.datasets.lerobot.boxes import BoxWriter, SeenByCamera
+from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
 from demorec.datasets.lerobot.facts import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
 from demorec.datasets.lerobot.inspect import episode_digests
-from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetFeature, DatasetInfo, combined_digest
+from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetInfo, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import dataset_features, episode_boxes, prepare_episode, reasons_to_transcode
@@ -31,7 +31,7 @@ from demorec.datasets.lerobot.sidecar import EpisodeRecord, SidecarWriter, attem
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData, WriterStart
 from demorec.datasets.options import ExportReport, ProgressCallback
-from demorec.datasets.sources import ExportSource, Intake, Profile, find_recordings, goes_in, is_wanted, places_of
+from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
 from demorec.datasets.staging import CODED, staged_folder
 from demorec.episode.episode import Outcome
 from demorec.mcap import open_recording
@@ -56,7 +56,7 @@ def export_lerobot(
         RecordingError: A recording is damaged.
     """
     options.validate()
-    found = find_recordings(sources, include_failures=options.include_failures)
+    found = find_recordings(sources)
     existing = open_existing(out) if options.append and out.exists() else None
     verifies = options.verify and lerobot_is_installed()
     kind, replace_it = (DATASET, options.overwrite) if existing is None else (GROWING_DATASET, True)
@@ -82,9 +82,7 @@ def export_lerobot(
 class _Export:
     """One export into an empty (or linked) folder."""
 
-    def __init__(
-        self, folder: Path, found: list[ExportSource], options: ExportOptions, existing: Existing | None
-    ) -> None:
+    def __init__(self, folder: Path, found: list[Path], options: ExportOptions, existing: Existing | None) -> None:
         self._folder = folder
         self._found = found
         self._options = options
@@ -95,6 +93,7 @@ class _Export:
         self._progress: list[EpisodeProgress] = []
         self._digests: list[str] = []
         self._recordings: list[Path] = []
+        self._silent: list[str] = []
         self._intake = Intake(found, options)
         self._is_simulated = True
 
@@ -129,13 +128,7 @@ class _Export:
             configs = sidecar.finish(self._about_this_export())
         if self._options.progress:
             write_progress(self._folder, [*self._progress_before(), *self._progress])
-        facts = CardFacts(
-            options=self._options,
-            configs=configs,
-            is_transcoded=bool(self._transcoded),
-            is_simulated=self._is_simulated,
-        )
-        write_card(self._folder, finished, facts)
+        write_card(self._folder, finished, self._options, configs, is_transcoded=bool(self._transcoded))
         return ExportReport(
             path=self._folder,
             num_episodes=finished.total_episodes,
@@ -147,8 +140,8 @@ class _Export:
             skipped_unwanted=self._intake.skipped_unwanted,
             transcoded=tuple(self._transcoded),
             left_out=self._left_out,
-            depth_left_out=self._intake.depth_left_out,
-            silent=() if self._options.language is None else tuple(self._intake.silent),
+            depth_left_out=begun[-1].depth_left_out,
+            silent=tuple(self._silent),
             digest=combined_digest(finished, [*self._before, *self._digests]),
         )
 
@@ -161,12 +154,10 @@ class _Export:
 
     def _dataset_info(self, first: Reading) -> DatasetInfo:
         if self._existing is not None:
-            self._left_out = features_to_append(self._existing, first.features, fps=first.fps, robot=first.robot)
+            self._left_out = features_to_append(self._existing, first.info)
             return self._existing.info
-        return DatasetInfo(
-            fps=first.fps,
-            features=first.features,
-            robot_type=first.robot,
+        return replace(
+            first.info,
             chunks_size=self._options.files_per_chunk,
             data_files_size_in_mb=self._options.data_files_mb,
             video_files_size_in_mb=self._options.video_files_mb,
@@ -193,7 +184,7 @@ class _Export:
             if reading.data is None:
                 self._intake.leave_out(reading.outcome)
             else:
-                self._intake.take(reading.path, reading.profile)
+                self._intake.take(reading.path, reading.traits)
             yield reading
 
     def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, reading: Reading) -> None:
@@ -201,7 +192,9 @@ class _Export:
             sidecar.add_attempt(reading.attempt, in_dataset=False)
             return
         written = writer.add(reading.data)
-        sidecar.add(written, reading.record)
+        sidecar.add(written, reading.record, reading.attempt)
+        if self._options.language is not None and not reading.is_simulated and not reading.data.language.persistent:
+            self._silent.append(reading.path.name)
         if self._options.progress:
             facts = reading.data.facts
             self._progress.append(EpisodeProgress.from_row(facts, facts["num_goals"]))
@@ -222,11 +215,7 @@ class _Export:
 
     def _refuse_silence(self) -> None:
         """Raise ConfigError when language is asked for and nobody said a word in any episode of a new dataset."""
-        if (
-            self._existing is None
-            and self._options.language is not None
-            and len(self._intake.silent) == self._intake.num_taken
-        ):
+        if self._existing is None and self._options.language is not None and len(self._silent) == len(self._recordings):
             raise ConfigError(
                 "Language is asked for, but the episodes are external and no source of them states a subtask (in the "
                 "mapping of an import, [subtasks] names the topic of it): leave --language out."
@@ -308,8 +297,9 @@ class Reading:
             that an export does not fail for what it leaves out.
         record: Of it, for the sidecar.
         boxes: Camera feature -> what it sees, if that was asked for.
-        profile: What must agree with all the others.
-        features, fps, robot: Of a dataset made from it.
+        traits: What must agree with all the others.
+        info: Of a dataset made from it.
+        depth_left_out: Depth cameras that were not asked for.
         transcoded: Cameras whose images had to be encoded anew, with the reason.
         is_simulated: Whether demorec simulated the episode.
     """
@@ -319,38 +309,40 @@ class Reading:
     outcome: Outcome | None
     data: EpisodeData | None = None
     record: EpisodeRecord | None = None
-    boxes: Mapping[str, EpisodeBoxes] = field(default_factory=dict)
-    profile: Profile = field(default_factory=Profile)
-    features: dict[str, DatasetFeature] = field(default_factory=dict)
-    fps: int = 0
-    robot: str = ""
+    boxes: Mapping[str, SeenByCamera] = field(default_factory=dict)
+    traits: Mapping[str, str] = field(default_factory=dict)
+    info: DatasetInfo = field(default_factory=lambda: DatasetInfo(fps=1, features={}))
+    depth_left_out: tuple[str, ...] = ()
     transcoded: tuple[str, ...] = ()
     is_simulated: bool = False
 
 
-def read(source: ExportSource, options: ExportOptions) -> Reading | None:
+def read(path: Path, options: ExportOptions) -> Reading | None:
     """Read one recording; None if its episode is not wanted (`is_wanted`).
 
     Raises:
         RecordingError: It is damaged.
         ExportError: It has no frames, or its fps is no multiple of the wanted one.
     """
-    with open_recording(source.path) as recording:
+    with open_recording(path) as recording:
         if not is_wanted(recording, options):
             return None
         attempt = attempt_row(recording)
-        if not goes_in(source, recording, options):
-            return Reading(path=source.path, attempt=attempt, outcome=recording.outcome)
-        episode = exported(recording, options)
+        if not goes_in(recording, options):
+            return Reading(path=path, attempt=attempt, outcome=recording.outcome)
+        episode = ExportEpisode(recording, options)
         reasons = reasons_to_transcode(episode)
         return Reading(
-            path=source.path,
+            path=path,
             attempt=attempt,
             outcome=recording.outcome,
-            profile=Profile.of(episode),
-            features=dataset_features(episode, options),
-            fps=episode.fps,
-            robot=recording.info.robot_name,
+            traits=dict(episode.traits()),
+            info=DatasetInfo(
+                fps=episode.fps,
+                features=dataset_features(episode, options),
+                robot_type=recording.info.robot_name,
+            ),
+            depth_left_out=episode.depth_left_out,
             transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
             is_simulated=episode.simulated is not None,
             data=prepare_episode(episode, options),
@@ -360,7 +352,7 @@ def read(source: ExportSource, options: ExportOptions) -> Reading | None:
 
 
 def readings(
-    sources: Sequence[ExportSource], options: ExportOptions, progress: ProgressCallback | None, *, aside: Path
+    sources: Sequence[Path], options: ExportOptions, progress: ProgressCallback | None, *, aside: Path
 ) -> Iterator[Reading]:
     """Every wanted recording in order; several processes read ahead where that pays, and leave images in `aside`."""
     workers = options.workers or _workers_that_pay(sources, options)
@@ -372,15 +364,15 @@ def readings(
             progress(done, len(sources))
 
 
-def _workers_that_pay(sources: Sequence[ExportSource], options: ExportOptions) -> int:
+def _workers_that_pay(sources: Sequence[Path], options: ExportOptions) -> int:
     transcodes = options.depth or options.fps is not None
-    size = sum(source.path.stat().st_size for source in sources) * (20 if transcodes else 1)
+    size = sum(path.stat().st_size for path in sources) * (20 if transcodes else 1)
     return min(available_cores(), 8) if size >= _BYTES_THAT_PAY else 1
 
 
-def _read_aside(source: ExportSource, options: ExportOptions, folder: Path) -> Reading | None:
+def _read_aside(path: Path, options: ExportOptions, folder: Path) -> Reading | None:
     """`read`, with the images in files: through a pipe they cost as much as all the rest."""
-    reading = read(source, options)
+    reading = read(path, options)
     if reading is None or reading.data is None:
         return reading
     videos = {key: video.put_aside(folder) for key, video in reading.data.videos.items()}

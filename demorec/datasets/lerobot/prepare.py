@@ -16,7 +16,7 @@ from demorec.annotate.tries import story_of
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
-from demorec.datasets.lerobot.boxes import EpisodeBoxes
+from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.depth import depth_info, depth_video
 from demorec.datasets.lerobot.facts import EpisodeProgress, episode_facts
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
@@ -108,14 +108,13 @@ def _language(episode: ExportEpisode, options: ExportOptions, about: Collection[
     if (simulated := episode.simulated) is None:
         stated = [Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in episode.subtasks]
         return episode_language(stated, fps=episode.fps)
-    recording = simulated.recording
-    cameras = [camera for camera in recording.cameras if options.takes(IMAGE_PREFIX + camera)]
-    if "vqa" in (options.language or ()) and not any(map(recording.has_segmentation, cameras)):
+    cameras = [camera for camera in simulated.cameras if options.takes(IMAGE_PREFIX + camera)]
+    if "vqa" in (options.language or ()) and not any(map(simulated.has_segmentation, cameras)):
         raise ConfigError(
             "Questions about images (vqa) need recordings with segmentation (generate --segmentation), leave them "
-            f"out: {recording.path}"
+            f"out: {simulated.path}"
         )
-    told = narrate(recording, simulated.columns, episode.rows, options.spoken, cameras, about=about)
+    told = narrate(simulated, episode.columns, episode.rows, options.spoken, cameras, about=about)
     return episode_language(told, fps=episode.fps)
 
 
@@ -123,15 +122,15 @@ def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
     """What is known of a simulated episode, its stages among it if they were asked for."""
     if (simulated := episode.simulated) is None:
         return {}
-    facts = episode_facts(simulated.recording, simulated.columns)
+    facts = episode_facts(simulated, episode.columns)
     if options.progress:
-        runs = dense_runs(story_of(simulated.recording, simulated.columns), episode.rows)
-        num_goals = len(simulated.recording.info.scene.goals)
+        runs = dense_runs(story_of(simulated, episode.columns), episode.rows)
+        num_goals = len(simulated.info.scene.goals)
         facts |= EpisodeProgress(num_goals=num_goals, dense=tuple(runs)).row()
     return facts
 
 
-def episode_boxes(episode: ExportEpisode) -> dict[str, EpisodeBoxes]:
+def episode_boxes(episode: ExportEpisode) -> dict[str, SeenByCamera]:
     """Camera feature -> what it sees, of the cameras that have segmentation.
 
     Raises:
@@ -140,12 +139,10 @@ def episode_boxes(episode: ExportEpisode) -> dict[str, EpisodeBoxes]:
     boxes = {}
     if (simulated := episode.simulated) is not None:
         taken = {camera.name for camera in episode.cameras}
-        for camera in simulated.recording.info.scene.cameras:
-            if camera.name in taken and simulated.recording.has_segmentation(camera.name):
-                seen = seen_objects(simulated.recording, simulated.columns, episode.rows, camera)
-                boxes[IMAGE_PREFIX + camera.name] = EpisodeBoxes(
-                    width=camera.width, height=camera.height, num_frames=len(episode.rows), objects=tuple(seen)
-                )
+        for camera in simulated.info.scene.cameras:
+            if camera.name in taken and simulated.has_segmentation(camera.name):
+                seen = seen_objects(simulated, episode.columns, episode.rows, camera)
+                boxes[IMAGE_PREFIX + camera.name] = camera.width, camera.height, tuple(seen)
     if not boxes:
         raise ConfigError(
             "Boxes need recordings with segmentation (generate --segmentation), leave them out: "

@@ -87,15 +87,16 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     Raises:
         RecordingError: The recording is damaged.
     """
-    spec = None if episode.simulated is None else episode.simulated.recording.info.robot
+    spec = None if episode.simulated is None else episode.simulated.info.robot
     if not (text := episode.urdf):
         return None
     urdf = portable_urdf(text) if spec is None else text
+    joints, units = episode.joints()
     record = RobotRecord(
         name=episode.recording.info.robot_name,
         urdf_sha256=_sha256(urdf),
-        joints=dict(episode.joints),
-        units=dict(episode.units),
+        joints=joints,
+        units=units,
         spec=spec,
         meshes={} if spec is None else _mesh_names(spec.urdf),
     )

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.core.plain import to_json, to_plain
-from demorec.datasets.episode import ExportEpisode, Simulated
+from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.facts import first_goal
 from demorec.datasets.lerobot.layout import (
     SIDECAR_ATTEMPTS_PATH,
@@ -38,7 +38,7 @@ from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
 from demorec.datasets.lerobot.writer import WrittenEpisode, write_text
 from demorec.episode.episode import SimulatedColumns
 from demorec.episode.scene import Scene
-from demorec.mcap import AnyRecording
+from demorec.mcap import AnyRecording, SimulatedRecording
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
@@ -107,14 +107,12 @@ class EpisodeRecord:
 
     Attributes:
         row: Of the episodes' table, less the index.
-        attempt: Of the attempts' table, less `in_dataset`.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
         config_digest, config: Of its run.
         robot: What draws and moves its arm; None where that is not known.
     """
 
     row: Mapping[str, Any]
-    attempt: Mapping[str, Any]
     moving_cameras: Mapping[str, Array]
     config_digest: str
     config: Mapping[str, Any]
@@ -132,23 +130,22 @@ class EpisodeRecord:
         }
         moving: dict[str, Array] = {}
         if (simulated := episode.simulated) is not None:
-            row |= _simulated_row(simulated, rows)
-            cameras = simulated.recording.info.scene.cameras
-            poses = simulated.columns.world_from_camera
+            row |= _simulated_row(episode, simulated)
+            cameras = simulated.info.scene.cameras
+            poses = episode.columns.world_from_camera
             moving = {camera.name: poses[camera.name][rows] for camera in cameras if camera.mount != "world"}
         return cls(
             row=row,
-            attempt=attempt,
             moving_cameras=moving,
-            config_digest="" if simulated is None else simulated.recording.info.config_digest,
-            config={} if simulated is None else simulated.recording.info.config,
+            config_digest="" if simulated is None else simulated.info.config_digest,
+            config={} if simulated is None else simulated.info.config,
             robot=robot_of(episode),
         )
 
 
-def _simulated_row(simulated: Simulated, rows: NDArray[np.intp]) -> dict[str, Any]:
+def _simulated_row(episode: ExportEpisode, simulated: SimulatedRecording) -> dict[str, Any]:
     """What is known of a simulated episode; it failed where its recording ends without an outcome."""
-    info, columns, outcome = simulated.recording.info, simulated.columns, simulated.recording.outcome
+    info, columns, outcome = simulated.info, episode.columns, simulated.outcome
     return {
         "root_seed": info.root_seed,
         "task": info.task,
@@ -158,8 +155,8 @@ def _simulated_row(simulated: Simulated, rows: NDArray[np.intp]) -> dict[str, An
         "final_state_digest": "" if outcome is None else outcome.final_state_digest,
         "checks": [] if outcome is None else [to_plain(check) for check in outcome.checks],
         "behaviour": sorted(info.behaviour.items()),
-        "phases": _phases(columns, rows),
-        "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[rows]).tolist(),
+        "phases": _phases(columns, episode.rows),
+        "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[episode.rows]).tolist(),
         **_things(info.scene, columns),
         "episode_info": to_json(info),
     }
@@ -234,8 +231,8 @@ class SidecarWriter:
             if table is not None:
                 table.abort()
 
-    def add(self, written: WrittenEpisode, record: EpisodeRecord) -> None:
-        """What belongs to an episode of the dataset."""
+    def add(self, written: WrittenEpisode, record: EpisodeRecord, attempt: Mapping[str, Any]) -> None:
+        """What belongs to an episode of the dataset, and the attempt that it was."""
         episode_index = written.episode_index
         robot = record.robot
         added = {"episode_index": episode_index, "content_digest": written.digest}
@@ -244,7 +241,7 @@ class SidecarWriter:
             write_robot(self._root, robot)
         if record.config_digest or record.config:
             self._configs.setdefault(record.config_digest, record.config)
-        self.add_attempt(record.attempt, in_dataset=True)
+        self.add_attempt(attempt, in_dataset=True)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)
         if len(self._episode_rows) >= _ROWS_PER_TABLE:

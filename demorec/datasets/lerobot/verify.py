@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from demorec.core.errors import DemorecError, ExportError, in_words, resource_error
 from demorec.core.processes import SPAWN
 from demorec.datasets.episode import ExportCamera, ExportEpisode
-from demorec.datasets.exported import exported
 from demorec.datasets.lerobot.depth import code_values, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
 from demorec.datasets.lerobot.options import ExportOptions
@@ -141,7 +140,7 @@ def _compare_episode(
     dataset: Any, episode_index: int, recording: AnyRecording, options: ExportOptions, number: int
 ) -> int:
     first = int(dataset.meta.episodes[episode_index]["dataset_from_index"])
-    episode = exported(recording, options)
+    episode = ExportEpisode(recording, options)
     length = len(episode.rows)
     # The last frame, where offsets add up, and one more that differs from episode to episode.
     moments = sorted({(number * 37) % length, length - 1})
