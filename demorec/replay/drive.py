@@ -208,7 +208,7 @@ def _report(
         first = d.num_steps, "the final state"
     arm = np.abs(off["joint positions"][:, : len(d.info.robot.arm_joints)]).max(axis=1)
     distances = np.array([np.linalg.norm(off[f"the pose of {name}"][:, :3], axis=1) for name in d.object_poses])
-    number, step = np.unravel_index(int(distances.argmax()), distances.shape) if len(distances) else (0, 0)
+    number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
     distance = float(distances[number, step]) if len(distances) else 0.0
     checks = outcome.checks if is_judged else ()
     failed = tuple(check.name for check in checks if not check.passed)
@@ -222,7 +222,7 @@ def _report(
         joint_error_step=int(arm.argmax()),
         gripper_error=float(np.abs(off["gripper opening"]).max()),
         object_error=distance,
-        object_error_step=int(step),
+        object_error_step=step,
         object_error_name="" if distance == 0.0 else list(d.object_poses)[number],
         compares_objects=bool(d.object_poses),
         recorded_success=d.recorded_success,
