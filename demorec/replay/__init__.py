@@ -7,8 +7,7 @@ float32 actions of any kind, still does the task.
 """
 
 from demorec.replay.demonstration import Demonstration, ReplayOptions, dataset_demonstrations, open_file
-from demorec.replay.drive import ReplayReport, is_as_recorded
-from demorec.replay.many import replay_all
+from demorec.replay.drive import ReplayReport, is_as_recorded, replay_all
 
 __all__ = [
     "Demonstration",

@@ -1,26 +1,32 @@
-"""The actions of a demonstration into the simulator, and every state compared with the recorded one."""
+"""The actions of a demonstration into the simulator, recorded if wanted; every state compared with the recorded one."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain, repeat
+from pathlib import Path
 
 import numpy as np
 
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.files import make_folder
 from demorec.core.geometry import Array
+from demorec.core.plain import from_plain
 from demorec.core.seeding import generator
 from demorec.core.tables import TASKS
-from demorec.episode.episode import Action, Frame, Outcome
-from demorec.loop import Decision, Session
+from demorec.episode.episode import Action, Frame, Observation, Outcome
+from demorec.loop import Decision, Session, SimulatorCache
 from demorec.loop.actions import ActionDecoder
+from demorec.mcap import SimulatedWriter
 from demorec.mcap.streams import pose_of
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions
+from demorec.replay.rerender import recorded_view, view_behaviour, view_painter
+from demorec.robots.assets import allow_models
 from demorec.sim.world import World
-
-FrameSink = Callable[[Frame], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,51 +67,13 @@ class ReplayReport:
     unreachable: int = 0
 
 
-@dataclass(kw_only=True)
-class _Comparison:
-    """What is kept of the comparison while the steps go by."""
-
-    demonstration: Demonstration
-    first: tuple[int, str] | None = None
-    joint: tuple[float, int] = (0.0, 0)
-    gripper: float = 0.0
-    object: tuple[float, int, str] = (0.0, 0, "")
-
-    def take(self, frame: Frame) -> None:
-        """Compare what is seen now with what was recorded at that step."""
-        d, seen, step = self.demonstration, frame.observation, frame.frame_index
-        num_arm = len(d.info.robot.arm_joints)
-        recorded = d.joint_position[step]
-        differences = [
-            ("joint positions", float(np.abs(seen.joint_position[: len(recorded)] - recorded).max())),
-            ("gripper opening", abs(seen.gripper_width - float(d.gripper_width[step]))),
-        ]
-        if d.joint_velocity is not None:
-            off = np.abs(seen.joint_velocity - d.joint_velocity[step])
-            differences.append(("joint velocities", float(off.max())))
-        for name, poses in d.object_poses.items():
-            off = np.abs(seen.object_poses[name].vector() - poses[step])
-            differences.append((f"the pose of {name}", float(off.max())))
-            distance = math.dist(seen.object_poses[name].position, poses[step, :3])
-            if distance > self.object[0] or not math.isfinite(distance):
-                self.object = (distance, step, name)
-        if self.first is None:
-            # Written so that what is no number differs.
-            what = next((name for name, off in differences if not off <= d.tolerance), None)
-            self.first = None if what is None else (step, what)
-        arm = float(np.abs(seen.joint_position[:num_arm] - recorded[:num_arm]).max())
-        if arm > self.joint[0] or not math.isfinite(arm):
-            self.joint = (arm, step)
-        self.gripper = max(self.gripper, differences[1][1])
-
-
 def replay(
     demonstration: Demonstration,
     world: World,
     options: ReplayOptions,
     *,
     painter: Painter | None = None,
-    sink: FrameSink | None = None,
+    sink: Callable[[Frame], None] | None = None,
 ) -> tuple[ReplayReport, Outcome]:
     """Send the actions of a demonstration and compare.
 
@@ -123,16 +91,13 @@ def replay(
     task = None if options.states else TASKS.load(d.info.task, options.allowed)()
     session = Session(world, d.info.scene, task, painter=painter)
     agent = DemonstrationAgent(d, options)
-    comparison = _Comparison(demonstration=d)
-    num_steps = 0
+    seen: list[Observation] = []
     for frame in _placed(session, d) if options.states else session.run(agent):
-        if frame.frame_index < d.num_steps:
-            comparison.take(frame)
+        seen.append(frame.observation)
         if sink is not None:
             sink(frame)
-        num_steps += 1
     outcome = _recorded_outcome(d, world) if options.states else session.outcome
-    return _report(comparison, agent, outcome, num_steps=num_steps, is_judged=not options.states), outcome
+    return _report(d, seen, outcome, is_judged=not options.states, unreachable=agent.num_unreachable), outcome
 
 
 class DemonstrationAgent:
@@ -231,32 +196,54 @@ def _recorded_outcome(d: Demonstration, world: World) -> Outcome:
 
 
 def _report(
-    comparison: _Comparison, agent: DemonstrationAgent, outcome: Outcome, *, num_steps: int, is_judged: bool
+    d: Demonstration, seen: Sequence[Observation], outcome: Outcome, *, is_judged: bool, unreachable: int
 ) -> ReplayReport:
-    d = comparison.demonstration
-    first = comparison.first
-    if first is None and is_judged and d.final_state_digest not in ("", outcome.final_state_digest):
-        first = (d.num_steps, "the final state")
+    off = _differences(d, seen[: d.num_steps])
+    differs = np.array([~(np.abs(values).max(axis=1) <= d.tolerance) for values in off.values()])  # as NaN does
+    first = None
+    if differs.any():
+        step = int(differs.any(axis=0).argmax())
+        first = step, list(off)[int(differs[:, step].argmax())]
+    elif is_judged and d.final_state_digest not in ("", outcome.final_state_digest):
+        first = d.num_steps, "the final state"
+    arm = np.abs(off["joint positions"][:, : len(d.info.robot.arm_joints)]).max(axis=1)
+    distances = np.array([np.linalg.norm(off[f"the pose of {name}"][:, :3], axis=1) for name in d.object_poses])
+    number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
+    distance = float(distances[number, step]) if len(distances) else 0.0
     checks = outcome.checks if is_judged else ()
     failed = tuple(check.name for check in checks if not check.passed)
     return ReplayReport(
         name=d.name,
-        num_steps=num_steps,
+        num_steps=len(seen),
         is_bitwise=bool(d.object_poses) or d.joint_velocity is not None,
         is_identical=first is None,
         first_difference=first,
-        joint_error=comparison.joint[0],
-        joint_error_step=comparison.joint[1],
-        gripper_error=comparison.gripper,
-        object_error=comparison.object[0],
-        object_error_step=comparison.object[1],
-        object_error_name=comparison.object[2],
+        joint_error=float(arm.max()),
+        joint_error_step=int(arm.argmax()),
+        gripper_error=float(np.abs(off["gripper opening"]).max()),
+        object_error=distance,
+        object_error_step=step,
+        object_error_name="" if distance == 0.0 else list(d.object_poses)[number],
         compares_objects=bool(d.object_poses),
         recorded_success=d.recorded_success,
         success=not failed if checks else None,
         failed_checks=failed,
-        unreachable=agent.num_unreachable,
+        unreachable=unreachable,
     )
+
+
+def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Array]:
+    """What was compared -> (T, D), what is seen now minus what was recorded."""
+    num_steps, width = len(seen), d.joint_position.shape[1]
+    off = {
+        "joint positions": np.array([now.joint_position[:width] for now in seen]) - d.joint_position[:num_steps],
+        "gripper opening": (np.array([now.gripper_width for now in seen]) - d.gripper_width[:num_steps])[:, None],
+    }
+    if d.joint_velocity is not None:
+        off["joint velocities"] = np.array([now.joint_velocity for now in seen]) - d.joint_velocity[:num_steps]
+    for name, poses in d.object_poses.items():
+        off[f"the pose of {name}"] = np.array([now.object_poses[name].vector() for now in seen]) - poses[:num_steps]
+    return off
 
 
 def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: bool = True) -> bool:
@@ -274,3 +261,61 @@ def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: boo
         and max(report.joint_error, report.gripper_error, report.object_error) <= tolerance
         and report.success == report.recorded_success
     )
+
+
+def replay_all(
+    demonstrations: Iterable[Demonstration], options: ReplayOptions, *, out: Path | None = None, overwrite: bool = False
+) -> Iterator[tuple[ReplayReport, tuple[Path, Path] | None]]:
+    """Replay one after the other, in one world as long as robot and rate stay the same.
+
+    Args:
+        demonstrations: What to replay.
+        options: How.
+        out: Folder for recordings of the replays; None records nothing.
+        overwrite: Whether recordings there may be replaced.
+
+    Yields:
+        The report, and (recording, recording of its replay) where one was made.
+
+    Raises:
+        NotAllowedError: A demonstration's task is of a module that `options` do not allow.
+    """
+    allow_models(options.allowed)
+    with closing(SimulatorCache()) as simulators:
+        for demonstration in demonstrations:
+            if not options.states:
+                TASKS.check_name(demonstration.info.task, options.allowed)  # before anything is made
+            if out is not None:
+                yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
+                continue
+            blind = replace(demonstration.info.scene, cameras=())
+            world, _ = simulators.acquire(replace(demonstration.info, fps=demonstration.fps, scene=blind, config={}))
+            yield replay(demonstration, world, options)[0], None
+
+
+def record_replay(
+    demonstration: Demonstration, simulators: SimulatorCache, options: ReplayOptions, out: Path, *, overwrite: bool
+) -> tuple[ReplayReport, tuple[Path, Path] | None]:
+    """Replay and record it, with pictures of the recording's cameras, into a file of the same name in `out`.
+
+    Returns:
+        As `replay_all` yields.
+
+    Raises:
+        ConfigError: The new recording would replace the one that is replayed, or one of that name is there already.
+    """
+    d = demonstration
+    path = out / (d.name if d.source is not None else f"{d.name}.mcap")
+    if d.source is not None and path.resolve() == d.source.resolve():
+        raise ConfigError(f"The replay would replace the recording itself, choose another --out: {out}")
+    view = recorded_view(d.info, options.allowed)
+    make_folder(out)
+    behaviour = view_behaviour(d.info, view)
+    info = replace(d.info, fps=d.fps, behaviour=behaviour, origin=f"replay of {d.digest[:16]}")
+    video = from_plain(d.info.config.get("video", {}), VideoConfig)
+    world, renderer = simulators.acquire(info)
+    painter = view_painter(renderer, view, d.info.config) if renderer else None
+    with SimulatedWriter(path, info, video=video, overwrite=overwrite) as writer:
+        report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
+        writer.finish(outcome)
+    return report, None if d.source is None else (d.source, path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -71,15 +70,9 @@ def read_cameras(path: Path) -> dict[str, FreeCamera]:
     cameras = {}
     for name, table in read_toml(path).items():
         try:
-            cameras[name] = from_plain(_tuples(table), FreeCamera)
-        except (ValueError, TypeError, AttributeError) as error:
+            cameras[name] = from_plain(table, FreeCamera)
+        except ValueError as error:
             raise ConfigError(f"The camera {name!r} of the file cannot be used ({in_words(error)}): {path}") from error
     if not cameras:
         raise ConfigError(f"The file describes no camera; write a table, e.g. [side] with position and look_at: {path}")
     return cameras
-
-
-def _tuples(table: Any) -> Any:
-    if not isinstance(table, dict):
-        raise TypeError("a camera is a table of its own, e.g. [side]")
-    return {key: [float(v) for v in value] if isinstance(value, list) else value for key, value in table.items()}
