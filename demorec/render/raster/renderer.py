@@ -10,7 +10,7 @@ from typing import Self
 from demorec.core.geometry import Array
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import SceneCamera
-from demorec.render import RenderSetup
+from demorec.render import RenderSetup, check_setup, world_from_camera
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.cache import folder_lock
 from demorec.render.raster.canvas import Canvas
@@ -18,7 +18,6 @@ from demorec.render.raster.kernels.jit import compiled_folder
 from demorec.render.raster.shapes import Instance, ModelStore, make_instances
 from demorec.render.raster.stage import Stage
 from demorec.render.raster.view import CameraView
-from demorec.render.setup_checks import check_setup, world_from_camera
 
 log = logging.getLogger(__name__)
 
