@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
+from demorec.view.bodies import joint_columns, log_robot, robot_model
 from demorec.view.episode import PlayedEpisode
 from demorec.view.layout import episode_layout
 from demorec.view.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.view.paths import Paths
 from demorec.view.programs import free_port, viewer_environment, viewer_program
-from demorec.view.robot import joint_columns, log_robot, robot_model
 from demorec.view.save import save
 from demorec.view.scene import new_recording
 from demorec.view.sources import find_episodes

@@ -21,7 +21,7 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import SimulatedRecording, SimulatedWriter
-from demorec.render.warm import WarmRenderer
+from demorec.render.painter import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
 

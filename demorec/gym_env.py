@@ -31,8 +31,7 @@ from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.episode.variation import Preset
 from demorec.loop import Decision, Episode, Session, SimulatorCache, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
-from demorec.render.painter import Painter
-from demorec.render.warm import WarmRenderer
+from demorec.render.painter import Painter, WarmRenderer
 from demorec.sim.world import World
 
 SUCCESS_FRAMES = 5

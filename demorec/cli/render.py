@@ -21,7 +21,7 @@ from demorec.core.registry import modules_of
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 if TYPE_CHECKING:
-    from demorec.render.warm import WarmRenderer
+    from demorec.render.painter import WarmRenderer
     from demorec.replay.rerender import RerenderOptions, RerenderReport
 
 
@@ -171,6 +171,6 @@ def _draw(options: RerenderOptions, overwrite: bool, job: tuple[Path, Path]) -> 
 @cache
 def _renderers() -> WarmRenderer:
     """Of this process, which draws one recording after the other."""
-    from demorec.render.warm import WarmRenderer
+    from demorec.render.painter import WarmRenderer
 
     return WarmRenderer()

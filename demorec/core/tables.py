@@ -64,8 +64,8 @@ RENDERERS: Registry[type[Renderer]] = Registry(
     kind="renderer",
     rows={
         "raster": "demorec.render.raster:RasterRenderer",
-        "tiny": "demorec.sim.renderers.client_renderer:TinyRenderer",
-        "egl": "demorec.sim.renderers.egl:EglRenderer",
+        "tiny": "demorec.sim.renderers:TinyRenderer",
+        "egl": "demorec.sim.renderers:EglRenderer",
     },
 )
 

@@ -18,13 +18,12 @@ from types import FrameType
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
 from demorec.core.processes import available_cores, handled
-from demorec.core.tables import load_robot
+from demorec.core.tables import RENDERERS, load_robot
 from demorec.generate.contents import Inspector
 from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Lost, Made, Raised, Report
 from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunObserver, RunOptions, RunResult
-from demorec.render.warm import warm_up_renderer
 from demorec.robots.assets import allow_models
 from demorec.robots.inertials import check_masses
 from demorec.runs.run_file import UNFINISHED, Attempt, RunFile, inspect_recording
@@ -89,7 +88,7 @@ def generate(
             return folder.result(interrupted=False)
         schedule.give_back(first)
         if config.cameras and options.executor != "ray":
-            warm_up_renderer(config.renderer)
+            RENDERERS.load(config.renderer)().close()  # compiles what it needs, before several processes would
         executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
         folder.begin_session(executor=options.executor, workers=executor.workers)
         progress.started(folder.run, executor.workers)

@@ -20,7 +20,7 @@ from demorec.episode.episode import SimulatedInfo
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.render import Renderer
-from demorec.render.warm import WarmRenderer
+from demorec.render.painter import WarmRenderer
 from demorec.robots.assets import allow_models, model_name
 from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World

@@ -6,10 +6,12 @@ recording (`demorec.render.recorded.RecordedWorld`). `demorec.render.painter` br
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+from demorec.core.errors import RenderError
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import Light, Rgba, SceneCamera, Texture
@@ -130,3 +132,41 @@ def first_rows(bodies: Sequence[VisualBody]) -> list[int]:
         rows.append(count)
         count += 1 + body.num_links
     return rows
+
+
+MAX_SAMPLES = 1 << 28
+"""Of a picture; beyond, buffers would take several GB. (PyBullet ends the process on sizes that it cannot draw.)"""
+
+
+def check_setup(setup: RenderSetup) -> None:
+    """Raise RenderError for a camera that cannot draw, or whose mount does not exist."""
+    for camera in setup.cameras:
+        name, size = f"Camera {camera.name!r}", f"{camera.width}x{camera.height}"
+        if camera.width < 1 or camera.height < 1:
+            raise RenderError(f"{name} is {size}: both sizes must be at least 1.")
+        samples = camera.width * camera.height * (4 if setup.antialias else 1)
+        if samples > MAX_SAMPLES:
+            raise RenderError(
+                f"{name} is {size}, {samples} samples a picture; allowed are {MAX_SAMPLES}: make it smaller"
+                f"{' or draw without antialiasing' if setup.antialias else ''}."
+            )
+        if not 0 < camera.near < camera.far < math.inf:
+            raise RenderError(f"{name} clips at near {camera.near} m and far {camera.far} m: 0 < near < far is needed.")
+        if not 0 < camera.fov_y < math.pi:
+            raise RenderError(f"{name} has a field of view of {camera.fov_y} rad: allowed is 0 to pi.")
+        if camera.mount != "world" and camera.mount not in setup.mounts:
+            raise RenderError(
+                f"{name} is mounted on the link {camera.mount!r}, which the robot does not have; allowed are world, "
+                f"{', '.join(setup.mounts)}."
+            )
+
+
+def world_from_camera(setup: RenderSetup, camera: SceneCamera, poses: Array) -> Pose:
+    """Pose of a camera, OpenCV axes, with `poses` as `Renderer.render` is given them."""
+    if camera.mount == "world":
+        return camera.mount_from_camera
+    mount = setup.mounts[camera.mount]
+    row = poses[first_rows(setup.bodies)[mount.body] + 1 + mount.link]
+    world_from_link = Pose(position=row[:3], quat_xyzw=row[3:])
+    world_from_mount = world_from_link if mount.link_from_mount is None else world_from_link @ mount.link_from_mount
+    return world_from_mount @ camera.mount_from_camera

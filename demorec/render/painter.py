@@ -1,15 +1,16 @@
 """The one place where a world and a renderer meet: what is drawn, by which cameras, and where these are believed to be.
 
-Generation, environments, replay and re-rendering draw through it.
+Generation, environments, replay and re-rendering draw through it, with a renderer that is kept warm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Protocol
+from typing import Protocol, Self
 
 from demorec.core.geometry import Array, Pose
+from demorec.core.tables import RENDERERS
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.render import Mount, Renderer, RenderSetup, VisualBody
@@ -94,3 +95,38 @@ class Painter:
         for name, error in self._true_from_recorded.items():
             images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
         return images
+
+
+class WarmRenderer:
+    """Hands out one renderer again and again, and another only when another name is asked for; a context manager.
+
+    What it has read of meshes and textures is not read again.
+    """
+
+    def __init__(self) -> None:
+        self._name = ""
+        self._renderer: Renderer | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def of(self, name: str) -> Renderer:
+        """The entered renderer of a row of the renderers' table; it stays open, one of another name is closed.
+
+        Raises:
+            ConfigError: There is none of that name.
+            MissingDependencyError, RenderError: It cannot work on this machine.
+        """
+        if self._renderer is None or name != self._name:
+            self.close()
+            self._renderer, self._name = RENDERERS.load(name)().__enter__(), name
+        return self._renderer
+
+    def close(self) -> None:
+        """Free the renderer; harmless when called twice."""
+        renderer, self._renderer = self._renderer, None
+        if renderer is not None:
+            renderer.close()

@@ -28,9 +28,8 @@ from demorec.loop import prepare
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.mcap.recording import frames_of
 from demorec.render import Renderer
-from demorec.render.painter import Painter
+from demorec.render.painter import Painter, WarmRenderer
 from demorec.render.recorded import RecordedWorld
-from demorec.render.warm import WarmRenderer
 from demorec.replay.free_camera import FreeCamera
 from demorec.robots.assets import allow_models
 from demorec.tasks.vary import vary_looks

@@ -14,7 +14,7 @@ from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
-from demorec.sim.urdf_file import load_urdf
+from demorec.sim.bodies import load_urdf
 
 FINGER_DAMPING = 1_000.0
 """Contact of the finger pads, N s/m (the value of panda.urdf)."""

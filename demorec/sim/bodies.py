@@ -1,15 +1,25 @@
-"""Scene bodies into PyBullet bodies."""
+"""Scene bodies and URDFs into PyBullet bodies, and what a client shows back into plain data for renderers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import os
+import re
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import SceneError
-from demorec.episode.scene import Body
-from demorec.robots.assets import asset_path
+import numpy as np
+
+from demorec.core.errors import DemorecError, RenderError, SceneError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Body, Texture
+from demorec.render import Visual, VisualBody, VisualKind
+from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.inertials import check_masses, with_massless_frames
 from demorec.sim.client import silence
-from demorec.sim.urdf_file import load_urdf
 
 
 def add_body(client: Any, body: Body) -> int:
@@ -82,3 +92,158 @@ def shape_arguments(
         case "mesh":
             return {"shapeType": client.GEOM_MESH, "fileName": file, "meshScale": size}
     raise SceneError(f"A body of shape {kind!r} cannot be built.")
+
+
+def load_urdf(
+    client: Any, name: str, pose: Pose, *, scale: float, is_fixed: bool, what: str, is_robot: bool = False
+) -> int:
+    """Load a URDF and return its PyBullet index.
+
+    Args:
+        client: The PyBullet client.
+        name: As in `demorec.robots.assets.asset_path`.
+        pose: Of its base.
+        scale: Uniform scale.
+        is_fixed: Whether physics cannot move its base.
+        what: Whose model it is, for messages ("body 'duck'").
+        is_robot: Whether each link has to say what it weighs, and a frame weighs nothing.
+
+    Raises:
+        ConfigError: A link of a robot does not say what it weighs.
+        SceneError: The URDF or one of its meshes is missing or cannot be loaded.
+    """
+    if is_robot:
+        check_masses(name)
+    try:
+        with urdf_file(name, has_frames=is_robot) as path, silence():
+            place = pose.position.tolist(), pose.quat_xyzw.tolist()
+            return int(client.loadURDF(path, *place, useFixedBase=is_fixed, globalScaling=scale))
+    except DemorecError:
+        raise
+    except Exception as error:  # PyBullet raises its own bare pybullet.error
+        raise SceneError(f"The {what} cannot be loaded from {name!r} ({error}).") from error
+
+
+@contextmanager
+def urdf_file(name: str, *, has_frames: bool = False) -> Iterator[str]:
+    """A file that PyBullet can load while the context lasts.
+
+    Args:
+        name: As in `demorec.robots.assets.asset_path`.
+        has_frames: Whether links without `<inertial>` are frames of no mass.
+
+    Raises:
+        SceneError: The URDF or one of its meshes is missing.
+    """
+    path = asset_path(name)
+    text = path.read_text()
+    loaded = with_massless_frames(text) if has_frames else text
+    if ":" not in name and loaded == text:  # of pybullet_data, meshes beside it
+        yield str(path)
+        return
+    descriptor, copy = tempfile.mkstemp(suffix=".urdf", prefix="demorec_")
+    try:
+        with os.fdopen(descriptor, "w") as file:
+            file.write(_with_absolute_meshes(loaded, path.parent))
+        yield copy
+    finally:
+        Path(copy).unlink()
+
+
+@functools.cache
+def _with_absolute_meshes(text: str, folder: Path) -> str:
+    return re.sub(
+        r'(<mesh\s+filename=")([^"]+)"', lambda match: f'{match.group(1)}{mesh_path(folder, match.group(2))}"', text
+    )
+
+
+ShapeRows = tuple[tuple[Any, ...], ...]
+"""Of every visual shape what PyBullet tells: body, link, kind, dimensions, file, position, orientation, colour."""
+
+
+def shape_rows(client: Any) -> ShapeRows:
+    """The visual shapes of a client; equal rows look equal."""
+    return tuple(shape for body in range(client.getNumBodies()) for shape in client.getVisualShapeData(body))
+
+
+def visual_bodies(
+    client: Any, rows: ShapeRows, *, names: Mapping[int, str], textures: Mapping[int, Texture]
+) -> tuple[VisualBody, ...]:
+    """The bodies of a client.
+
+    Args:
+        client: Its bodies are numbered without a gap.
+        rows: Its `shape_rows`.
+        names: Body -> name; others are called as PyBullet calls them.
+        textures: Body -> procedural texture: PyBullet cannot be asked for the pixels of one.
+
+    Raises:
+        RenderError: A shape of a kind that no renderer draws.
+    """
+    bodies = []
+    for body in range(client.getNumBodies()):
+        dynamics = client.getDynamicsInfo(body, -1)
+        name = names.get(body) or client.getBodyInfo(body)[1].decode()
+        inertial_from_base = base_from_inertial(client, body).inverse()
+        bodies.append(
+            VisualBody(
+                name=name,
+                num_links=client.getNumJoints(body),
+                is_fixed=dynamics[0] == 0,
+                visuals=tuple(_visual(client, row, name, inertial_from_base) for row in rows if row[0] == body),
+                texture=textures.get(body),
+            )
+        )
+    return tuple(bodies)
+
+
+def base_from_inertial(client: Any, body: int) -> Pose:
+    """Pose of the base's centre of mass, whose pose PyBullet tells as that of the body."""
+    dynamics = client.getDynamicsInfo(body, -1)
+    return Pose(position=np.array(dynamics[3]), quat_xyzw=np.array(dynamics[4]))
+
+
+def body_poses(client: Any) -> Array:
+    """(n, 7) poses as `Renderer.render` takes them: of each body the base's centre of mass, then its links' frames."""
+    rows: list[tuple[float, ...]] = []
+    for body in range(client.getNumBodies()):
+        position, quat = client.getBasePositionAndOrientation(body)
+        rows.append(position + quat)
+        links = range(client.getNumJoints(body))
+        if links:
+            states = client.getLinkStates(body, list(links), computeForwardKinematics=1)
+            rows += [state[4] + state[5] for state in states]
+    return np.array(rows).reshape(-1, 7)
+
+
+def _visual(client: Any, row: tuple[Any, ...], name: str, inertial_from_base: Pose) -> Visual:
+    body, link, kind, dimensions, file, position, quat, rgba = row[:8]
+    known: dict[int, tuple[VisualKind, tuple[float, ...]]] = {
+        client.GEOM_MESH: ("mesh", dimensions),
+        client.GEOM_BOX: ("box", dimensions),
+        client.GEOM_SPHERE: ("sphere", dimensions[:1]),
+        client.GEOM_CYLINDER: ("cylinder", (dimensions[1], dimensions[0])),
+        client.GEOM_CAPSULE: ("capsule", (dimensions[1], dimensions[0])),
+        client.GEOM_PLANE: ("plane", ()),
+    }
+    if kind not in known:
+        raise RenderError(
+            f"Body {body} ({name!r}), link {link}: a visual shape of PyBullet's kind {kind} cannot be drawn: "
+            "use a mesh, box, sphere, cylinder, capsule or plane."
+        )
+    kind_name, size = known[kind]
+    link_from_shape = Pose(position=np.array(position), quat_xyzw=np.array(quat))
+    return Visual(
+        link=link,
+        kind=kind_name,
+        size=tuple(size),
+        file=_mesh_file(file.decode()) if kind_name == "mesh" else "",
+        link_from_shape=inertial_from_base @ link_from_shape if link == -1 else link_from_shape,
+        rgba=rgba,
+    )
+
+
+def _mesh_file(name: str) -> str:
+    """PyBullet searches pybullet_data too, and tells names as it was given them."""
+    path = Path(name)
+    return name if path.is_absolute() or path.exists() else str(asset_path(name))

@@ -19,9 +19,8 @@ from demorec.episode.scene import Body, Physics, Scene
 from demorec.render import Mount, VisualBody
 from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import Arm
-from demorec.sim.bodies import add_body
+from demorec.sim.bodies import ShapeRows, add_body, base_from_inertial, body_poses, shape_rows, visual_bodies
 from demorec.sim.client import connect
-from demorec.sim.visuals import ShapeRows, base_from_inertial, body_poses, shape_rows, visual_bodies
 
 SETTLE_SECONDS = 0.1
 """Physics time before the first frame, so that objects rest on their support."""

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from demorec.episode.scene import Scene
 from demorec.view.episode import Distances, PlayedEpisode, Video, timed
-from demorec.view.paths import Paths
+from demorec.view.paths import Paths, indexes, log_pose, send_poses
 from demorec.view.style import FRUSTUM, segment_colors
-from demorec.view.times import indexes, log_pose, send_poses
 
 _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
 _PACKETS_AT_ONCE, _PICTURES_AT_ONCE = 256, 64

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 import rerun as rr
 import rerun.blueprint as rrb
 
-from demorec.view.compare import DIFFERENCES, A, B
 from demorec.view.episode import PlayedEpisode
-from demorec.view.paths import Paths
-from demorec.view.times import FRAMES, SECONDS
+from demorec.view.paths import FRAMES, SECONDS, Paths
+from demorec.view.scene import DIFFERENCES, A, B
 
 BACKGROUND = (24, 27, 33)
 _SIDE = ("gripper opening (m)", "contact force (N)")

@@ -6,9 +6,8 @@ import numpy as np
 import rerun as rr
 
 from demorec.view.episode import Curves, PlayedEpisode
-from demorec.view.paths import Paths
+from demorec.view.paths import Paths, indexes
 from demorec.view.style import ASKED, FORCE, MEASURED, SECOND, TARGET, Color, phase_colors, series_colors
-from demorec.view.times import indexes
 
 _COLORS = {"gripper": MEASURED, "gripper target": TARGET, "force": FORCE, "target": ASKED}
 _WIDTHS = {"target": 0.7, "gripper target": 1.2}

@@ -10,9 +10,8 @@ import rerun as rr
 
 from demorec.core.errors import RecordingError
 from demorec.core.replacing import RERUN_FILE, written_whole
-from demorec.view.compare import log_comparison, new_comparison
 from demorec.view.layout import comparison_layout, episode_layout
-from demorec.view.scene import log_episode, new_recording
+from demorec.view.scene import log_comparison, log_episode, new_comparison, new_recording
 from demorec.view.sources import PlaybackSource
 
 

@@ -1,4 +1,4 @@
-"""One episode into one Rerun recording: everything that can be seen of it, as columns."""
+"""Episodes into Rerun recordings, in words, numbers and columns: one, or two over each other below /a and /b."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Array
+from demorec.episode.episode import Outcome
 from demorec.episode.scene import Rgba
-from demorec.view.bodies import log_bodies
+from demorec.view.bodies import log_bodies, log_robot
 from demorec.view.cameras import log_cameras
-from demorec.view.episode import PlayedEpisode, Statements
+from demorec.view.episode import Curves, PlayedEpisode, Statements
 from demorec.view.motion import log_curves, log_ee_path, log_events, log_phases
-from demorec.view.paths import Paths
-from demorec.view.robot import log_robot
+from demorec.view.paths import Paths, indexes
 from demorec.view.style import segment_colors
-from demorec.view.summary import entry, properties, summary
-from demorec.view.times import indexes
 
 _HEADINGS = {"subtask": "Now", "motion": "Motion", "plan": "Plan", "memory": "So far"}
 """Kind of statement -> its heading, in the order of the page."""
@@ -102,3 +102,129 @@ def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
         recording.send_columns(
             paths.camera(camera, "/boxes"), indexes(episode.time_ns, episode.time_ns), columns.partition(lengths)
         )
+
+
+_OF_A_RUN = re.compile(r"episode_0*(?P<number>\d+)(?:\.attempt_(?P<attempt>\d+))?")
+
+
+def entry(episode: PlayedEpisode) -> str:
+    """A few characters for the viewer's narrow list: "3 ok", "0.1 FAIL place" (the attempt after the dot)."""
+    match, outcome = _OF_A_RUN.fullmatch(episode.name), episode.outcome
+    name = episode.name if match is None else ".".join(part for part in match.groups() if part is not None)
+    if outcome is None or outcome.success is None:
+        return f"{name} ?"
+    return f"{name} ok" if outcome.success else f"{name} FAIL {outcome.failure_phase}".rstrip()
+
+
+def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
+    """What the viewer lists beside the recording's name."""
+    info, simulated, outcome = episode.info, episode.simulated, episode.outcome
+    values: dict[str, str | int | float | bool] = {
+        "instruction": info.instruction,
+        "outcome": episode.verdict,
+        "seconds": round(episode.duration, 3),
+        "frames": episode.num_frames,
+        "episode": info.episode_index,
+        "robot": info.robot_name,
+        "source": episode.source,
+    }
+    if outcome is not None and outcome.success is not None:
+        values["success"] = outcome.success
+    if simulated is not None:
+        values |= {"task": simulated.task, "seed": simulated.root_seed, "attempt": simulated.attempt}
+        values |= {} if outcome is None else {"retries": outcome.num_retries}
+        values |= {"config_digest": simulated.config_digest} if simulated.config_digest else {}
+    if origin := _origin(episode):
+        values["origin"] = origin
+    return values
+
+
+def _origin(episode: PlayedEpisode) -> str:
+    """Where it comes from, "" for a generated one."""
+    origin = episode.info.origin
+    return origin if isinstance(origin, str) else ", ".join([origin.kind, *(file.name for file in origin.files)])
+
+
+def summary(episode: PlayedEpisode) -> str:
+    """Markdown: task, outcome and its checks, the failed ones first."""
+    info, simulated = episode.info, episode.simulated
+    about = [info.robot_name if simulated is None else simulated.task, f"episode {info.episode_index}"]
+    about += [] if simulated is None else [f"seed {simulated.root_seed}"]
+    length = f"{episode.duration:.1f} s · {episode.num_frames} frames (nominal {info.fps} Hz)"
+    origin, checks = _origin(episode), [] if episode.outcome is None else _checks(episode.outcome)
+    parts = [f"**{info.instruction}**", " · ".join(about), length, f"Outcome: **{episode.verdict}**"]
+    return "\n\n".join([*parts, *([f"Origin: {origin}"] if origin else []), *checks]) + "\n"
+
+
+def _checks(outcome: Outcome) -> list[str]:
+    """A table of the conditions of success, the failed ones first."""
+    rows = ["| | check | value | limit |", "|---|---|---|---|"]
+    for check in sorted(outcome.checks, key=lambda check: check.passed):
+        mark = "✓" if check.passed else "**✗**"
+        unit = f" {check.unit}" if check.unit else ""
+        rows.append(f"| {mark} | {check.name} | {check.value:.3g}{unit} | {check.limit:.3g}{unit} |")
+    return ["\n".join(rows)] if outcome.checks else []
+
+
+_ORANGE = (1.0, 0.62, 0.25, 0.6)
+"""Translucent, so that an episode that lies exactly where the other one does hides nothing of it."""
+A, B = Paths("/a"), Paths("/b")
+DIFFERENCES = "/differences"
+
+
+def new_comparison(a: PlayedEpisode, b: PlayedEpisode) -> rr.RecordingStream:
+    """An empty Rerun recording named after both."""
+    recording = rr.RecordingStream("demorec-compare", recording_id=f"{a.identity}-{b.identity}")
+    recording.send_recording_name(f"A {entry(a)}, B {entry(b)}")
+    recording.send_property("a", rr.AnyValues(**properties(a)))
+    recording.send_property("b", rr.AnyValues(**properties(b)))
+    return recording
+
+
+def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpisode) -> None:
+    """Send both episodes and how far they are apart.
+
+    Raises:
+        ConfigError: The robots differ, so that nothing can be laid over each other.
+        DemorecError: A source is damaged.
+    """
+    if a.simulated is None or b.simulated is None:
+        raise ConfigError(
+            "Only simulated episodes can be laid over each other: of others nobody knows that their robots stand "
+            "alike. View them without --compare."
+        )
+    if [*a.joint_position] != [*b.joint_position]:
+        raise ConfigError(
+            f"The episodes have different robots, {a.info.robot_name} and {b.info.robot_name}: "
+            "compare two of the same robot."
+        )
+    log_episode(recording, a, root=A.root, label="A ")
+    log_episode(recording, b, root=B.root, label="B ", tint=_ORANGE)
+    for name, curves in differences(a, b).items():
+        entity = f"{DIFFERENCES}/{name}"
+        recording.log(entity, rr.SeriesLines(names=list(curves.names), widths=[2.0] * len(curves.names)), static=True)
+        times = indexes(curves.time_ns, a.time_ns)
+        recording.send_columns(entity, times, rr.Scalars.columns(scalars=curves.values))
+
+
+def differences(a: PlayedEpisode, b: PlayedEpisode) -> dict[str, Curves]:
+    """Frame by frame, as long as both last: the gripper's and the objects' distance (mm), the joints' largest (rad)."""
+    count = min(a.num_frames, b.num_frames)
+    time_ns = a.time_ns[:count]
+    first, second = (np.stack([*episode.joint_position.values()])[:, :count] for episode in (a, b))
+    joints = np.abs(first - second).max(axis=0, initial=0.0)
+    assert a.base_from_tcp is not None
+    assert b.base_from_tcp is not None
+    names, columns = ["gripper"], [_distance(a.base_from_tcp[:count], b.base_from_tcp[:count])]
+    for name in a.object_poses:
+        if name in b.object_poses:
+            names.append(name)
+            columns.append(_distance(a.object_poses[name][:count], b.object_poses[name][:count]))
+    return {
+        "distance": Curves(time_ns=time_ns, values=1000 * np.stack(columns, axis=1), names=tuple(names)),
+        "joints": Curves(time_ns=time_ns, values=joints[:, None], names=("largest joint difference",)),
+    }
+
+
+def _distance(a: Array, b: Array) -> Array:
+    return np.asarray(np.sqrt(((a[:, :3] - b[:, :3]) ** 2).sum(axis=1)))

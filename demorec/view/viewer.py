@@ -19,8 +19,8 @@ from rerun.experimental import ViewerClient
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.processes import start_program
 from demorec.core.replacing import PICTURE, written_whole
+from demorec.view.paths import SECONDS
 from demorec.view.programs import free_port, has_display, viewer_environment, viewer_program
-from demorec.view.times import SECONDS
 
 _START_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0

@@ -21,7 +21,7 @@ from demorec.core.geometry import Pose, quat_from_rotation, rotation_from_quat
 from demorec.core.tables import RENDERERS
 from demorec.episode.scene import Light
 from demorec.render import Renderer
-from demorec.sim.renderers.client_renderer import TinyRenderer
+from demorec.sim.renderers import TinyRenderer
 
 
 @dataclass(frozen=True, kw_only=True)

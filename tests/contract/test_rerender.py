@@ -16,7 +16,7 @@ from support.commands import exit_code
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.mcap import SimulatedRecording
-from demorec.render.warm import WarmRenderer
+from demorec.render.painter import WarmRenderer
 from demorec.replay.free_camera import read_cameras
 from demorec.replay.rerender import RerenderOptions, SceneView, rerender, view_behaviour
 

@@ -60,9 +60,7 @@ def test_the_wrench_holds_the_weight_of_the_hand(
     found = {}
     for name, model in (("as it is", None), ("turned", turned)):
         if model is not None:
-            monkeypatch.setattr(
-                "demorec.sim.urdf_file.urdf_file", lambda _, model=model, **_more: nullcontext(str(model))
-            )
+            monkeypatch.setattr("demorec.sim.bodies.urdf_file", lambda _, model=model, **_more: nullcontext(str(model)))
         with World(spec) as world:
             world.reset(scene)
             world.set_state(joint_position=np.array([*q, 0.02, 0.02]))

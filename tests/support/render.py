@@ -16,8 +16,8 @@ from demorec.core.geometry import Pose, look_at
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import RobotPlacement, Scene, SceneCamera, Texture
 from demorec.render import Mount, Renderer, RenderSetup, VisualBody
-from demorec.sim.renderers.client_renderer import view_matrix
-from demorec.sim.visuals import body_poses, shape_rows, visual_bodies
+from demorec.sim.bodies import body_poses, shape_rows, visual_bodies
+from demorec.sim.renderers import view_matrix
 
 DATA = pybullet_data.getDataPath()
 

@@ -24,7 +24,7 @@ from demorec.core.plain import digest, from_json, to_json
 from demorec.datasets.lerobot.robots import RobotRecord, portable_urdf, read_robot
 from demorec.mcap import SimulatedRecording
 from demorec.sources.dataset_import import import_lerobot
-from demorec.view import robot as played_robot
+from demorec.view import bodies as played_robot
 from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.save import save
 from demorec.view.sources import find_episodes

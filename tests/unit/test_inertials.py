@@ -10,8 +10,8 @@ from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.robots.assets import asset_path
 from demorec.robots.inertials import check_masses, link_masses
+from demorec.sim.bodies import load_urdf, urdf_file
 from demorec.sim.client import connect
-from demorec.sim.urdf_file import load_urdf, urdf_file
 
 BOX = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
 
@@ -107,7 +107,7 @@ def test_a_frame_weighs_nothing_and_the_engine_is_not_heard(
     """By statics: the motor holds the arm of 2 kg, half a metre out, and not the frame a metre out."""
     file = tmp_path / "arm.urdf"
     monkeypatch.setattr("demorec.robots.inertials.asset_path", lambda name: file)
-    monkeypatch.setattr("demorec.sim.urdf_file.asset_path", lambda name: file)
+    monkeypatch.setattr("demorec.sim.bodies.asset_path", lambda name: file)
     file.write_text(arm())
     client = connect()
     client.setGravity(0, 0, -9.81)

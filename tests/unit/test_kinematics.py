@@ -19,8 +19,8 @@ from demorec.robots.kinematics_kernels import forward
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf, quat_from_rpy
 from demorec.sim.arm import arm_kinematics
+from demorec.sim.bodies import urdf_file
 from demorec.sim.client import connect
-from demorec.sim.urdf_file import urdf_file
 
 SimulatedRobot = tuple[RobotSpec, Any, int, dict[str, int], dict[str, int]]
 """Specification, client, body, indices of links and of joints by name."""

@@ -11,9 +11,8 @@ import pytest
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import Light, RobotPlacement, Scene, SceneCamera
-from demorec.render import Mount, RenderSetup, Visual, VisualBody, first_rows
+from demorec.render import Mount, RenderSetup, Visual, VisualBody, first_rows, world_from_camera
 from demorec.render.painter import Painter
-from demorec.render.setup_checks import world_from_camera
 
 HALF_TURN = Pose(position=np.array([0.0, 0.0, 0.5]), quat_xyzw=np.array([0.0, 0.0, 1.0, 0.0]))
 

@@ -22,14 +22,13 @@ from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 from demorec.view import bodies
-from demorec.view.compare import differences
+from demorec.view.bodies import joint_columns, robot_model
 from demorec.view.meshes import MAX_TRIANGLES, urdf_meshes
 from demorec.view.programs import viewer_environment
-from demorec.view.robot import joint_columns, robot_model
 from demorec.view.save import save, save_comparison
+from demorec.view.scene import differences, entry, summary
 from demorec.view.sources import find_episodes, select
 from demorec.view.style import segment_colors
-from demorec.view.summary import entry, summary
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.mcap import SimulatedRecording
-from demorec.view.from_dataset import open_dataset_episode
-from demorec.view.held_objects import held
+from demorec.view.from_dataset import held, open_dataset_episode
 from demorec.view.save import save
 from demorec.view.sources import find_episodes
 

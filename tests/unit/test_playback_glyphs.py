@@ -17,9 +17,8 @@ from demorec.mcap import SimulatedWriter
 from demorec.robots.urdf import Urdf
 from demorec.view.glyphs import DRAWABLE, drawable, drawable_source
 from demorec.view.layout import episode_layout
-from demorec.view.scene import log_episode, new_recording
+from demorec.view.scene import log_episode, new_recording, summary
 from demorec.view.sources import find_episodes
-from demorec.view.summary import summary
 from demorec.view.viewer import HeadlessViewer, why_it_ended
 
 INSTRUCTION = "把红色方块放到绿色托盘里"

@@ -11,8 +11,8 @@ from support import render as scenes
 
 from demorec.core.errors import RenderError
 from demorec.render.raster import RasterRenderer
+from demorec.render.raster.cache import cached_mesh
 from demorec.render.raster.decimate import decimate
-from demorec.render.raster.mesh_cache import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
 
 

@@ -10,8 +10,8 @@ from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
 from demorec.core.registry import Registry
 from demorec.episode.episode import CameraImages
-from demorec.render import Renderer, RenderSetup, warm
-from demorec.render.warm import WarmRenderer
+from demorec.render import Renderer, RenderSetup, painter
+from demorec.render.painter import WarmRenderer
 
 
 class Counted:
@@ -45,7 +45,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[Counted]:
     monkeypatch.setattr(Counted, "opened", [])
     place = f"{__name__}:Counted"
     rows: Registry[type[Renderer]] = Registry("renderer", {"a": place, "b": place})
-    monkeypatch.setattr(warm, "RENDERERS", rows)
+    monkeypatch.setattr(painter, "RENDERERS", rows)
     return Counted.opened
 
 

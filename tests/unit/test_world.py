@@ -228,7 +228,7 @@ def test_broken_model_file_is_a_scene_error(
 ) -> None:
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot name='x'><link")
-    monkeypatch.setattr("demorec.sim.urdf_file.asset_path", lambda name: broken)
+    monkeypatch.setattr("demorec.sim.bodies.asset_path", lambda name: broken)
     body = Body(
         name="b", role="object", shape=Shape(kind="urdf", file="x", size=(1.0, 1.0, 1.0)), world_from_body=Pose()
     )

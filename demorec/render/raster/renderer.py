@@ -1,4 +1,4 @@
-"""The renderer: takes over a scene, then draws all cameras of a step."""
+"""The renderer: takes over a scene, then draws all cameras of a step; and the rehearsal that compiles its kernels."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import logging
 import math
 from typing import Self
 
-from demorec.core.geometry import Array
+import numpy as np
+
+from demorec.core.geometry import Array, Pose, look_at
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import SceneCamera
-from demorec.render import RenderSetup
+from demorec.episode.scene import Light, SceneCamera, Texture
+from demorec.render import RenderSetup, Visual, VisualBody, VisualKind, check_setup, world_from_camera
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.cache import folder_lock
 from demorec.render.raster.canvas import Canvas
@@ -18,7 +20,6 @@ from demorec.render.raster.kernels.jit import compiled_folder
 from demorec.render.raster.shapes import Instance, ModelStore, make_instances
 from demorec.render.raster.stage import Stage
 from demorec.render.raster.view import CameraView
-from demorec.render.setup_checks import check_setup, world_from_camera
 
 log = logging.getLogger(__name__)
 
@@ -139,7 +140,35 @@ def warm_up() -> None:
         if done.exists():
             return
         log.warning("Compiling the renderer for this machine: about half a minute, once (kept in %s).", folder)
-        from demorec.render.raster.rehearsal import rehearse
-
         rehearse()
         done.touch()
+
+
+def _body(kind: VisualKind, *size: float, is_fixed: bool, texture: Texture | None = None) -> VisualBody:
+    visual = Visual(link=-1, kind=kind, size=size, link_from_shape=Pose(), rgba=(1.0, 1.0, 1.0, 1.0))
+    return VisualBody(name=kind, num_links=0, is_fixed=is_fixed, visuals=(visual,), texture=texture)
+
+
+def rehearse() -> None:
+    """Draw a box and a sphere in every mode."""
+    texture = Texture(pattern="plain", colors=((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))
+    bodies = [_body("box", 0.3, 0.3, 0.1, is_fixed=True, texture=texture), _body("sphere", 0.1, is_fixed=False)]
+    instances = make_instances(bodies, ModelStore())
+    light = Light()
+    camera = SceneCamera(
+        name="rehearsal",
+        width=32,
+        height=24,
+        fov_y=1.0,
+        mount="world",
+        mount_from_camera=look_at((0.8, 0, 0.5), (0, 0, 0)),
+    )
+    stage = Stage(instances, light, shadow_size=64, caster_faces=[None, None])
+    poses = np.array([[0.0, 0.0, 0.15 * body, 0.0, 0.0, 0.0, 1.0] for body in range(2)])
+    batch = make_batch(instances, [None, None], specular=light.specular)
+    for antialias in (True, False):
+        for keep_still in (True, False):
+            canvas = Canvas(camera, batch, stage, light, antialias=antialias, depth=True, segmentation=True)
+            view = CameraView(canvas, stage, keep_still=keep_still)
+            stage.update(poses)
+            view.draw(camera.mount_from_camera)
