@@ -170,36 +170,6 @@ def gripper_width(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @physics_check(
-    measures="force that holds the hand against the vertical",
-    unit="rad",
-    reads=(
-        "/wrench",
-        "info.robot.hand_link",
-        "info.scene.physics.gravity",
-    ),
-)
-def wrench_holds_the_hand(episode: CheckedEpisode) -> Measurement | None:
-    """Where the hand hardly accelerates and touches nothing, the arm's force on it is the answer to gravity.
-
-    Catches axes of another frame, a turned sign, torques for forces. The median over those frames, rad; what is
-    heavier or lighter by an unknown load cannot be seen.
-    """
-    c, fps = episode.columns, episode.info.fps
-    gravity = np.array(episode.info.scene.physics.gravity)
-    if c.wrench is None or c.num_frames < 3 or not gravity.any():
-        return None
-    hand = episode.world_from_link(episode.info.robot.hand_link)
-    force = (hand[:, :3, :3] @ c.wrench[:, :3, None])[1:-1, :, 0]
-    steady = np.linalg.norm(np.diff(hand[:, :3, 3], 2, axis=0), axis=1) * fps**2 < 0.05 * np.linalg.norm(gravity)
-    steady &= c.contact_force[1:-1] == 0
-    if not steady.any():
-        return None
-    cosine = -(force @ gravity) / np.maximum(np.linalg.norm(force, axis=1) * np.linalg.norm(gravity), 1e-12)
-    angle = float(np.median(np.arccos(np.clip(cosine[steady], -1.0, 1.0))))
-    return Measurement(value=angle, detail=f"{int(steady.sum())} steady frames")
-
-
-@physics_check(
     measures="distance of the joints from the command before",
     unit="rad",
     reads=(

@@ -23,28 +23,9 @@ def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
     for topic in (stream.topic for stream in frame_streams(episode.info) if stream.topic in episode.scan):
         times = episode.scan[topic].time_ns
         if topic == channels.JOINT_STATES and len(times) != len(expected):
-            times = times[np.isin(times, expected)]  # states between the frames have check joint_sample_times
+            times = times[np.isin(times, expected)]  # others are between the frames
         count = min(len(times), len(expected))
         yield worst_frame(np.abs(times[:count] - expected[:count]) / 1e6, topic)
-
-
-@time_check(
-    measures="joint states between frames that are out of order or off the physics clock",
-    reads=(
-        "/joint_states",
-        "info.physics_hz",
-    ),
-)
-def joint_sample_times(episode: CheckedEpisode) -> Measurement | None:
-    """Recorded at the physics rate, joint states rise in equal steps of 1 / physics_hz."""
-    times = episode.scan[channels.JOINT_STATES].time_ns
-    if len(times) == episode.num_frames:
-        return None
-    hz = episode.info.physics_hz
-    expected = (np.arange(len(times), dtype=np.int64) * 2_000_000_000 + hz) // (2 * hz)
-    wrong = np.flatnonzero(times != expected)
-    frame = None if not len(wrong) else int(wrong[0] * episode.info.fps / hz)
-    return Measurement(value=len(wrong), frame=frame, detail=f"{len(times)} joint states at {hz} Hz")
 
 
 @time_check(
