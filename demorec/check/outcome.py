@@ -16,14 +16,6 @@ from demorec.check.rows import matrices
 
 @outcome_check(
     measures="contradictions within the outcome",
-    reads=(
-        "outcome.success",
-        "outcome.checks.name",
-        "outcome.checks.passed",
-        "outcome.failure_phase",
-        "outcome.failure_reason",
-        "outcome.num_frames",
-    ),
 )
 def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
     """An episode succeeds if all its conditions passed; a failure has a phase and a reason."""
@@ -51,11 +43,6 @@ def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
 
 @outcome_check(
     measures="colours that the instruction names and the scene lacks, or the other way round",
-    reads=(
-        "info.instruction",
-        "info.scene.bodies.color_name",
-        "info.scene.goals.object",
-    ),
 )
 def instruction_fits_scene(episode: CheckedEpisode) -> Found:
     """The instruction speaks of colours that are in the scene, and of those of the objects that have a goal."""
@@ -75,12 +62,6 @@ def instruction_fits_scene(episode: CheckedEpisode) -> Found:
 @outcome_check(
     measures="goal distance in the last frame against the outcome's",
     unit="m",
-    reads=(
-        "/object/{body}/pose",
-        "outcome.checks.value",
-        "info.scene.goals.onto",
-        "info.scene.goals.onto_from_goal",
-    ),
 )
 def final_state(episode: CheckedEpisode) -> Iterator[Found]:
     """An object that is said to lie at its goal lies there in the last recorded frame."""
@@ -106,10 +87,6 @@ def final_state(episode: CheckedEpisode) -> Iterator[Found]:
 @outcome_check(
     measures="speed of the goals' objects at the end",
     unit="m/s",
-    reads=(
-        "/object/{body}/pose",
-        "info.scene.goals.object",
-    ),
 )
 def at_rest_in_the_end(episode: CheckedEpisode) -> Iterator[Found]:
     """After a success the objects lie still: the recording does not stop in mid-motion."""

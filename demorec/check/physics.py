@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 
 from demorec.check.base import (
-    EE_TOPICS,
     Found,
     Lacking,
     Measurement,
@@ -21,21 +20,10 @@ from demorec.check.dynamics import MIN_FRAMES
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.core.geometry import Array
-from demorec.episode.features import EE_POSE, STATE
 
 
 @physics_check(
     measures="numbers that are NaN or infinite",
-    reads=(
-        "/joint_states",
-        "/gripper",
-        "/action",
-        "/command",
-        *EE_TOPICS,
-        "/wrench",
-        "/object/{body}/pose",
-        "/camera/{camera}/pose",
-    ),
 )
 def finite_numbers(episode: CheckedEpisode) -> Measurement:
     """Every recorded number is one."""
@@ -61,10 +49,6 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
 
 @physics_check(
     measures="largest acceleration of the wanted motion in units of its limit",
-    reads=(
-        "/action",
-        "info.robot.acceleration_limit",
-    ),
 )
 def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """The expert's joint targets (the labels) ask for no more than the motors give.
@@ -78,10 +62,6 @@ def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
 
 @physics_check(
     measures="largest acceleration of the measured motion in units of its limit",
-    reads=(
-        "/joint_states",
-        "info.robot.acceleration_limit",
-    ),
 )
 def joint_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """Steps of the recorded velocities.
@@ -109,8 +89,6 @@ class Handed(Protocol):
     simulated=(1e-6, 1e-4),
     on=("simulated", "dataset"),
     needs="EE poses, and the robot and TCP link that demorec recorded",
-    reads=(*EE_TOPICS, "/joint_states", "/action", "/command", "/robot_description", "info.robot.tcp_link", STATE,
-           EE_POSE, "demorec/"),
 )  # fmt: skip
 def forward_kinematics(subject: Handed) -> Iterator[Found]:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
@@ -126,11 +104,6 @@ def forward_kinematics(subject: Handed) -> Iterator[Found]:
     measures="deviation of a quaternion's length from 1",
     warn=1e-6,
     fail=1e-3,
-    reads=(
-        *EE_TOPICS,
-        "/object/{body}/pose",
-        "/camera/{camera}/pose",
-    ),
 )
 def unit_quaternions(episode: CheckedEpisode) -> Iterator[Found]:
     """Every rotation is one."""
@@ -147,13 +120,6 @@ def unit_quaternions(episode: CheckedEpisode) -> Iterator[Found]:
     unit="m",
     warn=1e-6,
     fail=2e-3,
-    reads=(
-        "/gripper",
-        "/joint_states",
-        "/action",
-        "/command",
-        "info.robot.gripper.max_width",
-    ),
 )
 def gripper_width(episode: CheckedEpisode) -> Iterator[Found]:
     """The opening is that of the finger joints and lies, as its target does, within 0 and the full opening.
@@ -172,10 +138,6 @@ def gripper_width(episode: CheckedEpisode) -> Iterator[Found]:
 @physics_check(
     measures="distance of the joints from the command before",
     unit="rad",
-    reads=(
-        "/joint_states",
-        "/command",
-    ),
 )
 def command_tracking(episode: CheckedEpisode) -> Measurement | None:
     """The arm goes where it is sent, rad: catches commands of another episode, of another joint, or made up."""
@@ -187,10 +149,6 @@ def command_tracking(episode: CheckedEpisode) -> Measurement | None:
 @physics_check(
     measures="distance between action and executed command",
     unit="rad",
-    reads=(
-        "/action",
-        "/command",
-    ),
 )
 def action_matches_command(episode: CheckedEpisode) -> Measurement | None:
     """The label differs from what was executed by exploration noise at most, rad."""
@@ -200,10 +158,6 @@ def action_matches_command(episode: CheckedEpisode) -> Measurement | None:
 
 @physics_check(
     measures="share of frames in which nothing moves and nothing is asked",
-    reads=(
-        "/action",
-        "/joint_states",
-    ),
 )
 def idle_frames(episode: CheckedEpisode) -> Measurement | None:
     """A policy that learns from idle frames learns to stand still."""
@@ -220,7 +174,6 @@ def idle_frames(episode: CheckedEpisode) -> Measurement | None:
 
 @physics_check(
     measures="force on the hand against the weight and motion of what it bears, median difference of it",
-    reads=("/wrench", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
 )
 def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import COLOR_TOPICS, Found, Measurement, time_check, worst_frame
+from demorec.check.base import Found, Measurement, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.mcap import channels
 from demorec.mcap.streams import frame_streams
@@ -15,7 +15,6 @@ from demorec.mcap.streams import frame_streams
 @time_check(
     measures="largest distance of a message from its frame's time",
     unit="ms",
-    reads=("info.fps",),
 )
 def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
     """Times rise in equal steps of 1 / fps from 0, the same on every stream of numbers."""
@@ -31,18 +30,6 @@ def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
 @time_check(
     measures="largest difference between a message's own stamp and its time",
     unit="ms",
-    reads=(
-        "/joint_states",
-        "/gripper",
-        "/action",
-        "/command",
-        "/ee_pose",
-        "/events",
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-    ),
 )
 def stamps(episode: CheckedEpisode) -> Iterator[Found]:
     """The stamp in each message's header, which ROS tools go by, is the time at which it was logged."""
@@ -57,7 +44,6 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
 
 @time_check(
     measures="pictures missing, surplus, off their frame's time, or too far from a keyframe",
-    reads=(*COLOR_TOPICS, "cameras.video.gop"),
 )
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
     """Each camera has one coded picture a frame at the frame's time, and a keyframe at least every GOP."""
