@@ -91,11 +91,6 @@ def lag_error(before: Array, after: Array, *, what: str) -> Measurement | None:
 
 @alignment_check(
     measures="lag between states and what the commands ask for, frames",
-    reads=(
-        "/command",
-        "/joint_states",
-        "info.physics_hz",
-    ),
 )
 def command_lag(episode: CheckedEpisode) -> Measurement | None:
     """Command t is sent after observation t and reached, but for the servo's lag, at observation t + 1."""
@@ -110,10 +105,6 @@ def command_lag(episode: CheckedEpisode) -> Measurement | None:
 
 @alignment_check(
     measures="lag between action and executed command, frames",
-    reads=(
-        "/action",
-        "/command",
-    ),
 )
 def action_lag(episode: CheckedEpisode) -> Measurement | None:
     """The action of a frame is the wish behind that frame's command.
@@ -133,10 +124,6 @@ def action_lag(episode: CheckedEpisode) -> Measurement | None:
 
 @alignment_check(
     measures="lag between gripper command and opening, frames beyond the motor's",
-    reads=(
-        "/command",
-        "/gripper",
-    ),
 )
 def gripper_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """The opening starts to follow within a few frames of each command to close or open, and never before it."""
@@ -158,10 +145,6 @@ def gripper_lag(episode: CheckedEpisode) -> Iterator[Found]:
 
 @sidecar_check(
     measures="lag between action and state, off the contract's, frames",
-    reads=(
-        "action",
-        "observation.state",
-    ),
 )
 def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
     """Action t is what leads from observation t to t + 1, in every episode; catches shifted and made-up actions.

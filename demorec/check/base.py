@@ -42,14 +42,6 @@ IMAGES = "colour images"
 SIDECAR = "what demorec keeps beside its datasets"
 """What checks need, as `Check.needs` has it."""
 
-COLOR_TOPICS = ("/camera/{camera}/h264", "/camera/{camera}/video", "/camera/{camera}/image/compressed")
-"""Where a camera's coded colour pictures are, whatever the codec; for `Check.reads`."""
-PICTURE_TOPICS = (*COLOR_TOPICS, "/camera/{camera}/depth", "/camera/{camera}/segmentation")
-"""The same with its other pictures."""
-MOTION_TOPICS = ("/joint_states", "/object/{body}/pose")
-"""Where it is said how everything moves that a camera sees."""
-EE_TOPICS = ("/ee_pose", "/action/ee_pose", "/command/ee_pose")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
@@ -106,7 +98,6 @@ class Check:
         warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.
         simulated: (warn, fail) of recordings that demorec simulated, where these are exact and others are not.
         needs_pictures: Whether pictures have to be decoded.
-        reads: What it looks at, of all that `demorec.check.reads` lists: topics, fields, columns.
         measure: The function.
     """
 
@@ -120,7 +111,6 @@ class Check:
     fail: float
     simulated: tuple[float, float]
     needs_pictures: bool
-    reads: tuple[str, ...]
     measure: Callable[[Any], Found]
 
     @property
@@ -252,7 +242,6 @@ def check(
     on: tuple[Form, ...] = ("simulated",),
     needs: str = SCENE,
     needs_pictures: bool = False,
-    reads: tuple[str, ...] = (),
 ) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
     """Make a `Check` of a function; its name is the function's. Of a generator the `worst` that it yields is judged.
 
@@ -281,7 +270,6 @@ def check(
             fail=limits[1],
             simulated=exact,
             needs_pictures=needs_pictures,
-            reads=reads,
             measure=measure,
         )
 

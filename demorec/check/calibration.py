@@ -8,9 +8,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.check.base import (
-    COLOR_TOPICS,
-    MOTION_TOPICS,
-    PICTURE_TOPICS,
     Found,
     Measurement,
     NotMeasured,
@@ -37,12 +34,6 @@ UNRELATED = 16.0
     unit="px",
     warn=0.01,
     fail=0.5,
-    reads=(
-        "/camera/{camera}/camera_info",
-        "info.scene.cameras.fov_y",
-        "info.scene.cameras.width",
-        "info.scene.cameras.height",
-    ),
 )
 def intrinsics(episode: CheckedEpisode) -> Iterator[Found]:
     """The calibration message agrees with the scene's camera and the pictures' size."""
@@ -63,12 +54,6 @@ def intrinsics(episode: CheckedEpisode) -> Iterator[Found]:
     unit="m",
     warn=1e-5,
     fail=1e-3,
-    reads=(
-        "/camera/{camera}/pose",
-        "info.scene.cameras.mount",
-        "info.scene.cameras.mount_from_camera",
-        "info.scene.robot.world_from_base",
-    ),
 )
 def extrinsics(episode: CheckedEpisode) -> Iterator[Found]:
     """Recorded camera poses are those of the mount, by forward kinematics (0.1 m per rad of rotation)."""
@@ -101,12 +86,6 @@ def _allowance(episode: CheckedEpisode, camera: SceneCamera) -> float:
     measures="shift of the pictures against what the recorded numbers make of them, of the height",
     unit="%",
     needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/camera/{camera}/camera_info",
-        "info.scene.cameras",
-        "info.behaviour",
-    ),
 )
 @of_each_camera
 def projection(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
@@ -129,11 +108,6 @@ def projection(episode: CheckedEpisode, camera: SceneCamera, compared: PictureCo
 @calibration_check(
     measures="size of what the pictures show against what the recorded numbers make of it, off 1",
     needs_pictures=True,
-    reads=(
-        *COLOR_TOPICS,
-        "/camera/{camera}/camera_info",
-        "info.scene.cameras.fov_y",
-    ),
 )
 @of_each_camera
 def projected_size(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
@@ -146,7 +120,6 @@ def projected_size(episode: CheckedEpisode, camera: SceneCamera, compared: Pictu
 @alignment_check(
     measures="lag between pictures and numbers, frames",
     needs_pictures=True,
-    reads=(*PICTURE_TOPICS, *MOTION_TOPICS),
 )
 def picture_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """Picture t shows state t: robot and objects are where the numbers of the same frame put them.
@@ -163,12 +136,6 @@ def picture_lag(episode: CheckedEpisode) -> Iterator[Found]:
 @calibration_check(
     measures="share of a depth picture that is not what the recorded numbers make of it",
     needs_pictures=True,
-    reads=(
-        "/camera/{camera}/depth",
-        *MOTION_TOPICS,
-        "info.scene.bodies.shape",
-        "info.scene.cameras.far",
-    ),
 )
 def depth_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
     """Depth is metres along the optical axis, in every frame: catches other units, distances along the ray, flips."""
@@ -178,11 +145,6 @@ def depth_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
 @calibration_check(
     measures="share of a picture of labels that is not what the recorded numbers make of it",
     needs_pictures=True,
-    reads=(
-        "/camera/{camera}/segmentation",
-        *MOTION_TOPICS,
-        "info.scene.bodies.shape",
-    ),
 )
 def segmentation_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
     """Every pixel has the label of the body that geometry puts there, in every frame."""

@@ -16,7 +16,6 @@ from demorec.datasets.lerobot.robots import read_robot
 
 @sidecar_check(
     measures="descriptions of robots that are missing, changed or of another robot",
-    reads=("demorec/",),
 )
 def dataset_robots(dataset: Dataset) -> Measurement | None:
     """The URDF beside each episode is there, unchanged, and of the robot, joints and TCP that the episode has.
@@ -49,7 +48,6 @@ def dataset_robots(dataset: Dataset) -> Measurement | None:
 
 @sidecar_check(
     measures="columns of the table of episodes that the sidecar contradicts",
-    reads=("meta/episodes", "demorec/"),
 )
 def dataset_facts(dataset: Dataset) -> Measurement | None:
     """Outcome, retries, task, seed and length of each episode are those that the sidecar keeps."""
@@ -81,7 +79,6 @@ def dataset_facts(dataset: Dataset) -> Measurement | None:
 
 @dataset_check(
     measures="rows of sarm_progress.parquet that the episodes' stages contradict",
-    reads=(PROGRESS_PATH, "meta/episodes"),
 )
 def dataset_progress(dataset: Dataset) -> Measurement | None:
     """Every row of the dataset has a progress in 0 to 1, which is that of its stage; stages leave no gap."""

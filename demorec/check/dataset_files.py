@@ -23,10 +23,6 @@ from demorec.datasets.lerobot.videos import PacketReader
 
 @dataset_check(
     measures="tables that cannot be read",
-    reads=(
-        "meta/info.json",
-        "meta/episodes",
-    ),
 )
 def dataset_readable(dataset: Dataset) -> Measurement:
     """info.json, the tables and every row can be read."""
@@ -36,13 +32,6 @@ def dataset_readable(dataset: Dataset) -> Measurement:
 
 @dataset_check(
     measures="counters, indices and timestamps that are not as they must be",
-    reads=(
-        "timestamp",
-        "frame_index",
-        "episode_index",
-        "index",
-        "task_index",
-    ),
 )
 def dataset_counts(dataset: Dataset) -> Measurement:
     """Totals agree with the tables; indices count up without a gap; timestamps are frame_index / fps."""
@@ -77,10 +66,6 @@ def dataset_counts(dataset: Dataset) -> Measurement:
 
 @dataset_check(
     measures="episodes without a coded picture for every frame",
-    reads=(
-        "observation.images.{camera}",
-        "observation.images.{camera}_depth",
-    ),
 )
 def dataset_videos(dataset: Dataset) -> Measurement | None:
     """Every episode has its pictures in every camera's file, one after the other.
@@ -110,7 +95,6 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
 
 @sidecar_check(
     measures="episodes on which dataset and sidecar disagree",
-    reads=("demorec/",),
 )
 def dataset_sidecar(dataset: Dataset) -> Measurement | None:
     """Task, success and content digest of each episode are those that the sidecar keeps."""
@@ -162,7 +146,6 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
 @dataset_check(
     measures="errors when the installed LeRobot opens it",
     needs_pictures=True,
-    reads=("meta/info.json",),
 )
 def dataset_opens(dataset: Dataset) -> Measurement | None:
     """LeRobot opens the dataset and reads first, middle and last frame, pictures included."""

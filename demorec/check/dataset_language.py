@@ -22,7 +22,7 @@ from demorec.annotate.situation import COLOR_WORDS, Surroundings, place_of, situ
 from demorec.check.base import Found, Measurement, NotMeasured, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
-from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode
+from demorec.datasets.lerobot.language import SpokenEpisode
 from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE, SimulatedInfo
 
 Row = dict[str, Any]
@@ -33,7 +33,6 @@ _ROLES = ("user", "assistant", "system", "tool")
 
 @dataset_check(
     measures="entries of the language columns that are not as LeRobot has them",
-    reads=COLUMNS,
 )
 def dataset_language(dataset: Dataset) -> Measurement | None:
     """Styles, roles and cameras; one subtask at every frame; times of frames; answers that can be read."""
@@ -124,7 +123,6 @@ def _points(answer: Row) -> Iterator[tuple[float, float]]:
 
 @sidecar_check(
     measures="statements that the phases, the scene or the boxes beside the dataset contradict",
-    reads=(*COLUMNS, "demorec/"),
 )
 def dataset_language_truth(dataset: Dataset) -> Found:
     """Subtasks change with the phases, words refer to things of the task, boxes and counts are those of the masks."""

@@ -21,10 +21,6 @@ from demorec.episode.features import STATE
 @dataset_check(
     measures="pictures that are of one colour, or unlike both of their neighbours",
     needs_pictures=True,
-    reads=(
-        "observation.images.{camera}",
-        "observation.images.{camera}_depth",
-    ),
 )
 def dataset_pictures(dataset: Dataset) -> Measurement | None:
     """Every picture decodes, none is empty, and none is from another moment or place than those around it."""
@@ -47,7 +43,6 @@ def dataset_pictures(dataset: Dataset) -> Measurement | None:
     warn=0.25,
     fail=1.0,
     needs_pictures=True,
-    reads=("observation.images.{camera}", "observation.state"),
 )
 def dataset_frozen(dataset: Dataset) -> Iterator[Found]:
     """A camera that sees the robot move shows it: catches a stream that hangs.
@@ -86,11 +81,6 @@ def dataset_frozen(dataset: Dataset) -> Iterator[Found]:
     warn=0.04,
     fail=0.08,
     needs_pictures=True,
-    reads=(
-        "meta/stats.json",
-        "meta/episodes",
-        "observation.images.{camera}",
-    ),
 )
 def dataset_picture_statistics(dataset: Dataset) -> Iterator[Found]:
     """The mean colours of each camera, over all episodes and in each of them, are those of all its pictures."""
@@ -117,7 +107,6 @@ def _off_colour(said: Any, mean: Array, detail: str) -> Measurement:
 drawn_check = partial(
     sidecar_check,
     needs_pictures=True,
-    reads=("observation.images.{camera}", "observation.state", "demorec/"),
 )
 
 

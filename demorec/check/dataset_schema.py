@@ -28,7 +28,6 @@ _RATE_TOLERANCE = 0.01
 
 @dataset_check(
     measures="statements of info.json that its tables and videos contradict",
-    reads=("meta/info.json",),
 )
 def dataset_schema(dataset: Dataset) -> Measurement:
     """Columns, types, shapes, names; codec, size and rate of each video file; splits that cover all episodes."""
@@ -143,10 +142,6 @@ def _splits(dataset: Dataset) -> Iterator[str]:
 
 @sidecar_check(
     measures="statements of info.json that the episodes' own descriptions contradict",
-    reads=(
-        "meta/info.json",
-        "demorec/",
-    ),
 )
 def dataset_description(dataset: Dataset) -> Measurement | None:
     """Robot, rate, names of components and sizes of pictures are those of the scenes that the sidecar keeps."""

@@ -28,14 +28,6 @@ _MERGED = 0.02
     measures="statistics against those recomputed from all rows, in standard deviations",
     warn=0.01,
     fail=0.05,
-    reads=(
-        "meta/stats.json",
-        "observation.state",
-        "observation.velocity",
-        "observation.ee_pose",
-        "observation.environment_state",
-        "action",
-    ),
 )
 def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     """meta/stats.json: minimum, maximum, mean, deviation, count and quantiles of every feature.
@@ -65,7 +57,6 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     measures="statistics of single episodes against those recomputed, in standard deviations",
     warn=0.01,
     fail=0.05,
-    reads=("meta/episodes",),
 )
 def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
     """The columns stats/... of the episodes' table, from which LeRobot merges those of several datasets."""

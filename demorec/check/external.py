@@ -88,7 +88,6 @@ class CheckedRecording(ExitStack):
     group="time",
     measures="frames and images that were dropped while recording",
     fail=float("inf"),
-    reads=("metadata demorec.outcome", "outcome.drops"),
 )
 def drops(subject: CheckedRecording) -> Found:
     """What came could be taken."""
@@ -104,7 +103,6 @@ def drops(subject: CheckedRecording) -> Found:
     measures="how much the frames' mean rate differs from the nominal one, as a share of it",
     warn=0.05,
     fail=0.5,
-    reads=("/frames",),
 )
 def rate(subject: CheckedRecording) -> Found:
     """The frames came at the rate that the episode names, by which datasets and policies go."""
@@ -120,7 +118,6 @@ def rate(subject: CheckedRecording) -> Found:
     measures="the longest time between two frames, in nominal periods",
     warn=2.5,
     fail=30,
-    reads=("/frames",),
 )
 def gaps(subject: CheckedRecording) -> Found:
     """No frames are missing between others."""
@@ -138,7 +135,6 @@ def gaps(subject: CheckedRecording) -> Found:
     measures="the largest distance between the stamps of a frame and of a sample that it holds",
     warn=0.1,
     fail=1.0,
-    reads=("/frames",),
 )
 def sample_age(subject: CheckedRecording) -> Iterator[Found]:
     """What a frame holds was sensed at about its time."""
@@ -153,7 +149,6 @@ def sample_age(subject: CheckedRecording) -> Iterator[Found]:
     measures="the largest distance between the stamps of a frame and of an image that it holds",
     warn=0.2,
     fail=1.0,
-    reads=("/frames", "/camera/{camera}/h264"),
 )
 def image_age(subject: CheckedRecording) -> Iterator[Found]:
     """The images that a frame holds were taken at about its time."""
@@ -167,7 +162,6 @@ def image_age(subject: CheckedRecording) -> Iterator[Found]:
     group="pictures",
     measures="the share of frames that have no image of a camera",
     fail=0.5,
-    reads=("/frames",),
 )
 def missing_images(subject: CheckedRecording) -> Iterator[Found]:
     """Every frame has an image of every camera."""
@@ -185,7 +179,6 @@ def missing_images(subject: CheckedRecording) -> Iterator[Found]:
     "than half of them",
     needs=IMAGES,
     needs_pictures=True,
-    reads=("/camera/{camera}/h264", "/camera/{camera}/depth"),
 )
 def images_show_something(subject: CheckedRecording) -> Found:
     """Every image decodes and shows something."""

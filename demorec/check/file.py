@@ -8,14 +8,13 @@ from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.external import CheckedRecording
 from demorec.mcap import channels, messages
-from demorec.mcap.streams import SUBTASK, frame_streams
+from demorec.mcap.streams import frame_streams
 
 
 @file_check(
     measures="recordings that cannot be opened (index, metadata, format version)",
     on=("simulated", "external"),
     needs="a recording",
-    reads=("info.format_version", "metadata demorec.collected"),
 )
 def opens(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
@@ -26,7 +25,6 @@ def opens(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     measures="topics whose message count differs from the index; every chunk passes its CRC",
     on=("simulated", "external"),
     needs="a recording",
-    reads=("metadata demorec.episode", "metadata demorec.collected"),
 )
 def checksums(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     """Every byte that holds a message or an attachment passes its checksum, and the index counts them right."""
@@ -41,11 +39,6 @@ def checksums(episode: CheckedEpisode | CheckedRecording) -> Measurement:
 
 @file_check(
     measures="topics that are missing, of another type or not one message a frame",
-    reads=(
-        "info.scene.cameras.name",
-        "info.scene.bodies.name",
-        "info.format_version",
-    ),
 )
 def topics(episode: CheckedEpisode) -> Measurement:
     """Every stream that the metadata promises is there, of its type, with one message for each frame."""
@@ -91,7 +84,6 @@ def _picture_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str
     measures="streams that do not decode into numbers",
     on=("simulated", "external"),
     needs="a recording",
-    reads=("/events", "/phase", "/deliberate_miss", "/frames", "/{feature}", SUBTASK),
 )
 def readable(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     """Every message has the layout that the metadata promises, at its frame's time."""
@@ -103,7 +95,6 @@ def readable(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     fail=1,
     on=("simulated", "external"),
     needs="a recording",
-    reads=("metadata demorec.recovered",),
 )
 def complete(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     """The episode was recorded to its end."""

@@ -88,7 +88,6 @@ def _reach(body: Convex, world_from_body: Array, axes: Array) -> tuple[Array, Ar
     unit="m",
     warn=0.001,
     fail=0.0015,
-    reads=("/joint_states", "/robot_description", "/object/{body}/pose", "info.scene.bodies.shape.size"),
 )
 def finger_depth(episode: CheckedEpisode) -> Iterator[Found]:
     """Fingers press on the outside of what they hold (boxes, spheres, cylinders, capsules).

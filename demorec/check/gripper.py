@@ -20,7 +20,6 @@ CARRIED_HEIGHT = 0.03
     unit="m",
     warn=1e-6,
     fail=2e-3,
-    reads=("/action", "/command"),
 )
 def gripper_label(episode: CheckedEpisode) -> Measurement | None:
     """Exploration noise is on the arm alone: the label asks for the opening that was sent."""
@@ -30,7 +29,6 @@ def gripper_label(episode: CheckedEpisode) -> Measurement | None:
 
 @physics_check(
     measures="contact force on a carried object against that of the gripper's motors, off 1",
-    reads=("/gripper", "info.robot.gripper.force", "/object/{body}/pose"),
 )
 def grip_force(episode: CheckedEpisode) -> Found:
     """Two fingers that hold something press on it with the force of their motors, each of them.
@@ -56,7 +54,6 @@ def grip_force(episode: CheckedEpisode) -> Found:
 @physics_check(
     measures="contact force while there is nothing within reach",
     unit="N",
-    reads=("/gripper", "/object/{body}/pose"),
 )
 def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
     """Fingers far above all supports and away from all objects touch nothing but each other."""
@@ -83,7 +80,6 @@ def _top(body: Body) -> float:
     measures="largest motor torque or finger force in units of its limit",
     warn=1.001,
     fail=1.05,
-    reads=("/joint_states", "info.robot.torque_limit", "info.robot.gripper.force"),
 )
 def joint_effort(episode: CheckedEpisode) -> Measurement | None:
     """No motor gives more than it can; a gripper that presses gives all that it has."""

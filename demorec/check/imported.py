@@ -22,9 +22,7 @@ _TIMES = frozenset(
 _PICTURES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
 _MOST_TOLD = 5
 
-import_check = partial(
-    check, on=("external run",), needs="a run that was imported", fail=math.inf, reads=("import.json",)
-)
+import_check = partial(check, on=("external run",), needs="a run that was imported", fail=math.inf)
 
 
 @import_check(

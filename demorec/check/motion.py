@@ -34,7 +34,6 @@ from demorec.check.evidence import Flags, Motion
 from demorec.check.rows import LinkMatrices, displacement, finest_lag, longest_run, matrices
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
-from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.robots.urdf import Urdf
 
 _REACH_S = 1.0
@@ -72,7 +71,6 @@ EVERYWHERE: tuple[Form, ...] = ("simulated", "external", "dataset")
 motion_check = partial(check, group="physics", on=EVERYWHERE)
 target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
 """Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
-_TOPICS = ("/{feature}", "/joint_states", "/action", "/command")
 
 
 class Motions:
@@ -155,7 +153,6 @@ class Moving(Protocol):
     fail=0.2,
     simulated=(0.005, 0.05),
     needs=URDF,
-    reads=(STATE, *_TOPICS, "info.robot.position_lower", "info.robot.position_upper"),
 )
 def joint_limits(subject: Moving) -> Iterator[Found]:
     """Joints are within the limits of the robot's URDF: catches degrees for radians, and offsets."""
@@ -176,7 +173,6 @@ def joint_limits(subject: Moving) -> Iterator[Found]:
     fail=3,
     simulated=(1.1, 1.5),
     needs=URDF,
-    reads=(STATE, *_TOPICS, "info.robot.velocity_limit"),
 )
 def joint_speed(subject: Moving) -> Iterator[Found]:
     """No joint is faster than its motor: catches wrong rates, spikes, and episodes glued together.
@@ -201,7 +197,6 @@ def joint_speed(subject: Moving) -> Iterator[Found]:
     warn=0.1,
     fail=0.16,
     needs=VELOCITIES,
-    reads=(STATE, VELOCITY, "/{feature}", "/joint_states", "info.fps"),
 )
 def velocity_matches_position(subject: Moving) -> Found:
     """States change by velocity over time, each joint by itself, all episodes together: catches a wrong rate,
@@ -239,7 +234,6 @@ def velocity_matches_position(subject: Moving) -> Found:
     warn=0.75,
     fail=1.5,
     group="alignment",
-    reads=(STATE, ACTION, *_TOPICS),
 )
 def state_follows_action(subject: Moving) -> Found:
     """The state follows the action by about a frame or more, and by less than a third of a second: catches actions that
@@ -269,7 +263,6 @@ def state_follows_action(subject: Moving) -> Found:
 @target_check(
     measures="elements of the state that follow the action of another one",
     group="alignment",
-    reads=(STATE, ACTION, *_TOPICS),
 )
 def actions_in_order(subject: Moving) -> Found:
     """Every element of the state follows its own action: catches joints exchanged in one of the two."""
@@ -291,7 +284,6 @@ def actions_in_order(subject: Moving) -> Found:
     unit="rad, m",
     warn=0.1,
     fail=0.3,
-    reads=(STATE, ACTION, *_TOPICS),
 )
 def state_reaches_action(subject: Moving) -> Found:
     """A joint that is held comes to where it was sent, at least at some time: catches a zero that is off.
@@ -324,7 +316,6 @@ def state_reaches_action(subject: Moving) -> Found:
 @motion_check(
     measures="elements of the state that never change while their action does",
     needs=ACTIONS,
-    reads=(STATE, ACTION, *_TOPICS),
 )
 def elements_alive(subject: Moving) -> Found:
     """Encoders are alive: no element stays at one value in all episodes while what it is sent changes."""
@@ -343,7 +334,6 @@ def elements_alive(subject: Moving) -> Found:
     fail=math.inf,
     simulated=(2, 4),
     needs=STATE_ALONE,
-    reads=(STATE, VELOCITY, EE_POSE, "/{feature}", "/joint_states", "/ee_pose", "/wrench"),
 )
 def stuck_sensors(subject: Moving) -> Iterator[Found]:
     """What is measured changes, if ever so little, while the arm moves.
@@ -371,7 +361,6 @@ def stuck_sensors(subject: Moving) -> Iterator[Found]:
     warn=0.02,
     fail=0.05,
     needs=EE_POSES,
-    reads=(STATE, EE_POSE, "/{feature}"),
 )
 def pose_follows_joints(subject: Moving) -> Iterator[Found]:
     """The hand goes where the joints take it, whatever its frame and the base's are: catches exchanged joints,
@@ -436,7 +425,6 @@ def _mounted(links: Array, poses: Array) -> Array:
     warn=0.25,
     fail=0.5,
     needs=GRIPPER,
-    reads=(STATE, ACTION, "/{feature}", "/gripper", "/command", "/joint_states"),
 )
 def gripper_follows(subject: Moving) -> Iterator[Found]:
     """The fingers stand where they were told to, or further apart where something is between them.
@@ -481,13 +469,6 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     warn=0.6,
     fail=math.inf,
     needs=EFFORTS,
-    reads=(
-        "/joint_states",
-        "info.scene.physics.gravity",
-        "info.scene.bodies.mass",
-        "/robot_description",
-        "/{feature}",
-    ),
 )
 def effort_matches_dynamics(subject: Moving) -> Iterator[Found]:
     """The motors of the joints that bear the arm give the torques that its weight and motion need.

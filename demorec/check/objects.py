@@ -76,10 +76,6 @@ def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
 @physics_check(
     measures="fastest motion of an object that nothing touches",
     unit="m/s",
-    reads=(
-        "/object/{body}/pose",
-        "/joint_states",
-    ),
 )
 def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
     """An object moves only when touched, or for a moment after it (falling, rolling, tipping)."""
@@ -91,7 +87,6 @@ def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
 @physics_check(
     measures="object speed beyond that of the hand and of falling",
     unit="m/s",
-    reads=("/object/{body}/pose",),
 )
 def teleports(episode: CheckedEpisode) -> Iterator[Found]:
     """No object jumps."""
@@ -107,14 +102,6 @@ def teleports(episode: CheckedEpisode) -> Iterator[Found]:
 @physics_check(
     measures="distance of the first frame from the scene's start",
     unit="m",
-    reads=(
-        "/object/{body}/pose",
-        "/joint_states",
-        "/gripper",
-        "info.scene.bodies.world_from_body",
-        "info.scene.robot.joint_position",
-        "info.scene.robot.gripper_width",
-    ),
 )
 def starts_as_scene_says(episode: CheckedEpisode) -> Iterator[Found]:
     """Objects and joints begin where the scene put them (0.1 m per rad of rotation; 0.1 m per rad of a joint).
@@ -136,11 +123,6 @@ def starts_as_scene_says(episode: CheckedEpisode) -> Iterator[Found]:
 @physics_check(
     measures="depth to which a body is inside another",
     unit="m",
-    reads=(
-        "/object/{body}/pose",
-        "info.scene.bodies.shape",
-        "info.scene.bodies.collides",
-    ),
 )
 def penetration(episode: CheckedEpisode) -> Iterator[Found]:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules)."""
@@ -211,10 +193,6 @@ def _surface_points(shape: Shape) -> Array:
 
 @physics_check(
     measures="frames in which an object moves through the air unheld",
-    reads=(
-        "/object/{body}/pose",
-        "/gripper",
-    ),
 )
 def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
     """While an object travels above where it rests, fingers press on it and stand as far apart as it is wide."""

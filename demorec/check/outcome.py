@@ -1,45 +1,29 @@
-"""Is what is said about the episode's end what its last frames show."""
+"""Is what is said about the episode, its end above all, what its scene and its last frames show."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, outcome_check
+from demorec.annotate.situation import COLOR_WORDS
+from demorec.check.base import Found, Measurement, NotMeasured, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import matrices
-from demorec.core.tables import TASKS
-from demorec.episode.episode import SuccessCheck
-
-AT_LEAST = ("on_support", "on_table", "gripper_width")
-"""Conditions of demorec's own tasks that hold from their limit up; all others hold up to it."""
 
 
 @outcome_check(
     measures="contradictions within the outcome",
-    reads=(
-        "outcome.success",
-        "outcome.checks.name",
-        "outcome.checks.value",
-        "outcome.checks.limit",
-        "outcome.checks.passed",
-        "outcome.failure_phase",
-        "outcome.failure_reason",
-        "outcome.num_frames",
-    ),
 )
 def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
-    """Each condition passed as value and limit have it, success as the conditions; a failure has phase and reason."""
+    """An episode succeeds if all its conditions passed; a failure has a phase and a reason."""
     outcome = episode.outcome
     if outcome is None:
         return None
     failed = [condition.name for condition in outcome.checks if not condition.passed]
     wrong = []
-    for condition in outcome.checks:
-        if condition.passed not in _possible(episode, condition):
-            wrong.append(f"{condition.name} is {condition.value:.4g}, limit {condition.limit:.4g}: {condition.passed}?")
     if outcome.success and failed:
         wrong.append(f"success, but {failed[0]} did not pass")
     if outcome.success and (outcome.failure_reason or outcome.failure_phase):
@@ -57,57 +41,27 @@ def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong) or f"{len(outcome.checks)} conditions")
 
 
-def _possible(episode: CheckedEpisode, condition: SuccessCheck) -> set[bool]:
-    """What `passed` can be, given value and limit; a task of somebody else's may mean either side of the limit."""
-    at_most, at_least = condition.value <= condition.limit, condition.value >= condition.limit
-    if episode.info.task not in TASKS.rows:
-        return {at_most, at_least}
-    return {at_least if condition.name.partition(":")[0] in AT_LEAST else at_most}
-
-
 @outcome_check(
-    measures="values of the outcome against the last frame, in units of their limits",
-    reads=(
-        "outcome.checks.name",
-        "outcome.checks.value",
-        "outcome.checks.limit",
-        "/object/{body}/pose",
-        "/gripper",
-        "info.scene.goals.object",
-    ),
+    measures="colours that the instruction names and the scene lacks, or the other way round",
 )
-def end_values(episode: CheckedEpisode) -> Iterator[Found]:
-    """Height, tilt and opening that the outcome names are those of the last frame, in which all is at rest."""
-    outcome, scene, c = episode.outcome, episode.info.scene, episode.columns
-    if outcome is None or not outcome.success or not c.num_frames:
-        return
-    frame = c.num_frames - 1
-    for condition in outcome.checks:
-        name, _, body = condition.name.partition(":")
-        body = body or (scene.goals[0].object if len(scene.goals) == 1 else "")
-        value = None
-        if name == "gripper_width":
-            value = float(c.gripper_width[frame])
-        elif body in c.object_poses and name in ("tilt", "disturbed"):
-            pose = matrices(c.object_poses[body][-1:])[0]
-            upright = min(1.0, float(np.abs(pose[2, :3]).max()))
-            start = scene.body(body).world_from_body.position
-            value = math.acos(upright) if name == "tilt" else math.dist(pose[:2, 3], start[:2])
-        if value is not None and condition.limit > 0:
-            detail = f"{condition.name}: {value:.4g}, outcome says {condition.value:.4g}"
-            off = abs(value - condition.value) / condition.limit
-            yield Measurement(value=off, frame=frame, detail=detail)
+def instruction_fits_scene(episode: CheckedEpisode) -> Found:
+    """The instruction speaks of colours that are in the scene, and of those of the objects that have a goal."""
+    scene, instruction = episode.info.scene, episode.info.instruction
+    if not instruction.strip():
+        return Measurement(value=1, detail="there is no instruction")
+    words = [word for word in re.findall(r"[a-z]+", instruction.lower()) if word in COLOR_WORDS]
+    if not words:
+        return NotMeasured(why="the instruction names no colour")
+    known = {body.color_name for body in scene.bodies if body.color_name}
+    goals = dict.fromkeys(name for goal in scene.goals if (name := scene.body(goal.object).color_name))
+    wrong = [f"nothing is {word}" for word in dict.fromkeys(words) if word not in known]
+    wrong += [f"{color} is not named" for color in goals if color not in words]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or instruction)
 
 
 @outcome_check(
     measures="goal distance in the last frame against the outcome's",
     unit="m",
-    reads=(
-        "/object/{body}/pose",
-        "outcome.checks.value",
-        "info.scene.goals.onto",
-        "info.scene.goals.onto_from_goal",
-    ),
 )
 def final_state(episode: CheckedEpisode) -> Iterator[Found]:
     """An object that is said to lie at its goal lies there in the last recorded frame."""
@@ -133,10 +87,6 @@ def final_state(episode: CheckedEpisode) -> Iterator[Found]:
 @outcome_check(
     measures="speed of the goals' objects at the end",
     unit="m/s",
-    reads=(
-        "/object/{body}/pose",
-        "info.scene.goals.object",
-    ),
 )
 def at_rest_in_the_end(episode: CheckedEpisode) -> Iterator[Found]:
     """After a success the objects lie still: the recording does not stop in mid-motion."""

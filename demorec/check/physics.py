@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 
 from demorec.check.base import (
-    EE_TOPICS,
     Found,
     Lacking,
     Measurement,
@@ -21,21 +20,10 @@ from demorec.check.dynamics import MIN_FRAMES
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.core.geometry import Array
-from demorec.episode.features import EE_POSE, STATE
 
 
 @physics_check(
     measures="numbers that are NaN or infinite",
-    reads=(
-        "/joint_states",
-        "/gripper",
-        "/action",
-        "/command",
-        *EE_TOPICS,
-        "/wrench",
-        "/object/{body}/pose",
-        "/camera/{camera}/pose",
-    ),
 )
 def finite_numbers(episode: CheckedEpisode) -> Measurement:
     """Every recorded number is one."""
@@ -61,10 +49,6 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
 
 @physics_check(
     measures="largest acceleration of the wanted motion in units of its limit",
-    reads=(
-        "/action",
-        "info.robot.acceleration_limit",
-    ),
 )
 def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """The expert's joint targets (the labels) ask for no more than the motors give.
@@ -78,10 +62,6 @@ def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
 
 @physics_check(
     measures="largest acceleration of the measured motion in units of its limit",
-    reads=(
-        "/joint_states",
-        "info.robot.acceleration_limit",
-    ),
 )
 def joint_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """Steps of the recorded velocities.
@@ -109,8 +89,6 @@ class Handed(Protocol):
     simulated=(1e-6, 1e-4),
     on=("simulated", "dataset"),
     needs="EE poses, and the robot and TCP link that demorec recorded",
-    reads=(*EE_TOPICS, "/joint_states", "/action", "/command", "/robot_description", "info.robot.tcp_link", STATE,
-           EE_POSE, "demorec/"),
 )  # fmt: skip
 def forward_kinematics(subject: Handed) -> Iterator[Found]:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
@@ -126,11 +104,6 @@ def forward_kinematics(subject: Handed) -> Iterator[Found]:
     measures="deviation of a quaternion's length from 1",
     warn=1e-6,
     fail=1e-3,
-    reads=(
-        *EE_TOPICS,
-        "/object/{body}/pose",
-        "/camera/{camera}/pose",
-    ),
 )
 def unit_quaternions(episode: CheckedEpisode) -> Iterator[Found]:
     """Every rotation is one."""
@@ -147,13 +120,6 @@ def unit_quaternions(episode: CheckedEpisode) -> Iterator[Found]:
     unit="m",
     warn=1e-6,
     fail=2e-3,
-    reads=(
-        "/gripper",
-        "/joint_states",
-        "/action",
-        "/command",
-        "info.robot.gripper.max_width",
-    ),
 )
 def gripper_width(episode: CheckedEpisode) -> Iterator[Found]:
     """The opening is that of the finger joints and lies, as its target does, within 0 and the full opening.
@@ -170,42 +136,8 @@ def gripper_width(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @physics_check(
-    measures="force that holds the hand against the vertical",
-    unit="rad",
-    reads=(
-        "/wrench",
-        "info.robot.hand_link",
-        "info.scene.physics.gravity",
-    ),
-)
-def wrench_holds_the_hand(episode: CheckedEpisode) -> Measurement | None:
-    """Where the hand hardly accelerates and touches nothing, the arm's force on it is the answer to gravity.
-
-    Catches axes of another frame, a turned sign, torques for forces. The median over those frames, rad; what is
-    heavier or lighter by an unknown load cannot be seen.
-    """
-    c, fps = episode.columns, episode.info.fps
-    gravity = np.array(episode.info.scene.physics.gravity)
-    if c.wrench is None or c.num_frames < 3 or not gravity.any():
-        return None
-    hand = episode.world_from_link(episode.info.robot.hand_link)
-    force = (hand[:, :3, :3] @ c.wrench[:, :3, None])[1:-1, :, 0]
-    steady = np.linalg.norm(np.diff(hand[:, :3, 3], 2, axis=0), axis=1) * fps**2 < 0.05 * np.linalg.norm(gravity)
-    steady &= c.contact_force[1:-1] == 0
-    if not steady.any():
-        return None
-    cosine = -(force @ gravity) / np.maximum(np.linalg.norm(force, axis=1) * np.linalg.norm(gravity), 1e-12)
-    angle = float(np.median(np.arccos(np.clip(cosine[steady], -1.0, 1.0))))
-    return Measurement(value=angle, detail=f"{int(steady.sum())} steady frames")
-
-
-@physics_check(
     measures="distance of the joints from the command before",
     unit="rad",
-    reads=(
-        "/joint_states",
-        "/command",
-    ),
 )
 def command_tracking(episode: CheckedEpisode) -> Measurement | None:
     """The arm goes where it is sent, rad: catches commands of another episode, of another joint, or made up."""
@@ -217,10 +149,6 @@ def command_tracking(episode: CheckedEpisode) -> Measurement | None:
 @physics_check(
     measures="distance between action and executed command",
     unit="rad",
-    reads=(
-        "/action",
-        "/command",
-    ),
 )
 def action_matches_command(episode: CheckedEpisode) -> Measurement | None:
     """The label differs from what was executed by exploration noise at most, rad."""
@@ -230,10 +158,6 @@ def action_matches_command(episode: CheckedEpisode) -> Measurement | None:
 
 @physics_check(
     measures="share of frames in which nothing moves and nothing is asked",
-    reads=(
-        "/action",
-        "/joint_states",
-    ),
 )
 def idle_frames(episode: CheckedEpisode) -> Measurement | None:
     """A policy that learns from idle frames learns to stand still."""
@@ -250,7 +174,6 @@ def idle_frames(episode: CheckedEpisode) -> Measurement | None:
 
 @physics_check(
     measures="force on the hand against the weight and motion of what it bears, median difference of it",
-    reads=("/wrench", "info.scene.physics.gravity", "info.scene.bodies.mass", "/robot_description"),
 )
 def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""

@@ -10,9 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import (
-    COLOR_TOPICS,
-    MOTION_TOPICS,
-    PICTURE_TOPICS,
     Found,
     Lacking,
     Measurement,
@@ -37,7 +34,6 @@ _PREDICTED_WEIGHT = 0.5
 
 @picture_check(
     measures="frames without a picture that decodes",
-    reads=PICTURE_TOPICS,
 )
 def pictures_decode(episode: CheckedEpisode) -> Iterator[Found]:
     """Every camera's video, depth and labels decode to their end, one picture a frame."""
@@ -54,7 +50,6 @@ def pictures_decode(episode: CheckedEpisode) -> Iterator[Found]:
 
 @picture_check(
     measures="pictures that are nearly all black or nearly all white",
-    reads=COLOR_TOPICS,
 )
 def pictures_exposed(episode: CheckedEpisode) -> Iterator[Found]:
     """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
@@ -67,7 +62,6 @@ def pictures_exposed(episode: CheckedEpisode) -> Iterator[Found]:
 
 @picture_check(
     measures="largest share of a picture that is black or white",
-    reads=COLOR_TOPICS,
 )
 def exposure(episode: CheckedEpisode) -> Iterator[Found]:
     """Most of every picture is neither under- nor overexposed."""
@@ -78,12 +72,6 @@ def exposure(episode: CheckedEpisode) -> Iterator[Found]:
 
 @picture_check(
     measures="difference of the pictures from what the recorded numbers make of them, median of 255",
-    reads=(
-        *COLOR_TOPICS,
-        "info.scene.bodies.rgba",
-        "info.scene.bodies.texture",
-        "info.scene.light",
-    ),
 )
 def pictures_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
     """The pictures show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
@@ -93,7 +81,6 @@ def pictures_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
 
 @picture_check(
     measures="difference of a single picture from what was recorded at its frame, beyond the usual, of 255",
-    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
 def odd_pictures(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
@@ -123,7 +110,6 @@ def _stale(compared: PictureComparison) -> NDArray[np.bool_]:
 
 @picture_check(
     measures="longest run of unchanged pictures while something moves before the camera, frames",
-    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
 def frozen(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
@@ -133,7 +119,6 @@ def frozen(episode: CheckedEpisode, camera: SceneCamera, compared: PictureCompar
 
 @picture_check(
     measures="pictures that repeat the one before, in the midst of motion",
-    reads=(*COLOR_TOPICS, *MOTION_TOPICS),
 )
 @of_each_camera
 def repeated_pictures(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
@@ -157,7 +142,6 @@ def _stale_frames(camera: SceneCamera, compared: PictureComparison, count: int, 
     warn=0.9999,
     on=("simulated", "external", "dataset"),
     needs="two cameras",
-    reads=(*COLOR_TOPICS, "observation.images.{camera}"),
 )
 def distinct_cameras(subject: Filmed) -> Iterator[Found]:
     """Two cameras in different places do not show the same images, as when one is plugged in under two names."""
@@ -177,10 +161,6 @@ class Filmed(Protocol):
 
 @picture_check(
     measures="mean colour of the decoded pictures against the recorded histogram, of 255",
-    reads=(
-        *COLOR_TOPICS,
-        "/camera/{camera}/histogram",
-    ),
 )
 def pixel_statistics(episode: CheckedEpisode) -> Iterator[Found]:
     """The histograms, counted before coding, are those of the pictures: catches swapped channels and other pictures."""

@@ -168,7 +168,6 @@ class ExternalRun:
     measures="files missing, changed since they were made, or not in run.json",
     on=("run", "external run"),
     needs="a run",
-    reads=("run.attempts.file", "run.attempts.sha256", "metadata demorec.collected"),
 )
 def run_files(run: CheckedRun | ExternalRun) -> Measurement:
     """The recordings are exactly those that run.json lists, with the same SHA-256."""
@@ -190,24 +189,6 @@ def run_files(run: CheckedRun | ExternalRun) -> Measurement:
 
 @run_check(
     measures="recordings whose own account differs from run.json or the run",
-    reads=(
-        "run.attempts.episode_index",
-        "run.attempts.attempt",
-        "run.attempts.seed",
-        "run.attempts.success",
-        "run.attempts.num_frames",
-        "run.attempts.num_bytes",
-        "run.attempts.digest",
-        "run.attempts.phase",
-        "run.attempts.reason",
-        "run.config",
-        "run.versions",
-        "info.episode_index",
-        "info.attempt",
-        "info.root_seed",
-        "info.versions",
-        "outcome.success",
-    ),
 )
 def run_agrees(run: CheckedRun) -> Measurement:
     """Number, attempt, seed and config of each recording are those of its line and of the run."""
@@ -255,10 +236,6 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
     measures="episodes that have the start or the motion of another",
     on=("run", "external run", "dataset"),
     needs="two episodes",
-    reads=(
-        "info.scene.bodies.world_from_body", "info.scene.bodies.shape", "info.scene.robot.joint_position",
-        "/joint_states", STATE, "/{feature}",
-    ),
 )  # fmt: skip
 def duplicates(subject: CheckedRun | ExternalRun | Dataset) -> Found:
     """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
@@ -276,10 +253,6 @@ def duplicates(subject: CheckedRun | ExternalRun | Dataset) -> Found:
     fail=0.6,
     on=("run", "dataset"),
     needs=f"{MIN_EPISODES} episodes, each with {SCENE}",
-    reads=(
-        "info.scene.bodies.world_from_body", "info.scene.bodies.shape", "info.scene.goals.onto",
-        "info.scene.goals.onto_from_goal", "demorec/",
-    ),
 )  # fmt: skip
 def coverage(subject: CheckedRun | Dataset) -> Found:
     """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
@@ -288,10 +261,6 @@ def coverage(subject: CheckedRun | Dataset) -> Found:
 
 @run_check(
     measures="episodes that the run's dataset lacks or has too many",
-    reads=(
-        "run.num_episodes",
-        "run.attempts.success",
-    ),
 )
 def run_dataset(run: CheckedRun) -> Measurement | None:
     """The dataset that was made from the run has an episode for each success of those asked for last."""

@@ -49,12 +49,6 @@ class DatasetEpisode:
 
 @run_check(
     measures="episodes of the run's dataset that are not what was recorded",
-    reads=(
-        "observation.state",
-        "observation.velocity",
-        "observation.ee_pose",
-        "action",
-    ),
 )
 def run_dataset_content(run: CheckedRun) -> Measurement | None:
     """Every number and coded picture of each episode is that of its recording, exported with the same options."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import COLOR_TOPICS, Found, Measurement, time_check, worst_frame
+from demorec.check.base import Found, Measurement, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.mcap import channels
 from demorec.mcap.streams import frame_streams
@@ -15,7 +15,6 @@ from demorec.mcap.streams import frame_streams
 @time_check(
     measures="largest distance of a message from its frame's time",
     unit="ms",
-    reads=("info.fps",),
 )
 def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
     """Times rise in equal steps of 1 / fps from 0, the same on every stream of numbers."""
@@ -23,45 +22,14 @@ def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
     for topic in (stream.topic for stream in frame_streams(episode.info) if stream.topic in episode.scan):
         times = episode.scan[topic].time_ns
         if topic == channels.JOINT_STATES and len(times) != len(expected):
-            times = times[np.isin(times, expected)]  # states between the frames have check joint_sample_times
+            times = times[np.isin(times, expected)]  # others are between the frames
         count = min(len(times), len(expected))
         yield worst_frame(np.abs(times[:count] - expected[:count]) / 1e6, topic)
 
 
 @time_check(
-    measures="joint states between frames that are out of order or off the physics clock",
-    reads=(
-        "/joint_states",
-        "info.physics_hz",
-    ),
-)
-def joint_sample_times(episode: CheckedEpisode) -> Measurement | None:
-    """Recorded at the physics rate, joint states rise in equal steps of 1 / physics_hz."""
-    times = episode.scan[channels.JOINT_STATES].time_ns
-    if len(times) == episode.num_frames:
-        return None
-    hz = episode.info.physics_hz
-    expected = (np.arange(len(times), dtype=np.int64) * 2_000_000_000 + hz) // (2 * hz)
-    wrong = np.flatnonzero(times != expected)
-    frame = None if not len(wrong) else int(wrong[0] * episode.info.fps / hz)
-    return Measurement(value=len(wrong), frame=frame, detail=f"{len(times)} joint states at {hz} Hz")
-
-
-@time_check(
     measures="largest difference between a message's own stamp and its time",
     unit="ms",
-    reads=(
-        "/joint_states",
-        "/gripper",
-        "/action",
-        "/command",
-        "/ee_pose",
-        "/events",
-        "/camera/{camera}/h264",
-        "/camera/{camera}/video",
-        "/camera/{camera}/depth",
-        "/camera/{camera}/segmentation",
-    ),
 )
 def stamps(episode: CheckedEpisode) -> Iterator[Found]:
     """The stamp in each message's header, which ROS tools go by, is the time at which it was logged."""
@@ -76,7 +44,6 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
 
 @time_check(
     measures="pictures missing, surplus, off their frame's time, or too far from a keyframe",
-    reads=(*COLOR_TOPICS, "cameras.video.gop"),
 )
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
     """Each camera has one coded picture a frame at the frame's time, and a keyframe at least every GOP."""

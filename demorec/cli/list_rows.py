@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import aligned, say, say_json
-from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from demorec.core.registry import Registry
@@ -23,20 +22,15 @@ class ListRows:
     Examples:
       demorec list tasks
       demorec list cameras --json
-      demorec list checks --coverage
     """
 
     what: Positional[Literal["tasks", "cameras", "robots", "renderers", "exporters", "checks"]]
     """What to list."""
-    coverage: bool = False
-    """For checks: which of them read each topic, metadata field and dataset column, and what none of them reads."""
     json: bool = False
     """Print JSON: a list of names and summaries."""
 
     def run(self) -> int:
         """Print one line each."""
-        if self.coverage:
-            return self._print_coverage()
         from demorec.core import tables
 
         registry: Registry[Any] = getattr(tables, self.what.upper())
@@ -46,20 +40,6 @@ class ListRows:
             say_json([{"name": name, "summary": summary} for name, summary in rows])
         else:
             say(*aligned(rows))
-        return 0
-
-    def _print_coverage(self) -> int:
-        if self.what != "checks":
-            raise ConfigError(f"--coverage is for checks only, found {self.what}: demorec list checks --coverage.")
-        from demorec.check.reads import coverage
-        from demorec.core.plain import to_plain
-
-        rows = coverage()
-        if self.json:
-            say_json([to_plain(row) for row in rows])
-        else:
-            lines = ((row.kind, row.name, ", ".join(row.checks) or f"no check: {row.why_not}") for row in rows)
-            say(*aligned(lines))
         return 0
 
 

@@ -289,9 +289,9 @@ NUMBERS: list[tuple[Fault, str]] = [
     (commands_of_another_motion, "command_tracking"),
     (not_a_number, "finite_numbers"),
     (wrench_not_a_number, "finite_numbers"),
-    (wrench_of_the_load, "wrench_holds_the_hand"),
-    (torque_before_force, "wrench_holds_the_hand"),
-    (wrench_along_other_axes, "wrench_holds_the_hand"),
+    (wrench_of_the_load, "wrench_bears_the_hand"),
+    (torque_before_force, "wrench_bears_the_hand"),
+    (wrench_along_other_axes, "wrench_bears_the_hand"),
     (a_jump_while_untouched, "object_motion"),
     (a_drift_while_untouched, "object_motion"),
     (a_jump_in_the_hand, "teleports"),
@@ -391,18 +391,6 @@ def test_a_recovered_recording_is_a_warning(good: Path, tmp_path: Path) -> None:
     part.write_bytes(good.read_bytes()[: int(good.stat().st_size * 0.7)])
     recover(part, tmp_path / "cut.mcap")
     assert level_of(tmp_path / "cut.mcap", "complete") == "warn"
-
-
-def test_joint_states_off_the_physics_clock(tmp_path: Path) -> None:
-    fine = simulate(tmp_path / "fine.mcap", seed=7, joint_rate="physics")
-    assert level_of(fine, "joint_sample_times") == "pass"
-    frames = {index * 1_000_000_000 // 30 for index in range(400)}
-
-    def edit(m: Message) -> list[Message]:
-        between = m[0] == channels.JOINT_STATES and all(abs(m[3] - time) > 1000 for time in frames)
-        return [] if between and 1_000_000_000 < m[3] < 1_020_000_000 else [m]
-
-    assert level_of(rewrite_messages(fine, tmp_path / "s.mcap", edit), "joint_sample_times") == "fail"
 
 
 # ------------------------------------------------------------------------------------------------- pictures

@@ -112,9 +112,6 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
 def test_no_check_fails_on_a_correction(rollout: tuple[Attempt, Path]) -> None:
     report = check_subject(Subject(path=rollout[1], kind="recording"), CheckOptions())
     assert [result.check for result in report.results if result.level == "fail"] == []
-    skipped = {result.check: result.detail for result in report.results if result.level == "skip"}
-    for name in ("story", "phases_match_motion", "deliberate_misses", "noise_as_said"):
-        assert "a policy acted" in skipped[name]
 
 
 def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Path) -> None:
