@@ -36,8 +36,7 @@ from demorec.episode.scene import Body
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.loop.prepare import Episode
 from demorec.robots.assets import asset_path, mesh_path
-from demorec.robots.urdf import Urdf
-from demorec.robots.urdf_shapes import UrdfLink, read_links
+from demorec.robots.urdf import Urdf, UrdfLink, read_links
 
 LIMIT = 0.001
 """Of depth and slip, metres."""

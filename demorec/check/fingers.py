@@ -12,7 +12,7 @@ from demorec.check.base import Found, Measurement, physics_check
 from demorec.check.episode import CheckedEpisode
 from demorec.core.geometry import Array
 from demorec.episode.scene import Shape
-from demorec.robots.urdf_shapes import UrdfShape, read_links
+from demorec.robots.urdf import UrdfShape, read_links
 
 NEAR = 0.002
 """Gap between a finger and an object, metres, from which on there is something to measure."""

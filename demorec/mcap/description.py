@@ -24,8 +24,7 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba
 from demorec.robots.assets import asset_path, mesh_path
 from demorec.robots.obj import read_obj
-from demorec.robots.urdf import parse_xml, quat_from_rpy
-from demorec.robots.urdf_shapes import UrdfShape, read_links
+from demorec.robots.urdf import UrdfShape, parse_xml, quat_from_rpy, read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 _KINDS: dict[str, Literal["box", "sphere", "cylinder"]] = {

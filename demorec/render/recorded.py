@@ -18,7 +18,7 @@ from demorec.render import Mount, Visual, VisualBody
 from demorec.robots.assets import asset_path, mesh_path
 from demorec.robots.bullet_kinematics import BulletBody, as_told, origin_as_told, standing_as_told
 from demorec.robots.robot import RobotSpec
-from demorec.robots.urdf_shapes import read_links
+from demorec.robots.urdf import read_links
 
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 

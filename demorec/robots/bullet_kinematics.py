@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.robots.urdf import Urdf, UrdfJoint
-from demorec.robots.urdf_shapes import read_links
+from demorec.robots.urdf import Urdf, UrdfJoint, read_links
 
 Floats = NDArray[np.floating[Any]]
 """float64 or float32: every function below keeps the precision that it is given."""

@@ -6,7 +6,6 @@ nothing, which is right for a frame and for what is fixed to the ground, and wro
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -15,7 +14,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
 from demorec.core.plain import listed
 from demorec.robots.assets import asset_path
-from demorec.robots.urdf import Urdf, parse_xml
+from demorec.robots.urdf import Urdf, parse_xml, read_numbers
 
 MAX_MASS = 5_000.0
 """kg of a link: the heaviest arms that are sold weigh that as a whole (grams for kilograms are found)."""
@@ -83,13 +82,13 @@ def _mass(link: ET.Element, *, must_be_whole: bool) -> tuple[float, Array]:
         if must_be_whole and (link.find("visual") is not None or link.find("collision") is not None):
             raise ValueError("moves and has a shape, but no <inertial>")
         return 0.0, np.zeros(3)
-    (mass,) = _numbers(inertial.find("mass"), ("value",))
+    parts = inertial.find("mass"), inertial.find("inertia")
+    if parts[0] is None or parts[1] is None:
+        raise ValueError("an <inertial> without mass or inertia")
+    (mass,) = read_numbers(parts[0].get("value", ""), 1)
+    inertia = np.array([read_numbers(parts[1].get(axis, ""), 1) for axis in _AXES]).reshape(3, 3)
     origin = inertial.find("origin")
-    words = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
-    centre = np.array(_finite(words.split(), "a centre of mass that is no three numbers"))
-    if len(centre) != 3:
-        raise ValueError("a centre of mass that is no three numbers")
-    inertia = np.array(_numbers(inertial.find("inertia"), _AXES)).reshape(3, 3)
+    centre = np.array(read_numbers("0 0 0" if origin is None else origin.get("xyz", "0 0 0"), 3))
     if not 0 <= mass <= MAX_MASS:
         raise ValueError(f"a mass of {mass:g} kg")
     least, *_, most = np.linalg.eigvalsh(inertia)
@@ -98,20 +97,3 @@ def _mass(link: ET.Element, *, must_be_whole: bool) -> tuple[float, Array]:
     if most > MAX_GYRATION**2 * max(mass, 1.0) or least < -1e-9:
         raise ValueError(f"principal inertias of {least:.3g} to {most:.3g} kg m^2 for {mass:g} kg")
     return mass, centre
-
-
-def _numbers(element: ET.Element | None, names: tuple[str, ...]) -> list[float]:
-    """Finite attributes of an element; ValueError for others."""
-    if element is None:
-        raise ValueError("an <inertial> without mass or inertia")
-    return _finite([element.get(name, "") for name in names], "a mass or an inertia that is no number")
-
-
-def _finite(words: list[str], problem: str) -> list[float]:
-    try:
-        found = [float(word) for word in words]
-    except ValueError:
-        found = [math.nan]
-    if not all(map(math.isfinite, found)):
-        raise ValueError(problem)
-    return found

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -120,7 +121,7 @@ class ArmKinematics:
     def forward(self, joint_position: Array) -> Pose:
         """`base_from_tcp` at (n,) joint positions, rad."""
         q = np.ascontiguousarray(joint_position, dtype=np.float64)
-        position, rotation, _ = forward(q, self.origins, self.rotations, self.axes, self.tool, self.tool_rotation)
+        position, rotation, _ = forward(q, self.tables)
         return Pose(position=position, quat_xyzw=quat_from_rotation(rotation))
 
     def inverse(
@@ -183,7 +184,7 @@ class ArmKinematics:
             ROTATION_TOLERANCE,
             freedom.cone,
             freedom.roll,
-            *self._tables(),
+            self.tables,
         )
         return cast(Array, q), bool(reached)
 
@@ -210,9 +211,11 @@ class ArmKinematics:
             # On its way an arm of few joints may lean farther than where it is going to.
             min(math.pi, 2 * self.freedom.cone),
             min(math.pi, 5 * self.freedom.roll),
-            *self._tables(),
+            self.tables,
         )
         return cast(Array, path) if reached else None
 
-    def _tables(self) -> tuple[Array, ...]:
+    @cached_property
+    def tables(self) -> tuple[Array, ...]:
+        """What the compiled loops know of the arm."""
         return (self.origins, self.rotations, self.axes, self.tool, self.tool_rotation, self.lower, self.upper)

@@ -4,6 +4,8 @@ Without fast-math and without BLAS, every sum in a fixed order, so that the same
 OpenBLAS kernel is chosen by CPU type and changes the last bits). Loops stand where NumPy would take whole arrays: they
 compile several times as fast. The methods are the textbook ones: product of homogeneous transforms, geometric Jacobian,
 damped least squares with weights and a projected null-space pull (Siciliano et al., Robotics, sections 2.8, 3.1, 3.7).
+
+An `arm` is the tuple that `demorec.robots.kinematics.ArmKinematics.tables` gives.
 """
 
 from __future__ import annotations
@@ -93,8 +95,9 @@ def _rotation_vector(wanted, found):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def forward(q, origins, rotations, axes, tool, tool_rotation):  # type: ignore[no-untyped-def]
+def forward(q, arm):  # type: ignore[no-untyped-def]
     """TCP position (3,), rotation (3, 3) and geometric Jacobian (6, n)."""
+    origins, rotations, axes, tool, tool_rotation, _, _ = arm
     n = len(q)
     position = np.zeros(3)
     rotation = np.eye(3)
@@ -241,19 +244,14 @@ def inverse(  # type: ignore[no-untyped-def]
     rotation_tolerance,
     cone,
     roll,
-    origins,
-    rotations,
-    axes,
-    tool,
-    tool_rotation,
-    low,
-    high,
+    arm,
 ):
     """Damped least squares: dq = J# e + (I - J# J) gain (rest - q), clipped to 0.35 rad a step and to the limits.
 
     With a cone and a roll of 0 the whole pose is wanted. Otherwise the nearest to it is sought, which is reached once
     nothing moves any more and position, approach and roll are within what is allowed.
     """
+    low, high = arm[5], arm[6]
     n = len(start)
     q = start.copy()
     error = np.empty((6, 1))
@@ -261,7 +259,7 @@ def inverse(  # type: ignore[no-untyped-def]
     is_whole = cone == 0.0 and roll == 0.0
     largest = math.inf
     for iteration in range(max_iterations + 1):
-        position, rotation, jacobian = forward(q, origins, rotations, axes, tool, tool_rotation)
+        position, rotation, jacobian = forward(q, arm)
         turn = _rotation_vector(wanted_rotation, rotation) if is_whole else tilt_and_roll(wanted_rotation, rotation)
         worst_position = 0.0
         worst_rotation = 0.0
@@ -295,22 +293,7 @@ def inverse(  # type: ignore[no-untyped-def]
 
 @_njit
 def straight_path(  # type: ignore[no-untyped-def]
-    start,
-    goal,
-    start_position,
-    start_rotation,
-    goal_position,
-    goal_rotation,
-    fractions,
-    cone,
-    roll,
-    origins,
-    rotations,
-    axes,
-    tool,
-    tool_rotation,
-    low,
-    high,
+    start, goal, start_position, start_rotation, goal_position, goal_rotation, fractions, cone, roll, arm
 ):
     """(N, n) joint positions on a straight line of the tool, turning evenly; whether all were reached."""
     turn = _rotation_vector(goal_rotation, start_rotation)
@@ -327,25 +310,7 @@ def straight_path(  # type: ignore[no-untyped-def]
         position = _blend(start_position, goal_position, u)
         rotation = _multiply(_axis_rotation(axis, u * angle), start_rotation)
         seed = _blend(start, goal, u)
-        q, reached = inverse(
-            position,
-            rotation,
-            seed,
-            seed,
-            0.0,
-            max_iterations,
-            1e-4,
-            1e-3,
-            cone,
-            roll,
-            origins,
-            rotations,
-            axes,
-            tool,
-            tool_rotation,
-            low,
-            high,
-        )
+        q, reached = inverse(position, rotation, seed, seed, 0.0, max_iterations, 1e-4, 1e-3, cone, roll, arm)
         all_reached = all_reached and reached
         for k in range(len(q)):
             out[t, k] = q[k]

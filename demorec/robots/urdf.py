@@ -1,4 +1,8 @@
-"""The joint tree of a URDF: enough for kinematics and for placing links, without the simulator."""
+"""The one reader of URDFs, without the simulator: the tree of their joints, and the shapes and masses of their links.
+
+Kinematics, playback, the recorded description and images that are drawn without a simulator read URDFs through this
+module; what they make of them is their own.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +12,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast, get_args
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Rgba
 
 MAX_BYTES = 4 << 20
 """Of a URDF: the largest of pybullet_data has 32 kB."""
 _MAX_JOINTS = 500
 _MAX_SHAPES = 5000
-_SHAPE_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
-"""Tag of a primitive -> its attributes, and how many numbers each has."""
+_PRIMITIVES = ("box", "sphere", "cylinder")
 
 
 def parse_xml(text: str) -> ET.Element:
@@ -37,36 +41,16 @@ def parse_xml(text: str) -> ET.Element:
         raise ValueError(f"the URDF is no XML ({error})") from error
 
 
-@lru_cache(maxsize=8)  # all recordings of a robot have the same
-def check_primitives(text: str) -> None:
-    """ValueError unless a URDF can be used, and drawn without any other file: boxes, balls and cylinders alone."""
-    Urdf.parse(text)
-    robot = parse_xml(text)
-    shapes = robot.findall("link/visual")
-    if len(shapes) > _MAX_SHAPES:
-        raise ValueError(f"a URDF of {len(shapes)} shapes")
-    for visual in shapes:
-        origin = visual.find("origin")
-        if origin is not None:
-            _numbers(origin.get("xyz", "0 0 0"), 3)
-            _numbers(origin.get("rpy", "0 0 0"), 3)
-        for shape in visual.findall("geometry/*"):
-            if shape.tag not in _SHAPE_SIZES:
-                raise ValueError(f"a shape of the URDF is a {shape.tag[:20]!r}, allowed are {', '.join(_SHAPE_SIZES)}")
-            for name, count in _SHAPE_SIZES[shape.tag].items():
-                if min(_numbers(shape.get(name, ""), count)) < 0:
-                    raise ValueError(f"the {name} of a {shape.tag} of the URDF is negative")
-    for color in robot.iter("color"):
-        if not all(0 <= part <= 1 for part in _numbers(color.get("rgba", ""), 4)):
-            raise ValueError("a colour of the URDF is outside 0 to 1")
-
-
-def _numbers(text: str, count: int) -> list[float]:
-    """So many finite numbers; ValueError for others."""
-    values = [float(word) for word in text.split()]
-    if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise ValueError(f"{text[:40]!r} of the URDF should be {count} numbers")
-    return values
+def read_numbers(text: str, count: int) -> list[float]:
+    """The first so many finite numbers of a text, as PyBullet reads them; ValueError where there are none."""
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    if len(values) < count or not all(map(math.isfinite, values)):
+        wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise ValueError(f"{text[:40]!r} of the URDF should be {wanted}")
+    return values[:count]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,12 +167,9 @@ def joint_motion(joint: UrdfJoint, position: float) -> Pose:
 
 
 def _joint(element: ET.Element, scale: float) -> UrdfJoint:
-    def vector(tag: str, attribute: str, default: str) -> list[float]:
-        child = element.find(tag)
-        return _numbers(default if child is None else child.get(attribute, default), 3)
-
     kind = element.attrib["type"]
-    axis = np.array(vector("axis", "xyz", "1 0 0"))
+    given = element.find("axis")
+    axis = np.array(read_numbers("1 0 0" if given is None else given.get("xyz", "1 0 0"), 3))
     length = math.sqrt(float((axis * axis).sum()))
     limit = element.find("limit")
     bounded = limit is not None and kind in ("revolute", "prismatic")
@@ -198,10 +179,7 @@ def _joint(element: ET.Element, scale: float) -> UrdfJoint:
         parent=cast(ET.Element, element.find("parent")).attrib["link"],
         child=cast(ET.Element, element.find("child")).attrib["link"],
         kind=kind,
-        parent_from_joint=Pose(
-            position=np.array(vector("origin", "xyz", "0 0 0")) * scale,
-            quat_xyzw=quat_from_rpy(vector("origin", "rpy", "0 0 0")),
-        ),
+        parent_from_joint=_origin(element, scale),
         axis=(1.0, 0.0, 0.0) if length == 0.0 else tuple(float(v) for v in axis / length),  # type: ignore[arg-type]
         lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
         upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
@@ -220,3 +198,143 @@ def quat_from_rpy(rpy: Sequence[float]) -> Array:
             cr * cp * cy + sr * sp * sy,
         ]
     )
+
+
+UrdfShapeKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfShape:
+    """One <visual> or <collision>, lengths multiplied by the scale.
+
+    Attributes:
+        kind: Which geometry; decides what `size` means.
+        size: box: (x, y, z) full extents, metres; sphere: (radius,); cylinder and capsule: (radius, length) along z;
+            mesh: (x, y, z) factors by which the file is scaled; plane: ().
+        file: mesh: as the URDF names it (`demorec.robots.assets.mesh_path` finds it); otherwise "".
+        link_from_shape: Pose in the link's frame.
+        rgba: Colour of its material, 0..1; None without a material that has one.
+    """
+
+    kind: UrdfShapeKind
+    size: tuple[float, ...]
+    file: str
+    link_from_shape: Pose
+    rgba: Rgba | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfLink:
+    """One link.
+
+    Attributes:
+        name: Unique in the URDF.
+        link_from_inertial: Pose of the centre of mass in the link's frame.
+        visuals, collisions: Its shapes, in the order of the file; those of an unknown geometry are left out.
+    """
+
+    name: str
+    link_from_inertial: Pose
+    visuals: tuple[UrdfShape, ...]
+    collisions: tuple[UrdfShape, ...]
+
+    @property
+    def seen(self) -> tuple[UrdfShape, ...]:
+        """The shapes that PyBullet draws: the visual ones, of a link without any the collision shapes."""
+        return self.visuals or self.collisions
+
+
+def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
+    """The links of a URDF, in the order of the file.
+
+    Args:
+        text: The URDF.
+        scale: Uniform scale.
+
+    Raises:
+        ValueError: The text is no XML that may be read (`parse_xml`), or a shape lacks a size or has one that is no
+            finite number.
+    """
+    robot = parse_xml(text)
+    colors = {
+        name: rgba for element in robot.iter("material") if (name := element.get("name")) and (rgba := _rgba(element))
+    }
+    try:
+        return tuple(
+            UrdfLink(
+                name=link.attrib["name"],
+                link_from_inertial=_origin(link.find("inertial"), scale),
+                visuals=_shapes(link, "visual", scale, colors),
+                collisions=_shapes(link, "collision", scale, colors),
+            )
+            for link in robot.findall("link")
+        )
+    except KeyError as error:
+        raise ValueError(f"a link or shape of the URDF lacks its {error}") from error
+
+
+def _shapes(link: ET.Element, tag: str, scale: float, colors: dict[str, Rgba]) -> tuple[UrdfShape, ...]:
+    return tuple(
+        _shape(element, geometry, scale, colors)
+        for element in link.findall(tag)
+        if (geometry := element.find("geometry/*")) is not None and geometry.tag in get_args(UrdfShapeKind)
+    )
+
+
+def _shape(element: ET.Element, geometry: ET.Element, scale: float, colors: dict[str, Rgba]) -> UrdfShape:
+    match geometry.tag:
+        case "box":
+            size = read_numbers(geometry.attrib["size"], 3)
+        case "mesh":
+            size = read_numbers(geometry.get("scale", "1 1 1"), 3)
+        case "sphere":
+            size = read_numbers(geometry.attrib["radius"], 1)
+        case "plane":
+            size = []
+        case _:
+            size = read_numbers(f"{geometry.attrib['radius']} {geometry.attrib['length']}", 2)
+    material = element.find("material")
+    return UrdfShape(
+        kind=cast(UrdfShapeKind, geometry.tag),
+        size=tuple(value * scale for value in size),
+        file=geometry.attrib["filename"] if geometry.tag == "mesh" else "",
+        link_from_shape=_origin(element, scale),
+        rgba=None if material is None else _rgba(material) or colors.get(material.get("name", "")),
+    )
+
+
+def _origin(element: ET.Element | None, scale: float) -> Pose:
+    """The <origin> of an element; where there is none, no displacement."""
+    origin = None if element is None else element.find("origin")
+    if origin is None:
+        return Pose()
+    return Pose(
+        position=np.array(read_numbers(origin.get("xyz", "0 0 0"), 3)) * scale,
+        quat_xyzw=quat_from_rpy(read_numbers(origin.get("rpy", "0 0 0"), 3)),
+    )
+
+
+def _rgba(material: ET.Element) -> Rgba | None:
+    color = material.find("color")
+    if color is None:
+        return None
+    r, g, b, a = read_numbers(color.attrib["rgba"], 4)
+    return (r, g, b, a)
+
+
+@lru_cache(maxsize=8)  # all recordings of a robot have the same
+def check_primitives(text: str) -> None:
+    """ValueError unless a URDF can be used, and drawn without any other file: boxes, balls and cylinders alone."""
+    Urdf.parse(text)
+    robot = parse_xml(text)
+    shapes = robot.findall("link/visual/geometry/*")
+    if len(shapes) > _MAX_SHAPES:
+        raise ValueError(f"a URDF of {len(shapes)} shapes")
+    for shape in shapes:
+        if shape.tag not in _PRIMITIVES:
+            raise ValueError(f"a shape of the URDF is a {shape.tag[:20]!r}, allowed are {', '.join(_PRIMITIVES)}")
+    if any(value < 0 for link in read_links(text) for shape in link.visuals for value in shape.size):
+        raise ValueError("the size of a shape of the URDF is negative")
+    for color in robot.iter("color"):
+        if not all(0 <= part <= 1 for part in read_numbers(color.get("rgba", ""), 4)):
+            raise ValueError("a colour of the URDF is outside 0 to 1")

@@ -23,8 +23,7 @@ from demorec.core.errors import DemorecError, RecordingError, in_words
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import mesh_path
-from demorec.robots.urdf import Urdf
-from demorec.robots.urdf_shapes import UrdfShape, read_links
+from demorec.robots.urdf import Urdf, UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
 """Of one mesh file."""

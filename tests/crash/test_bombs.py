@@ -278,7 +278,7 @@ def test_fifos_in_a_dataset(name: str, good: Path, commands: Commands, tmp_path:
         ),
         (
             '<robot><link name="r"><visual><geometry><box size="1 nan 1"/></geometry></visual></link></robot>',
-            "should be 3 numbers",
+            "should be 3 finite numbers",
         ),
     ],
 )

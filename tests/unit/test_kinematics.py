@@ -80,7 +80,7 @@ def test_jacobian_equals_finite_differences(robot: SimulatedRobot) -> None:
     arm = arm_kinematics(spec)
     step = 1e-6
     for q in random_positions(spec, 5, seed=1):
-        *_, jacobian = forward(q, arm.origins, arm.rotations, arm.axes, arm.tool, arm.tool_rotation)
+        *_, jacobian = forward(q, arm.tables)
         for joint in range(arm.num_joints):
             ahead, behind = q.copy(), q.copy()
             ahead[joint] += step

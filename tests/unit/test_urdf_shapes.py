@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from demorec.robots.urdf import Urdf
-from demorec.robots.urdf_shapes import read_links
+from demorec.robots.urdf import Urdf, read_links
 
 TEXT = """
 <robot name="thing">

@@ -26,8 +26,7 @@ from demorec.episode.features import STATE
 from demorec.mcap.description import robot_description
 from demorec.robots.assets import asset_path
 from demorec.robots.robot import RobotSpec
-from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
-from demorec.robots.urdf_shapes import read_links
+from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml, read_links
 
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 
