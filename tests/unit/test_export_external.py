@@ -156,12 +156,6 @@ def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
         export(run, tmp_path / "d")
 
 
-def test_a_dataset_can_be_appended_to(tmp_path: Path) -> None:
-    export(run_of(tmp_path / "a", complete(num_frames=5)), tmp_path / "d")
-    report = export(run_of(tmp_path / "b", complete(num_frames=7, episode_index=3)), tmp_path / "d", append=True)
-    assert (report.num_episodes, report.num_frames) == (2, 12)
-
-
 def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     from typing import cast
 
@@ -224,31 +218,6 @@ def test_an_hdf5_file_has_nothing_that_nobody_knows(tmp_path: Path) -> None:
         assert json.loads(file["data"].attrs["env_args"])["env_name"] == "demorec/collected"
 
 
-def test_it_is_replaced_only_as_it_was_written(tmp_path: Path) -> None:
-    run, out = run_of(tmp_path / "run", *of_outcomes(True)), tmp_path / "d.hdf5"
-    export(run, out, "hdf5")
-    export(run, out, "hdf5", overwrite=True)
-    with h5py.File(out, "a") as file:
-        file["data/demo_0/obs/mine"] = 1
-    with pytest.raises(ConfigError, match="data/demo_0/obs/mine"):
-        export(run, out, "hdf5", overwrite=True)
-
-
-def test_streams_of_one_name_are_refused(tmp_path: Path) -> None:
-    given = make_external(cameras=(TOP,), num_frames=5)
-    force = replace(FORCE, name="state")
-    frames = [
-        replace(frame, samples={**{k: v for k, v in frame.samples.items() if k != FORCE.name}, "state": sample})
-        for frame in given.frames
-        for sample in [frame.samples[FORCE.name]]
-    ]
-    info = replace(given.info, features=(*given.info.features[:2], force))
-    path = write_external(tmp_path / "a.mcap", replace(given, info=info, frames=frames))
-    with pytest.raises(ConfigError, match="Two streams of the episode would be called state"):
-        export(path, tmp_path / "d.hdf5", "hdf5")
-    assert not (tmp_path / "d.hdf5").exists()
-
-
 def test_an_episode_without_actions_is_refused(tmp_path: Path) -> None:
     given = make_external(cameras=(), num_frames=5)
     frames = [replace(frame, samples={STATE.name: frame.samples[STATE.name]}) for frame in given.frames]
@@ -256,23 +225,3 @@ def test_an_episode_without_actions_is_refused(tmp_path: Path) -> None:
     path = write_external(tmp_path / "a.mcap", replace(given, info=info, frames=frames))
     with pytest.raises(ConfigError, match="needs actions"):
         export(path, tmp_path / "d.hdf5", "hdf5")
-
-
-def test_robomimic_reads_it(tmp_path: Path) -> None:
-    """robomimic's own reader, where it is installed: its dependencies need a compiler, so it is none of ours."""
-    dataset = pytest.importorskip("robomimic.utils.dataset", reason="robomimic is not installed")
-    from robomimic.utils import file_utils, obs_utils
-
-    export(run_of(tmp_path / "run", *of_outcomes(True, True)), tmp_path / "d.hdf5", "hdf5")
-    obs_utils.initialize_obs_utils_with_obs_specs({"obs": {"low_dim": ["state"], "rgb": ["top_image"]}})
-    assert file_utils.get_env_metadata_from_dataset(tmp_path / "d.hdf5")["env_name"] == "demorec/collected"
-    read = dataset.SequenceDataset(
-        hdf5_path=str(tmp_path / "d.hdf5"),
-        obs_keys=["state", "top_image"],
-        dataset_keys=["actions", "rewards", "dones"],
-        seq_length=3,
-        load_next_obs=False,
-    )
-    given = make_external(cameras=(TOP,), num_frames=20)
-    expected = np.array([frame.samples[STATE.name].vector for frame in given.frames[1:4]])
-    np.testing.assert_array_equal(read[1]["obs"]["state"], expected)

@@ -10,7 +10,6 @@ import trimesh
 from support import render as scenes
 
 from demorec.core.errors import RenderError
-from demorec.render.raster import RasterRenderer
 from demorec.render.raster.decimate import decimate
 from demorec.render.raster.mesh_cache import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
@@ -30,19 +29,6 @@ def test_stl_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
         assert (mesh.normals * outward).sum(-1).min() > 0.98
 
 
-def test_obj_polygons_negative_numbers_and_materials(tmp_path: Path) -> None:
-    (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n")
-    path = tmp_path / "two.obj"
-    path.write_text(
-        "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nusemtl red\nf -5 -4 -3 -2\nusemtl blue\nf 1 2 5\n"
-    )
-    mesh = load_mesh(path)
-    assert mesh.num_faces == 3
-    assert mesh.points[mesh.faces[2]].tolist() == [[0, 0, 0], [1, 0, 0], [0, 0, 1]]
-    assert mesh.colors.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
-    assert np.allclose(mesh.normals[0], [0, 0, 1])
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -60,17 +46,6 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: bytes) -> No
     path.write_bytes(content)
     with pytest.raises(RenderError, match=name):
         load_mesh(path)
-
-
-def test_a_mesh_that_vanished_is_named_with_its_body(tmp_path: Path) -> None:
-    path = tmp_path / "here.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    client = scenes.connect()
-    body = scenes.add(client, "mesh", (1.0, 1.0, 1.0), fileName=str(path))
-    path.unlink()
-    with RasterRenderer() as raster, pytest.raises(RenderError, match=f"Body {body} .*here.obj"):
-        raster.setup(scenes.setup(client, scenes.camera(32, 32)))
-    client.disconnect()
 
 
 def test_decimation_stays_near_the_surface() -> None:

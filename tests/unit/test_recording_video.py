@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from support.recording import Codec, make_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.mcap.video import VideoPacket, decode, is_keyframe, make_encoder, ordinary_scheduling
+from demorec.mcap.video import VideoPacket, decode, is_keyframe, make_encoder
 
 ENCODE = """
 import hashlib, sys
@@ -72,15 +71,6 @@ def test_broken_video_is_told_in_one_sentence() -> None:
         with pytest.raises(RecordingError) as caught:
             list(decode(encoder.settings, packets))
         assert "\n" not in str(caught.value)
-
-
-def test_another_size_than_the_settings_say() -> None:
-    encoder = make_encoder(video=VideoConfig(codec="jpeg"), width=64, height=48, fps=30)
-    other = make_encoder(video=VideoConfig(codec="jpeg"), width=32, height=32, fps=30)
-    (data,) = other.encode(np.zeros((32, 32, 3), dtype=np.uint8))
-    packet = VideoPacket(frame_index=0, time_ns=0, data=data, is_keyframe=True)
-    with pytest.raises(RecordingError, match="An image is 32x32 pixels where the metadata says 64x48"):
-        list(decode(encoder.settings, [packet]))
 
 
 def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
@@ -155,16 +145,3 @@ def test_an_encoder_leaves_the_scheduling_alone(codec: Codec) -> None:
     encoder.encode(np.zeros((64, 96, 3), np.uint8))
     encoder.finish()
     assert os.sched_getscheduler(0) == policy
-
-
-def test_scheduling_is_given_back() -> None:
-    stop = threading.Event()
-    with ordinary_scheduling():
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        late = threading.Thread(target=stop.wait)
-        late.start()
-        assert os.sched_getscheduler(late.native_id or 0) == os.SCHED_BATCH
-    policies = [os.sched_getscheduler(0), os.sched_getscheduler(late.native_id or 0)]
-    stop.set()
-    late.join()
-    assert policies == [os.SCHED_OTHER, os.SCHED_OTHER]
