@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -599,12 +598,3 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
         spoilt.pictures = [{camera: change(image) for camera, image in images.items()} for images in spoilt.pictures]
         check = "segmentation_matches_scene" if "labels" in name else "depth_matches_scene"
         assert level_of(spoilt.write(tmp_path / f"{name}.mcap"), check) == "fail", name
-
-
-def test_the_wrong_angle_of_a_quaternion_is_measured_in_radians() -> None:
-    # Independent of any recording: the measure behind the kinematic checks.
-    from demorec.check.rows import angle_between, matrices
-
-    a = matrices(np.array([[0, 0, 0, 0, 0, 0, 1.0]]))
-    b = matrices(np.array([[0, 0, 0, 0, 0, math.sin(0.05), math.cos(0.05)]]))
-    assert angle_between(a, b)[0] == pytest.approx(0.1, abs=1e-12)

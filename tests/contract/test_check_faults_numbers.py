@@ -19,7 +19,7 @@ from demorec.check.base import Found, Measurement
 from demorec.check.described import drawn_within_ranges
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.geometry import Pose
-from demorec.core.tables import CHECKS, ROBOTS, TASKS
+from demorec.core.tables import ROBOTS, TASKS
 from demorec.episode.camera_error import error_values
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.variation import PRESET_NAMES, Preset
@@ -288,7 +288,3 @@ def test_where_the_ranges_of_full_end(name: str, allowed: float, beyond: float) 
     assert isinstance(found, Measurement)
     assert found.value == 1
     assert name in found.detail
-
-
-def test_the_checks_used_here_are_rows() -> None:
-    assert {check for *_, check in CASES} <= set(CHECKS.names())
