@@ -218,6 +218,18 @@ def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> 
     assert "my_robots" not in sys.modules  # read, not run
 
 
+@pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])
+def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> None:
+    from demorec.robots.assets import data_folder, model_name
+
+    name, wanted = {
+        "absolute": (str(folder / "xarm6.urdf"), "my_robots:xarm6.urdf"),
+        "pybullet_data": ("franka_panda/panda.urdf", "franka_panda/panda.urdf"),
+        "absolute in pybullet_data": (str(data_folder() / "franka_panda/panda.urdf"), "franka_panda/panda.urdf"),
+    }[where]
+    assert model_name(name, "my_robots") == wanted
+
+
 def test_a_model_from_elsewhere_cannot_be_recorded(folder: Path, tmp_path: Path) -> None:
     from demorec.robots.assets import allow_models, model_name
 

@@ -12,8 +12,10 @@ from support.export import make_run
 
 from demorec.check.report import CheckOptions, SubjectReport, check_subjects, find_subjects
 from demorec.cli import main
+from demorec.cli.generate_report import check_run
 from demorec.core.config import GenerateConfig
-from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
+from demorec.generate.options import RunResult
+from demorec.runs.run_file import RunFile, RunSession, inspect_recording, save_run_file
 
 FAILED = "failed/episode_000000.attempt_0.mcap"
 
@@ -90,6 +92,16 @@ def test_a_recording_of_a_success_is_judged_in_full(tmp_path: Path) -> None:
     attempt = replace(inspect_recording(path)[0], file="episodes/episode_000000.mcap")
     save_run_file(RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,)), folder)
     assert report_of(folder, path).is_bad()
+
+
+def test_the_closing_table_counts_them_apart(run: Path) -> None:
+    """What decides the exit code of generate-dataset."""
+    attempt = replace(inspect_recording(run / FAILED)[0], file=FAILED)
+    known = RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,))
+    result = RunResult(folder=run, run=known, session=RunSession(started=""), made=(), interrupted=False)
+    found, failures = check_run(result, progress=lambda done, total: None)
+    assert "not counted: those of 1 failed attempt" in found
+    assert not any(failure.startswith(Path(FAILED).name) for failure in failures)
 
 
 def test_where_no_chosen_check_applies_nothing_has_passed(capsys: pytest.CaptureFixture[str], run: Path) -> None:

@@ -9,8 +9,16 @@ import pytest
 from rerun.chunk import RrdReader
 from support.external import TOP, WRIST, make_external, write_external
 
-from demorec.view.save import save
+from demorec.core.errors import ConfigError
+from demorec.view.episode import PlayedEpisode
+from demorec.view.save import save, save_comparison
 from demorec.view.sources import find_episodes
+
+
+def opened(path: Path) -> PlayedEpisode:
+    with find_episodes([path])[0].open() as episode:
+        assert episode.simulated is None
+        return episode
 
 
 def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
@@ -53,3 +61,10 @@ def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog:
         if "Mesh3D:vertex_positions" in chunk.to_record_batch().schema.names
     }
     assert drawn == {"base", "upper"}  # rods to the joints that they carry
+
+
+def test_two_of_them_are_not_laid_over_each_other(tmp_path: Path) -> None:
+    path = write_external(tmp_path / "a.mcap", make_external(num_frames=5))
+    (source,) = find_episodes([path])
+    with pytest.raises(ConfigError, match="without --compare"):
+        save_comparison(source, source, tmp_path / "a.rrd")

@@ -218,6 +218,31 @@ def test_an_hdf5_file_has_nothing_that_nobody_knows(tmp_path: Path) -> None:
         assert json.loads(file["data"].attrs["env_args"])["env_name"] == "demorec/collected"
 
 
+def test_it_is_replaced_only_as_it_was_written(tmp_path: Path) -> None:
+    run, out = run_of(tmp_path / "run", *of_outcomes(True)), tmp_path / "d.hdf5"
+    export(run, out, "hdf5")
+    export(run, out, "hdf5", overwrite=True)
+    with h5py.File(out, "a") as file:
+        file["data/demo_0/obs/mine"] = 1
+    with pytest.raises(ConfigError, match="data/demo_0/obs/mine"):
+        export(run, out, "hdf5", overwrite=True)
+
+
+def test_streams_of_one_name_are_refused(tmp_path: Path) -> None:
+    given = make_external(cameras=(TOP,), num_frames=5)
+    force = replace(FORCE, name="state")
+    frames = [
+        replace(frame, samples={**{k: v for k, v in frame.samples.items() if k != FORCE.name}, "state": sample})
+        for frame in given.frames
+        for sample in [frame.samples[FORCE.name]]
+    ]
+    info = replace(given.info, features=(*given.info.features[:2], force))
+    path = write_external(tmp_path / "a.mcap", replace(given, info=info, frames=frames))
+    with pytest.raises(ConfigError, match="Two streams of the episode would be called state"):
+        export(path, tmp_path / "d.hdf5", "hdf5")
+    assert not (tmp_path / "d.hdf5").exists()
+
+
 def test_an_episode_without_actions_is_refused(tmp_path: Path) -> None:
     given = make_external(cameras=(), num_frames=5)
     frames = [replace(frame, samples={STATE.name: frame.samples[STATE.name]}) for frame in given.frames]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from demorec.core.geometry import Pose
 from demorec.core.tables import ROBOTS
 from demorec.robots.assets import asset_path
+from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.kinematics_kernels import forward
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
@@ -143,3 +144,15 @@ def test_a_straight_path_is_straight_and_turns_evenly(robot: SimulatedRobot) -> 
         line = base_from_start.position + u * (base_from_goal.position - base_from_start.position)
         assert math.dist(pose.position, line) < 2e-4
         assert (Rotation.from_quat(pose.quat_xyzw) * slerp(u).inv()).magnitude() < 2e-3
+
+
+def test_a_chain_with_other_joints_is_refused() -> None:
+    spec = ROBOTS.load("panda")
+    with pytest.raises(ValueError, match="panda_joint7"):
+        ArmKinematics.from_urdf(
+            Urdf.load(asset_path(spec.urdf)),
+            arm_joints=spec.arm_joints[:6],
+            tcp_link=spec.tcp_link,
+            lower=spec.position_lower[:6],
+            upper=spec.position_upper[:6],
+        )

@@ -51,6 +51,13 @@ def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> No
     assert turned.min() > np.cos(np.deg2rad(3) / 2)
 
 
+def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path, recorded: Array) -> None:
+    export(SAMPLE, tmp_path / "cubes", privileged=True)
+    with open_dataset_episode(tmp_path / "cubes", 0) as episode:
+        assert episode.simulated is not None
+        np.testing.assert_allclose(episode.object_poses["red_cube"], recorded, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("opening", "target", "expected"),
     [

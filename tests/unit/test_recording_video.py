@@ -73,6 +73,15 @@ def test_broken_video_is_told_in_one_sentence() -> None:
         assert "\n" not in str(caught.value)
 
 
+def test_another_size_than_the_settings_say() -> None:
+    encoder = make_encoder(video=VideoConfig(codec="jpeg"), width=64, height=48, fps=30)
+    other = make_encoder(video=VideoConfig(codec="jpeg"), width=32, height=32, fps=30)
+    (data,) = other.encode(np.zeros((32, 32, 3), dtype=np.uint8))
+    packet = VideoPacket(frame_index=0, time_ns=0, data=data, is_keyframe=True)
+    with pytest.raises(RecordingError, match="An image is 32x32 pixels where the metadata says 64x48"):
+        list(decode(encoder.settings, [packet]))
+
+
 def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
     """x264 without any vector instruction codes the same bits as with all that this machine has."""
     from fractions import Fraction

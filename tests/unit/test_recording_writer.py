@@ -84,6 +84,16 @@ def test_leaving_without_finish_leaves_a_part_that_can_be_recovered(tmp_path: Pa
     assert recover(tmp_path / "a.mcap.part", tmp_path / "a.mcap").num_frames >= 40
 
 
+def test_frames_come_in_order(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=3, cameras=())
+    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+        writer.write(frames[0])
+        with pytest.raises(RecordingError, match=r"Frame 2 at 66666667 ns came where frame 1 at 33333333 ns was due"):
+            writer.write(frames[2])
+        with pytest.raises(RecordingError, match="Frame 1 at 7 ns"):
+            writer.write(replace(frames[1], time_ns=7))
+
+
 def test_pictures_are_complete(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=2, depth=True)
     with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
@@ -100,6 +110,16 @@ def test_pictures_are_complete(tmp_path: Path) -> None:
         small = replace(wrist, color=np.zeros((24, 32, 3), dtype=np.uint8))
         with pytest.raises(RecordingError, match=r"colour image .* has shape \(24, 32, 3\).* of 64x48 pixels"):
             writer.write(replace(frames[1], images={**frames[1].images, "wrist": small}))
+
+
+def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:
+    info, frames, _ = make_episode(num_frames=1)
+    with (
+        SimulatedWriter(tmp_path / "a.mcap", info, video=VideoConfig(preset="quickest")) as writer,
+        pytest.raises(ConfigError, match=r"libx264 .* preset quickest") as caught,
+    ):
+        writer.write(frames[0])
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.commands import exit_code
 from support.export import export, make_run
 from support.mcap import rewritten
-from support.recording import frame_number
+from support.recording import frame_number, write_episode
 
 from demorec.check.report import CheckOptions
 from demorec.mcap import SimulatedRecording
@@ -137,6 +138,17 @@ def test_a_filmstrip_shows_the_frames_that_it_names(run: Path) -> None:
             assert frame_number(np.asarray(part)) == round(number * (length - 1) / 7)
 
 
+def test_the_camera_is_chosen(run: Path, dataset: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for path in (run, dataset):
+        for camera in ("front", "wrist"):
+            alts = [image["alt"] or "" for image in report_on(path, camera=camera).all("img")]
+            assert alts
+            assert all(f"camera {camera}," in alt for alt in alts)
+        assert exit_code("report", path, "--no-checks", "--camera", "rear", "--out", tmp_path / "r.html") == 2
+        assert "the cameras are front, wrist" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_dataset_tells_the_same_as_its_run(run: Path, dataset: Path) -> None:
     ours, theirs = gathered(run), gathered(dataset)
     of_run = {
@@ -230,3 +242,17 @@ def test_what_cannot_be_read_is_told(run: Path, tmp_path: Path) -> None:
 
 def test_workers_find_the_same(run: Path) -> None:
     assert page(gathered(run, workers=2)) == page(gathered(run))
+
+
+def test_refusals(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, words in (
+        ((run, "--out", tmp_path / "x.pdf"), "--out names an .html file"),
+        ((run, "--out", tmp_path / "no" / "x.html"), "there is no folder"),
+        ((run, "--out", tmp_path / "x.html", "--workers", "0"), "--workers is 0"),
+        ((run, "--out", tmp_path / "x.html", "--no-checks", "--pictures"), "leave one of them out"),
+    ):
+        assert exit_code("report", *arguments) == 2
+        assert words in capsys.readouterr().err
+    write_episode(tmp_path / "one.mcap", num_frames=3, cameras=())
+    assert exit_code("report", tmp_path / "one.mcap", "--no-checks", "--out", tmp_path / "x.html") == 0
+    assert capsys.readouterr().out.startswith("1 episode, ")

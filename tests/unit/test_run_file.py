@@ -14,7 +14,7 @@ import pytest
 from support.generate import expected_attempts
 
 from demorec.core.config import GenerateConfig
-from demorec.core.errors import ResourceError
+from demorec.core.errors import ConfigError, ResourceError
 from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
@@ -185,6 +185,15 @@ def test_fewer_episodes_are_the_run_that_they_would_have_been_alone(tmp_path: Pa
     save_run_file(fewer, tmp_path)
     assert load_run_file(tmp_path) == fewer
     assert replace(fewer, num_episodes=8).with_attempts(fewer.known) == run
+
+
+def test_a_newer_format_is_no_damage(tmp_path: Path) -> None:
+    save_run_file(a_run(), tmp_path)
+    path = tmp_path / "run.json"
+    path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(ConfigError, match="format 2") as error:
+        load_run_file(tmp_path)
+    assert not isinstance(error.value, DamagedRunFileError)
 
 
 def test_the_digest_depends_on_content_and_on_nothing_else() -> None:
