@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
-from support.export import export, make_run
 from support.hdf5 import (
     ALOHA_CAMERAS,
     HEIGHT,
@@ -24,7 +23,7 @@ from support.hdf5 import (
 )
 
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error
-from demorec.mcap import Recording, SimulatedRecording
+from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources.frames_writer import FramesImport, Picture
 from demorec.sources.hdf5_arrays import StoredCamera
@@ -143,30 +142,6 @@ def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) ->
         shown = recording.picture("cam_high", 0)
     red, blue = shown[: HEIGHT // 2, : WIDTH // 2 - 4, 0].mean(), shown[: HEIGHT // 2, : WIDTH // 2 - 4, 2].mean()
     assert blue - red > 200  # the corner is red in the file
-
-
-def test_our_own_file_comes_back_to_the_bit(tmp_path: Path) -> None:
-    export(make_run(tmp_path / "simulated", (8, 7)), tmp_path / "a.hdf5", "hdf5", privileged=True)
-    result, run = imported(tmp_path / "a.hdf5")
-    assert (result.num_episodes, result.num_frames) == (2, 15)
-    with h5py.File(tmp_path / "a.hdf5") as file:
-        for index, path in enumerate(recordings(run)):
-            with (
-                Recording(path) as recording,
-                SimulatedRecording(tmp_path / f"simulated/episodes/{path.name}") as simulated,
-            ):
-                found, original, info = recording.columns().features, simulated.columns(), recording.info
-                assert (info.instruction, info.fps) == (simulated.info.instruction, simulated.info.fps)
-                assert info.urdf == simulated.description()
-                assert recording.outcome is not None
-                assert recording.outcome.success is True
-            demo = file[f"data/demo_{index}"]
-            np.testing.assert_array_equal(found["action"], demo["actions"][:])
-            np.testing.assert_array_equal(found["observation.ee_pose"][:, :3], demo["obs/robot0_eef_pos"][:])
-            state = np.hstack([original.joint_position[:, :7], original.gripper_width[:, np.newaxis]])
-            np.testing.assert_array_equal(found["observation.state"], state)
-            assert [feature.dtype for feature in info.features] == ["float64"] * len(info.features)
-            assert info.features[0].joints[:7] == simulated.info.robot.joint_names[:7]
 
 
 @pytest.mark.parametrize("kind", ["uint16", ">f4"])

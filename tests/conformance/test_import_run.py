@@ -130,14 +130,6 @@ def test_pictures(imported: tuple[Layout, bags.Notes, Path]) -> None:
                     assert np.abs(shown.astype(float) - given).mean() < 12
 
 
-def test_the_same_command_again_changes_nothing(imported: tuple[Layout, bags.Notes, Path]) -> None:
-    _, _, run = imported
-    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    bag = next(path for path in run.parent.iterdir() if path.name.startswith("bag"))
-    assert import_bags([bag], run.parent / "robot.toml", run).num_new == 0
-    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
-
-
 def _so101(tmp_path: Path, notes: bags.Notes, name: str = "bag") -> Path:
     return bags.write_mcap(bags.in_order(notes), tmp_path / f"{name}.mcap")
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from scipy.spatial.transform import Rotation
 from support.recording import make_episode, write_episode
 
 from demorec.core.errors import ConfigError
@@ -19,11 +18,10 @@ from demorec.episode.scene import Body, Shape
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.robots import assets
 from demorec.robots.assets import asset_path
-from demorec.robots.urdf import Urdf
 from demorec.view import bodies
 from demorec.view.compare import differences
 from demorec.view.programs import viewer_environment
-from demorec.view.robot import joint_columns, robot_model
+from demorec.view.robot import robot_model
 from demorec.view.save import save, save_comparison
 from demorec.view.sources import find_episodes, select
 
@@ -99,32 +97,6 @@ def test_robot_objects_path_and_goal_are_there(saved: dict[str, list[Any]]) -> N
 
 def _has(chunks: list[Any], component: str) -> bool:
     return any(component in chunk.to_record_batch().schema.names for chunk in chunks)
-
-
-def test_phases_and_events_are_states_and_a_log(saved: dict[str, list[Any]]) -> None:
-    states = [value[0] for _, value in _column(saved["/phase"], "StateChange:state")]
-    assert states == ["approach", "descend", "grasp", "lift", "transport", "place", "retreat"]
-    texts = [value[0] for _, value in _column(saved["/events"], "TextLog:text")]
-    assert "both fingers touch the cube" in texts
-    assert texts[-1] == "success"
-
-
-def test_links_move_as_scipy_says() -> None:
-    urdf = Urdf.load(asset_path("franka_panda/panda.urdf"))
-    for name in ("panda_joint2", "panda_finger_joint1"):
-        joint = next(joint for joint in urdf.joints if joint.name == name)
-        position = np.linspace(-1.0, 1.0, 7, dtype=np.float64)
-        translation, quaternion = joint_columns(joint, position)
-        fixed = Rotation.from_quat(joint.parent_from_joint.quat_xyzw)
-        for row, q in enumerate(position):
-            slide = q * np.array(joint.axis) if joint.kind == "prismatic" else np.zeros(3)
-            turn = Rotation.from_rotvec(np.zeros(3) if joint.kind == "prismatic" else q * np.array(joint.axis))
-            np.testing.assert_allclose(
-                translation[row], joint.parent_from_joint.position + fixed.apply(slide), atol=1e-12
-            )
-            np.testing.assert_allclose(
-                Rotation.from_quat(quaternion[row]).as_matrix(), (fixed * turn).as_matrix(), atol=1e-12
-            )
 
 
 def test_the_recorded_description_stands_in_for_a_model_that_is_not_installed(recording: Path) -> None:

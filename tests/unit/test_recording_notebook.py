@@ -59,21 +59,6 @@ def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -
     assert count == NUM_FRAMES
 
 
-@pytest.mark.parametrize("index", [0, 1, 9, 10, 33, NUM_FRAMES - 1, -1, -NUM_FRAMES])
-def test_any_frame_can_be_picked(path: Path, truth: list[Frame], index: int) -> None:
-    with SimulatedRecording(path) as recording:
-        same_frame(recording[index], truth[index])
-
-
-@pytest.mark.parametrize("index", [NUM_FRAMES, -NUM_FRAMES - 1])
-def test_there_are_no_frames_beyond_the_ends(path: Path, index: int) -> None:
-    with SimulatedRecording(path) as recording:
-        with pytest.raises(IndexError):
-            recording[index]
-        with pytest.raises(IndexError):
-            recording.image("front", index)
-
-
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
 def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path: Path, codec: Codec) -> None:
     file = write_episode(tmp_path / "a.mcap", num_frames=12, video=VideoConfig(codec=codec, gop=5))

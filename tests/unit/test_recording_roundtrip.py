@@ -130,37 +130,6 @@ def test_without_depth_it_says_so(tmp_path: Path) -> None:
         assert recording.segment_names() == {}
 
 
-def test_joint_samples_between_the_frames(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=40, cameras=(), physics_rate_joints=True)
-    path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with SimulatedRecording(path) as recording:
-        samples = list(recording.joint_samples())
-        columns = recording.columns()
-    assert len(samples) == 39 * 8 + 1
-    steps = np.diff([sample.time_ns for sample in samples])
-    assert steps.min() > 4_100_000
-    assert steps.max() < 4_200_000
-    inner = [sample for frame in frames for sample in frame.joint_samples]
-    read = [sample for sample in samples if sample.time_ns not in set(columns.time_ns.tolist())]
-    for written, found in zip(inner, read, strict=True):
-        assert found.time_ns == written.time_ns
-        assert np.array_equal(found.joint_position, written.joint_position)
-        assert np.array_equal(found.joint_velocity, written.joint_velocity)
-        assert np.array_equal(found.joint_effort, written.joint_effort)
-    assert np.array_equal(columns.joint_position, [frame.observation.joint_position for frame in frames])
-
-
-def test_events(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=40, cameras=())
-    path = record(tmp_path / "a.mcap", frames, info, outcome)
-    expected = [(frame.time_ns, event) for frame in frames for event in frame.events]
-    assert {event.level for _, event in expected} == {"info", "warning"}
-    with SimulatedRecording(path) as recording:
-        assert list(recording.events()) == expected
-        recording.columns()  # comes by them
-        assert list(recording.events()) == expected
-
-
 @pytest.mark.parametrize(("width", "height", "step"), [(64, 48, 1), (640, 480, 4)])
 def test_statistics_are_of_every_other_picture(tmp_path: Path, width: int, height: int, step: int) -> None:
     """Every fourth row of it, each quarter in turn; large pictures thinned as LeRobot thins them."""

@@ -62,23 +62,6 @@ def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> No
     assert np.abs(at_rest[:7]).max() > 10
 
 
-def test_one_command_is_one_frame_of_physics(scene: Scene) -> None:
-    with World(PANDA, fps=30, sample_joints=True) as world:
-        world.reset(scene)
-        assert not world.joint_samples
-        q = world.arm.target + 0.02
-        command = Action(joint_target=q, gripper_target=0.08, base_from_tcp_target=world.arm.kinematics.forward(q))
-        before = world.observe().joint_position
-        world.apply(command)
-        samples = world.joint_samples
-        after = world.observe().joint_position
-        assert [sample.time_ns for sample in samples] == [round(1e9 * k / 240) for k in range(1, 8)]
-        rows = np.array([before, *[sample.joint_position for sample in samples], after])[:, :7]
-        assert (np.diff(rows, axis=0) > 0).all(), "the joints move steadily towards the target"
-        world.apply(command)
-        assert world.joint_samples[0].time_ns == round(1e9 * 9 / 240)
-
-
 def test_the_force_torque_sensor_does_not_touch_the_physics(world: World, scene: Scene) -> None:
     def digest_after(sensor: bool) -> tuple[str, bool]:
         world.reset(scene)
