@@ -36,13 +36,6 @@ def test_what_was_not_asked_for_is_counted(run: Path, tmp_path: Path, capsys: py
     assert "2 recordings left out by --episodes or --corrected-only." in printed.out
 
 
-def test_options_reach_the_export(run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "d"
-    arguments = ("--include-failures", "--episodes", "1", "--action", "ee_delta", "--privileged", "--fps", "15")
-    assert exit_code("export", "lerobot", run, "--out", out, "--no-verify", *arguments) == 0
-    assert [row["length"] for row in episode_rows(out)] == [6, 4]
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
@@ -74,17 +67,6 @@ def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--overwrite") == 2
     assert "it is not a LeRobot dataset" in capsys.readouterr().err
     assert (tmp_path / "d" / "thesis.txt").read_text() == "years of work"
-
-
-@pytest.mark.parametrize(("source", "message"), [("nothing", "There is no such file"), ("", "holds no recording")])
-def test_a_source_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, message: str) -> None:
-    assert exit_code("export", "lerobot", tmp_path / source, "--out", tmp_path / "d") == 2
-    assert message in capsys.readouterr().err
-
-
-def test_no_recordings_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code("export", "lerobot", "--out", tmp_path / "d") == 2
-    assert "No recordings are given" in capsys.readouterr().err
 
 
 def test_uploading_without_a_token_keeps_the_dataset(
@@ -158,12 +140,3 @@ def test_verification_passes_a_good_dataset_and_drops_a_bad_one(run: Path, tmp_p
         export_lerobot([changing], tmp_path / "bad", ExportOptions(), swap)
     assert "observation.state" in str(error.value)
     assert not (tmp_path / "bad").exists()
-
-
-def test_info_tells_the_digest_and_the_attempts(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))
-    assert exit_code("info", tmp_path / "d") == 0
-    printed = capsys.readouterr().out
-    assert report.digest in printed
-    assert "2, of 3 attempts" in printed
-    assert "wrist 64x48 h264" in printed

@@ -61,63 +61,6 @@ def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: p
         assert recording.num_frames == episode.num_frames >= 30
 
 
-def test_simulated_time_begins_with_zero(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes = bags.in_order(bags.so101(1.0))
-    first = min(note.header_ns for note in notes if note.header_ns)
-    seen: set[str] = set()
-    shifted = []
-    for note in notes:
-        is_first = note.topic not in seen
-        seen.add(note.topic)
-        shifted.append(replace(note, header_ns=0 if is_first else note.header_ns and note.header_ns - first + 1))
-    bag = bags.write_mcap(shifted, tmp_path / "bag.mcap")
-    assert _run("import", "--suggest", bag) == 0
-    text = capsys.readouterr().out
-    assert "/follower/joint_states" in text
-    assert "no time" not in text
-
-
-def test_the_robot_is_described_by_the_outermost_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes = bags.so101(0.5)
-    notes += [
-        bags.Note(
-            topic=topic, type="std_msgs/msg/String", log_ns=notes[0].log_ns, header_ns=0, body={"data": "<robot/>"}
-        )
-        for topic in ("/a/cup/robot_description", "/robot_description")
-    ]
-    assert _run("import", "--suggest", bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")) == 0
-    assert tomllib.loads(capsys.readouterr().out)["robot"]["urdf_topic"] == "/robot_description"
-
-
-def test_headers_need_no_time_where_that_of_recording_is_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    notes = [replace(note, header_ns=0) for note in bags.in_order(bags.so101(1.0))]
-    bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
-    assert _run("import", "--suggest", bag) == 0
-    text = capsys.readouterr().out
-    assert 'stamp = "log"' in text
-    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
-    assert "unstamped" not in capsys.readouterr().out
-
-
-def test_a_doubtful_topic_is_commented_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes = bags.so101(0.5)
-    moments = bags.times(50, 0.5)
-    notes += [
-        bags.Note(
-            topic="/odd/numbers", type="std_msgs/msg/Float64MultiArray", log_ns=moment, header_ns=0,
-            body={"data": bags.motion(moment, 3)},
-        )
-        for moment in moments
-    ]  # fmt: skip
-    assert _run("import", "--suggest", bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")) == 0
-    text = capsys.readouterr().out
-    assert '# topic = "/odd/numbers"' in text
-    assert "observation.extra" not in tomllib.loads(text)["features"]
-
-
 def test_foreign_names_do_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evil = '/x\x1b[2J"\n[robot]\nname = "y"\u202e'
     notes = [replace(note, topic=note.topic.replace("/leader", evil)) for note in bags.so101(0.5)]

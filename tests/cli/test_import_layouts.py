@@ -123,15 +123,3 @@ def test_a_joint_that_stops_coming_is_a_finding(way: str, tmp_path: Path, capsys
     told = capsys.readouterr().out
     assert f"early_end: observation.state ({lost}): /joint_states: '{lost}' stop" in told
     assert "Nothing odd was found." not in told
-
-
-def test_a_leader_is_never_the_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Not even where nothing else is there."""
-    notes = [note for note in LAYOUTS["two publishers"].notes() if note.topic != "/joint_states"]
-    bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
-    assert _run("import", "--suggest", bag) == 0
-    text, warned = capsys.readouterr()
-    assert "The arm is left out" in warned
-    features = tomllib.loads(text)["features"]
-    assert "observation.state" not in features
-    assert [source["topic"] for source in features["action"]] == ["/lead_arm/joint_states"]

@@ -68,13 +68,6 @@ def test_info_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [item["episode_index"] for item in json.loads(capsys.readouterr().out)] == [0, 7]
 
 
-def test_info_of_a_failure_says_why(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", folder / "b.mcap") == 0
-    text = capsys.readouterr().out
-    assert "failure in phase place: distance_to_target" in text
-    assert "FAILED: 0.2 m (limit 0.02)" in text
-
-
 def test_info_of_a_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", folder) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -222,11 +215,6 @@ def test_an_unfit_folder_is_told_in_one_sentence(
     assert ". " not in said.removesuffix(f"{tmp_path}\n")
 
 
-def test_info_without_a_path(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info") == 2
-    assert "No path is given" in capsys.readouterr().err
-
-
 def test_an_empty_path_is_not_the_current_folder(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["info", ""])
@@ -271,18 +259,6 @@ def test_a_whole_recording_is_not_made_twice(folder: Path, tmp_path: Path, capsy
     assert list(tmp_path.iterdir()) == [source]
 
 
-def test_recovering_a_complete_file_keeps_everything(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source = tmp_path / "a.mcap"
-    source.write_bytes((folder / "a.mcap").read_bytes())
-    assert run("recover", source, "--out", tmp_path / "again.mcap") == 0
-    assert "Complete: all 45 frames" in capsys.readouterr().out
-    with SimulatedRecording(source) as one, SimulatedRecording(tmp_path / "again.mcap") as other:
-        assert one.digest() == other.digest()
-        assert one.pixel_statistics("front").counts.tolist() == other.pixel_statistics("front").counts.tolist()
-
-
 @pytest.mark.parametrize("mark", ["run.json", "evaluation.json", ""])
 @pytest.mark.parametrize("is_inside", [True, False])
 def test_what_is_recovered_is_no_further_episode_of_its_run(
@@ -323,13 +299,3 @@ def test_recover_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert run("recover", tmp_path / "empty.mcap.part") == 1
     assert "the file is empty" in capsys.readouterr().err
     assert not (tmp_path / "empty.mcap").exists()
-
-
-def test_both_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("info", "recover"):
-        with pytest.raises(SystemExit) as caught:
-            main([name, "--help"])
-        assert caught.value.code == 0
-        text = capsys.readouterr().out
-        assert "Examples:" in text
-        assert f"demorec {name} " in text

@@ -507,14 +507,6 @@ def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixtu
     assert target.read_text().startswith(REPORT_MARK)
 
 
-def test_a_coverage_picture_is_replaced_on_request(place: Path) -> None:
-    target = place / "c.png"
-    for flags in ((), ("--overwrite",)):
-        exit_code("check", place / "alone.mcap", "--only", "opens", "--coverage-picture", target, *flags)
-        assert target.read_bytes().startswith(b"\x89PNG")
-    assert not [path for path in place.iterdir() if path.name.endswith("demorec-part")]
-
-
 INSIDE: dict[str, Sequence[str]] = {
     "view --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/v.rrd", "dataset/data/v.rrd"),
     "view --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png"),

@@ -71,12 +71,6 @@ def test_flags_go_on_and_the_reader_is_replaced_meanwhile(
     ]
 
 
-def test_nothing_is_said_of_a_reader_that_is_not_used(instead: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    instead(lambda: None)
-    assert ends("--dataset.streaming=true") == 0
-    assert capsys.readouterr().err == ""
-
-
 def test_an_error_of_lerobot_is_one_sentence(instead: Any, capsys: pytest.CaptureFixture[str]) -> None:
     from lerobot.datasets import LeRobotDataset, factory
 
@@ -90,11 +84,6 @@ def test_an_error_of_lerobot_is_one_sentence(instead: Any, capsys: pytest.Captur
         "lerobot-train with the same flags to see where.\n"
     )
     assert factory.LeRobotDataset is LeRobotDataset
-
-
-def test_a_negative_cache_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert ends("--frame-cache-mb=-1") == 2
-    assert "frame-cache-mb is -1, at least 0 is needed." in capsys.readouterr().err
 
 
 def parsed(*words: str) -> Any:

@@ -119,11 +119,6 @@ def test_saving_never_replaces_a_file_unasked(run_folder: Path, tmp_path: Path) 
     assert target.stat().st_mtime_ns > before
 
 
-def test_several_episodes_are_several_files(run_folder: Path, tmp_path: Path) -> None:
-    assert view(run_folder, "--save", tmp_path / "x.rrd") == 0
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["x-0000.rrd", "x-0001.rrd"]
-
-
 @pytest.mark.viewer
 def test_episodes_are_listed_in_the_order_given(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()

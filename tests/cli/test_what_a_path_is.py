@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 from collections.abc import Callable
@@ -171,11 +170,6 @@ def test_what_there_is_gets_its_name(tmp_path: Path, make: Callable[[Path], Path
     assert find(make(tmp_path)).kind == kind
 
 
-def test_a_mark_that_is_no_file_is_not_overlooked(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "run.json")
-    assert find(tmp_path).kind == "run"
-
-
 def test_a_run_has_the_recordings_of_its_folders_alone(tmp_path: Path) -> None:
     for name in ("mine.mcap", "episodes/b.mcap", "episodes/a.mcap", "failed/c.mcap", "episodes/d.mcap.part"):
         write(name)(tmp_path)
@@ -218,11 +212,6 @@ def test_what_a_kill_left_is_named_with_what_to_do(
         "Left out: a recording is unfinished (being made, or left by a crash): demorec recover "
         f"'{after_a_kill}/episodes/episode_000001.mcap.part' keeps what is whole in it."
     ) in told.out + told.err
-
-
-def test_info_has_it_in_json_too(after_a_kill: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code("info", after_a_kill, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["unfinished"] == [f"{after_a_kill}/episodes/episode_000001.mcap.part"]
 
 
 @pytest.mark.parametrize("command", ["info", "check", "view"])

@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.check import simulate_run
-from support.export import export, files_of, make_run
+from support.export import export, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
-from demorec.annotate.grounding import outline_area, run_lengths
+from demorec.annotate.grounding import run_lengths
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import rotation_from_quat
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot import ExportOptions, dataset_digest
 from demorec.datasets.lerobot.boxes import coco_string
 from demorec.datasets.lerobot.prepare import prepare_episode
-from demorec.episode.scene import SceneCamera, Shape
 from demorec.mcap import SimulatedRecording
 
 PREFIX = "observation.images."
@@ -238,17 +237,6 @@ def test_a_thousand_boxes_are_those_of_the_segmentation(dataset: Path, truth: Tr
     assert count > 1000
 
 
-def test_visible_fractions_count_what_is_hidden(dataset: Path, truth: Truth) -> None:
-    told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}front.json").read_text())
-    name = truth.scene.goals[0].object
-    phase = truth.columns.phase
-    share = {item["image_id"]: item["visible_fraction"] for item in told["annotations"] if item["object"] == name}
-    free = [share[frame] for frame in range(len(phase)) if frame < phase.index("descend") // 2]
-    held = [share.get(frame, 0.0) for frame in range(len(phase)) if phase[frame] in ("close", "lift")]
-    assert min(free) > 0.9
-    assert max(held) < min(free)  # the fingers are around it
-
-
 @pytest.mark.filterwarnings("ignore:__array__ implementation")
 def test_pycocotools_reads_them(dataset: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco")
@@ -258,22 +246,6 @@ def test_pycocotools_reads_them(dataset: Path) -> None:
         for item in found.dataset["annotations"]:
             assert found.annToMask(item).sum() == item["area"]
             assert masks.toBbox(found.annToRLE(item)).tolist() == item["bbox"]
-
-
-@pytest.mark.parametrize("shape", [Shape(kind="box", size=(0.2, 0.1, 0.3)), Shape(kind="cylinder", size=(0.1, 0.3))])
-def test_outlines_of_what_faces_the_camera(shape: Shape) -> None:
-    """From far above, the outline is the face that is seen, in pixels."""
-    from demorec.core.geometry import look_at
-
-    eye = look_at((0.0, 0.0, 100.15), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-    camera = SceneCamera(name="c", width=100, height=100, fov_y=0.02, mount="world", mount_from_camera=eye, far=200.0)
-    face = 0.2 * 0.1 if shape.kind == "box" else np.pi * 0.1**2
-    scale = camera.intrinsics[0, 0] / 100
-    area = outline_area(camera, eye.vector(), shape, np.array([0, 0, 0, 0, 0, 0, 1.0]))
-    assert area is not None
-    assert abs(area / (face * scale**2) - 1) < 0.01
-    mesh = Shape(kind="mesh", size=(0.1, 0.1, 0.1))
-    assert outline_area(camera, eye.vector(), mesh, np.array([0, 0, 0, 0, 0, 0, 1.0])) is None
 
 
 def test_run_lengths_go_column_by_column() -> None:
@@ -327,14 +299,3 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
     assert pages[-1].endswith("on the green target.")
     told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}front.json").read_text())
     assert counts == [sum(item["image_id"] == frame for item in told["annotations"]) for frame in range(len(frames))]
-
-
-def test_a_dataset_with_everything_is_replaced_whole(run: Path, dataset: Path, tmp_path: Path) -> None:
-    out = tmp_path / "d"
-    export(run, out, language=(), boxes=True, progress=True)
-    assert not list(out.rglob("*.images"))
-    export(run, out, overwrite=True)
-    names = set(files_of(out))
-    assert not any(name.startswith(("sarm_progress", "demorec/boxes", "meta/temporal")) for name in names)
-    export(run, out, language=(), boxes=True, overwrite=True)
-    assert files_of(out) == files_of(dataset)

@@ -27,12 +27,9 @@ from demorec.core.tables import CHECKS
 from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources import import_run
-from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.import_file import BagReport
 from demorec.sources.import_run import import_bags
-from demorec.sources.mapping import SourceMapping
-from demorec.sources.streams import BagStreams, read_streams
 
 FRONT = "/follower/cam_front/image_raw/compressed"
 DROPPING = bag_mappings.SO101.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
@@ -158,18 +155,6 @@ def test_bad_bags_are_skipped_and_listed(
     assert "run_1.mcap: The bag is empty" in judged.detail
 
 
-@pytest.mark.parametrize("bad", sorted(BAD))
-def test_without_being_asked_the_first_bad_bag_is_refused(bad: str, tmp_path: Path) -> None:
-    first, second = _bag(tmp_path / "a.mcap"), _bag(tmp_path / "b.mcap")
-    spoil, reason = BAD[bad]
-    spoil(second)
-    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
-    with pytest.raises(DemorecError) as refused:
-        import_bags([first, second], mapping, tmp_path / "run")
-    assert reason in str(refused.value)
-    assert not (tmp_path / "run/episodes/episode_000001.mcap").exists()
-
-
 def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
     done: list[tuple[int, int]] = []
     told: list[BagReport] = []
@@ -222,17 +207,6 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
     assert [bag["name"] for bag in skipped] == [f"run_{2 * number + 1}.mcap" for number in range(1, len(BAD))]
 
 
-def test_another_mapping_may_follow_one_that_fitted_no_bag(tmp_path: Path) -> None:
-    bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
-    mapping = bag_mappings.write_mapping(DROPPING.replace("/leader/", "/lead/"), tmp_path / "robot.toml")
-    assert list(import_bags([bag], mapping, run, skip_bad=True).skipped) == [bag]
-    bag_mappings.write_mapping(DROPPING, mapping)
-    assert import_bags([bag], mapping, run, skip_bad=True).num_new == 1
-    bag_mappings.write_mapping(DROPPING.replace("fps = 30", "fps = 15"), mapping)
-    with pytest.raises(ConfigError, match="imported by another mapping"):
-        import_bags([bag], mapping, run, skip_bad=True)
-
-
 def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mistyped name, a full disk, too little memory."""
     bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
@@ -253,21 +227,6 @@ def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.Mo
             with pytest.raises(DemorecError, match=words):
                 import_bags([bag], mapping, run, skip_bad=True)
     assert import_bags([bag], mapping, run, skip_bad=True).num_new == 1
-
-
-def test_info_says_which_episodes_were_dropped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    leader = "/leader/joint_states"
-    notes = bags.changed(bags.so101(2.0), leader, lambda k, note: None if 60 <= k < 80 else note)
-    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
-    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.9]]\n'
-    text = DROPPING.replace("[cameras.front]", cut + "[cameras.front]")
-    mapping, run = bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run"
-    assert _demorec("import", bag, "--mapping", mapping, "--out", run) == 0
-    capsys.readouterr()
-    assert _demorec("info", run) == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("bag.mcap")]
-    assert "episode from 1.00 to 1.90 s" in line
-    assert f"action ({leader}) is up to" in line
 
 
 def test_the_same_bag_twice_is_imported_once(tmp_path: Path) -> None:
@@ -299,21 +258,6 @@ def test_a_folder_stands_for_the_bags_in_it_in_their_natural_order(tmp_path: Pat
     assert _demorec("import", "--suggest", folder) == 0
     with pytest.raises(BagError, match=r"holds no metadata.yaml.* and no bags"):
         import_bags([folder / "photos"], mapping, tmp_path / "run")
-
-
-def test_an_unexpected_error_skips_a_bag_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    good, bad = _bag(tmp_path / "a.mcap"), _bag(tmp_path / "b.mcap")
-    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
-
-    def fails(bag: Bag, mapping: SourceMapping) -> BagStreams:
-        if bag.path == bad:
-            raise KeyError("nobody thought of it")
-        return read_streams(bag, mapping)
-
-    monkeypatch.setattr(import_run, "read_streams", fails)
-    result = import_bags([bad, good], mapping, tmp_path / "run", skip_bad=True)
-    assert result.skipped == {bad: "unexpected KeyError, please report it"}
-    assert result.num_new == 1
 
 
 @pytest.mark.parametrize("kind", ["hdf5", "lerobot"])

@@ -139,26 +139,6 @@ def test_only_the_source_without_headers_goes_by_times_of_recording(imports: Imp
         assert values.tolist() == [*state.body["position"].tolist(), *gripper.body["data"].tolist()]
 
 
-def test_a_camera_by_times_of_recording(imports: Imports, tmp_path: Path) -> None:
-    notes = real()
-    assert imports(notes, MAPPING + 'stamp = "log"\n')[0] == 0
-    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
-        times = recording.columns().picture_stamps["front"].tolist()
-    assert set(times) <= {note.log_ns for note in notes if note.topic == FRONT}
-
-
-def test_the_suggestion_sets_it_for_that_source_alone(imports: Imports, tmp_path: Path) -> None:
-    notes = [replace(note, topic=note.topic.replace("/gripper/state", "/gripper/joint_states")) for note in real()]
-    code, told, _ = imports(notes, "suggested")
-    assert code == 0
-    assert "Nothing odd was found." in told
-    mapping = tomllib.loads((tmp_path / "robot.toml").read_text())
-    assert "stamp" not in mapping["clock"]
-    sources = [source for rows in mapping["features"].values() for source in rows if "topic" in source]
-    stamps = {source["topic"]: source.get("stamp") for source in (*sources, *mapping["cameras"].values())}
-    assert stamps == {"/gripper/joint_states": "log", STATE: None, ACTION: None, FRONT: None}
-
-
 def test_headers_far_from_times_of_recording_are_found_where_both_are_used(imports: Imports) -> None:
     _, told, _ = imports(real(skew_s=0.3), _with_gripper(stamp="log"))
     lines = [line for line in told.splitlines() if line.startswith("  clock_offset: ") and GRIPPER in line]
@@ -191,12 +171,6 @@ def test_simulated_headers_beside_none_are_refused(imports: Imports) -> None:
     assert "clock_offset" in error
     assert 'clock.stamp = "log"' in error
     assert error.count("\n") == 1
-
-
-def test_header_times_that_are_not_there_cannot_be_chosen(imports: Imports) -> None:
-    code, _, error = imports(real(), _with_gripper(stamp="header"))
-    assert code == 1
-    assert f'observation.state has stamp = "header", but the headers of {GRIPPER} have no time: write "log"' in error
 
 
 @pytest.mark.parametrize("rate", [5, 12, 30, 59.94, 90])

@@ -19,8 +19,6 @@ from support.commands import exit_code
 from support.export import export
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.depth import quantised
 from demorec.mcap import Recording
 from demorec.mcap.lossless import encode_millimetres
 from demorec.view.from_dataset import open_dataset_episode
@@ -200,30 +198,6 @@ def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> Non
         times, shown = zip(*episode.depth["wrist_depth"](), strict=True)
     assert list(times) == episode.time_ns.tolist()
     np.testing.assert_allclose(shown, np.nan_to_num(stored, posinf=0).clip(max=10), atol=2e-3)
-
-
-def test_what_was_not_measured_has_code_0() -> None:
-    """LeRobot's quantisation begins with 1 cm, so nothing that a sensor measures has it."""
-    distances = np.array([[np.nan, np.inf, -np.inf, 0.0, 0.5]], dtype=np.float32)
-    codes = quantised(distances)
-    assert codes[0, :4].tolist() == [0, 0, 0, 0]
-    assert codes[0, 4] > 0
-
-
-def test_depth_that_is_not_there_cannot_be_asked_for(tmp_path: Path) -> None:
-    bag = bags.write_mcap(bags.in_order(bags.so101(0.4)), tmp_path / "bag.mcap")
-    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
-    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
-    with pytest.raises(ConfigError, match="no camera of the recording measures distances"):
-        export(tmp_path / "run", tmp_path / "dataset", depth=True)
-
-
-def test_a_suggested_mapping_has_the_distances(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag = bags.write_mcap(notes_with_depth("16UC1", bags.times(30, 0.6)), tmp_path / "bag.mcap")
-    assert exit_code("import", "--suggest", bag) == 0
-    text = capsys.readouterr().out
-    assert f'[cameras.wrist_depth]\ntopic = "{DEPTH}"' in text
-    assert f'[cameras.wrist]\ntopic = "{COLOR}"' in text
 
 
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {

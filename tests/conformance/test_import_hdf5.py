@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
-from support.export import data_table, export, make_run
-from support.external import TOP, make_external
-from support.external import write_external as write_external_recording
 from support.hdf5 import (
     ALOHA_CAMERAS,
     HEIGHT,
@@ -27,18 +22,16 @@ from support.hdf5 import (
     write_robomimic,
 )
 
-from demorec.core.errors import ConfigError
-from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
-from demorec.mcap import Recording, SimulatedRecording
+from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error
+from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources.frames_writer import FramesImport, Picture
-from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature
+from demorec.sources.hdf5_arrays import StoredCamera
 from demorec.sources.hdf5_import import episode_places, import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
-from demorec.sources.mapping import Episodes, Source
+from demorec.sources.mapping import Episodes
 
 DEMOS = ("demo_0", "demo_1", "demo_10")
-Vectors = dict[str, NDArray[np.generic]]
 
 
 def recordings(run: Path) -> list[Path]:
@@ -100,18 +93,6 @@ def nearest(shown: NDArray[np.uint8], candidates: NDArray[np.uint8]) -> int:
     return int(np.abs(candidates.astype(int) - shown).mean(axis=(1, 2, 3)).argmin())
 
 
-def test_each_row_shows_its_own_picture(robomimic: tuple[Path, Path]) -> None:
-    source, run = robomimic
-    with h5py.File(source) as file:
-        for demo, path in zip(DEMOS, recordings(run), strict=True):
-            with Recording(path) as recording:
-                for camera in ("agentview", "robot0_eye_in_hand"):
-                    given = file[f"data/{demo}/obs/{camera}_image"][:]
-                    shown = list(recording.images(camera))
-                    assert [nearest(picture, given) for picture in shown] == list(range(len(given)))
-                    assert np.abs(np.array(shown).astype(int) - given).mean() < 8
-
-
 def test_a_mask_chooses_and_a_dataset_tells_the_outcome(tmp_path: Path) -> None:
     file = write_robomimic(tmp_path / "demo.hdf5")
     changes = {'# mask = "train"': 'mask = "train"', '# success = "rewards"': 'success = "rewards"'}
@@ -163,57 +144,6 @@ def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) ->
     assert blue - red > 200  # the corner is red in the file
 
 
-def test_the_action_can_be_the_next_state(tmp_path: Path) -> None:
-    file = write_aloha(tmp_path / "episode_0.hdf5")
-    _, run = imported(file, changes={'dataset = "action"': 'next = "observation.state"'})
-    with h5py.File(file) as opened, Recording(recordings(run)[0]) as recording:
-        columns = recording.columns()
-        np.testing.assert_array_equal(columns.features["action"], opened["observations/qpos"][1:])
-        np.testing.assert_array_equal(columns.features["observation.state"], opened["observations/qpos"][:-1])
-        assert len(columns.pictures["cam_high"]) == 7
-
-
-def test_our_own_file_comes_back_to_the_bit(tmp_path: Path) -> None:
-    export(make_run(tmp_path / "simulated", (8, 7)), tmp_path / "a.hdf5", "hdf5", privileged=True)
-    result, run = imported(tmp_path / "a.hdf5")
-    assert (result.num_episodes, result.num_frames) == (2, 15)
-    with h5py.File(tmp_path / "a.hdf5") as file:
-        for index, path in enumerate(recordings(run)):
-            with (
-                Recording(path) as recording,
-                SimulatedRecording(tmp_path / f"simulated/episodes/{path.name}") as simulated,
-            ):
-                found, original, info = recording.columns().features, simulated.columns(), recording.info
-                assert (info.instruction, info.fps) == (simulated.info.instruction, simulated.info.fps)
-                assert info.urdf == simulated.description()
-                assert recording.outcome is not None
-                assert recording.outcome.success is True
-            demo = file[f"data/demo_{index}"]
-            np.testing.assert_array_equal(found["action"], demo["actions"][:])
-            np.testing.assert_array_equal(found["observation.ee_pose"][:, :3], demo["obs/robot0_eef_pos"][:])
-            state = np.hstack([original.joint_position[:, :7], original.gripper_width[:, np.newaxis]])
-            np.testing.assert_array_equal(found["observation.state"], state)
-            assert [feature.dtype for feature in info.features] == ["float64"] * len(info.features)
-            assert info.features[0].joints[:7] == simulated.info.robot.joint_names[:7]
-
-
-def test_our_own_file_of_external_episodes_comes_back(tmp_path: Path) -> None:
-    (tmp_path / "given" / "episodes").mkdir(parents=True)
-    given = make_external(cameras=(TOP,), num_frames=20, success=False)
-    write_external_recording(tmp_path / "given" / "episodes" / "episode_000000.mcap", given)
-    export(tmp_path / "given", tmp_path / "a.hdf5", "hdf5", include_failures=True)
-    _, run = imported(tmp_path / "a.hdf5")
-    with Recording(recordings(run)[0]) as recording:
-        for name in ("observation.state", "observation.force", "action"):
-            expected = np.array([frame.samples[name].vector for frame in given.frames])
-            assert recording.columns().features[name].dtype == expected.dtype
-            np.testing.assert_array_equal(recording.columns().features[name], expected)
-        assert [feature.names for feature in recording.info.features if feature.name == "action"] == [
-            ("shoulder.pos", "elbow.pos", "gripper.pos")
-        ]
-        assert (recording.info.robot, recording.outcome and recording.outcome.success) == ("two_joints", False)
-
-
 @pytest.mark.parametrize("kind", ["uint16", ">f4"])
 def test_distances_stay(kind: str, tmp_path: Path) -> None:
     file = write_aloha(tmp_path / "episode_0.hdf5")
@@ -227,40 +157,6 @@ def test_distances_stay(kind: str, tmp_path: Path) -> None:
         found = np.array(list(recording.distances("cam_high_depth")))
     assert found.dtype == given.dtype.newbyteorder("=")
     np.testing.assert_array_equal(found, given)
-
-
-def test_distances_of_our_own_file_come_back(tmp_path: Path) -> None:
-    export(make_run(tmp_path / "simulated", (4,), depth=True), tmp_path / "a.hdf5", "hdf5", depth=True)
-    _, run = imported(tmp_path / "a.hdf5")
-    with h5py.File(tmp_path / "a.hdf5") as file, Recording(recordings(run)[0]) as recording:
-        assert recording.depth_cameras
-        for camera in recording.depth_cameras:
-            expected = file[f"data/demo_0/obs/{camera}"][..., 0]
-            np.testing.assert_array_equal(np.array(list(recording.depth(camera))), expected)
-
-
-@pytest.mark.usefixtures("hf_datasets_cache")
-def test_it_is_checked_and_exported(robomimic: tuple[Path, Path], tmp_path: Path) -> None:
-    from demorec.check.report import CheckOptions, Subject, check_subject
-
-    source, run = robomimic
-    report = check_subject(Subject(path=recordings(run)[0], kind="recording"), CheckOptions())
-    assert not [result.check for result in report.results if result.level == "fail"]
-    export(run, tmp_path / "dataset")
-    actions = np.array(data_table(tmp_path / "dataset").column("action").to_pylist())
-    with h5py.File(source) as file:
-        expected = np.vstack([file[f"data/{demo}/actions"][:] for demo in DEMOS]).astype(np.float32)
-    np.testing.assert_array_equal(actions, expected)
-
-
-def test_the_same_command_again_goes_on(robomimic: tuple[Path, Path], tmp_path: Path) -> None:
-    source, run = robomimic
-    shutil.copytree(run, tmp_path / "run")
-    recordings(tmp_path / "run")[1].unlink()
-    result = import_hdf5([source], source.with_suffix(".toml"), tmp_path / "run")
-    assert (result.num_new, result.num_episodes) == (1, 3)
-    again = [path.read_bytes() for path in recordings(tmp_path / "run")]
-    assert again == [path.read_bytes() for path in recordings(run)]
 
 
 def test_interrupting_leaves_nothing_half_written(
@@ -284,24 +180,6 @@ def test_interrupting_leaves_nothing_half_written(
     assert [path.read_bytes() for path in recordings(tmp_path / "run")] == [
         path.read_bytes() for path in recordings(run)
     ]
-
-
-def test_pictures_are_read_by_whole_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = pictures(23, 0)
-    with h5py.File(tmp_path / "a.hdf5", "w") as file:
-        file.create_dataset("images", data=given, chunks=(4, 12, 16, 3), compression="gzip")
-    read, asked = StoredArray.read, list[tuple[int, int]]()
-
-    def noted(self: StoredArray, begin: int, end: int) -> NDArray[np.generic]:
-        asked.append((begin, end))
-        return read(self, begin, end)
-
-    monkeypatch.setattr(StoredArray, "read", noted)
-    monkeypatch.setattr("demorec.datasets.hdf5.foreign._BLOCK_BYTES", 9 * given[0].nbytes)
-    with ForeignFile(tmp_path / "a.hdf5") as opened:
-        np.testing.assert_array_equal(np.array(list(opened.array("images").rows())), given)
-    assert asked == [(0, 8), (8, 16), (16, 23)]
-    assert all(before[1] == after[0] for before, after in pairwise(asked))
 
 
 def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
@@ -398,14 +276,6 @@ def test_one_observation_more_than_actions_is_left_out(tmp_path: Path, capsys: p
     assert found[0] == found[1]
 
 
-def test_with_one_observation_more_the_last_action_is_the_last_state(tmp_path: Path) -> None:
-    file = write_aloha(tmp_path / "episode_0.hdf5")
-    _one_observation_more(file)
-    _, run = imported(file, changes={'dataset = "action"': 'next = "observation.state"'})
-    with h5py.File(file) as opened, Recording(recordings(run)[0]) as recording:
-        np.testing.assert_array_equal(recording.columns().features["action"], opened["observations/qpos"][1:])
-
-
 @pytest.mark.parametrize("camera", ["jpeg", "pixels", "depth", "floats", "next"])
 def test_a_camera_is_left_out_only_where_the_mapping_says_so(
     camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -431,31 +301,6 @@ def test_a_camera_is_left_out_only_where_the_mapping_says_so(
     text = mapping.read_text().replace('leave_out = ["next_obs"]', "")
     mapping.write_text(f'leave_out = ["next_obs", "{name}"]\n{text}')
     assert name in import_hdf5([file], mapping, tmp_path / "run").left_out
-
-
-def test_what_is_no_camera_needs_no_word(tmp_path: Path) -> None:
-    """Points, transforms, masks and vectors of bytes are arrays like pictures."""
-    file = write_robomimic(tmp_path / "demo.hdf5")
-    mapping = suggested(file)
-    rng = np.random.default_rng(0)
-    others = {
-        "points": rng.normal(size=(7, 32, 32, 3)), "transforms": rng.uniform(0, 1, (7, 3, 4, 4)),
-        "mask": rng.integers(0, 3, (7, 48, 64)).astype(np.uint8), "bytes": rng.integers(0, 9, (7, 40)).astype(np.uint8),
-        "heights": rng.uniform(0, 1, (7, 48, 64)).astype(np.float32),
-    }  # fmt: skip
-    with h5py.File(file, "r+") as opened:
-        for name, values in others.items():
-            opened[f"data/demo_0/obs/{name}"] = values
-    left_out = import_hdf5([file], mapping, tmp_path / "run").left_out
-    assert {f"obs/{name}" for name in others} <= set(left_out)
-    again = "\n".join(suggested_hdf5_mapping(file))
-    assert not any(f"[cameras.{name}]" in again for name in others)
-
-
-def test_a_camera_cannot_be_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = write_robomimic(tmp_path / "demo.hdf5")
-    mapping = suggested(file, {'leave_out = ["next_obs"]': 'leave_out = ["obs", "next_obs"]'})
-    _refused(file, mapping, "leave_out leaves out 'obs/agentview_image', which the mapping names", capsys)
 
 
 def _soft_link(file: h5py.File) -> None:
@@ -613,47 +458,6 @@ def test_a_mask_leaves_links_out(tmp_path: Path) -> None:
     assert import_hdf5([file], mapping, tmp_path / "run").num_episodes == 2
 
 
-@pytest.mark.parametrize("edge", [2**53, -(2**53)])
-def test_whole_numbers_are_exact(edge: int, tmp_path: Path) -> None:
-    def array(name: str) -> StoredArray:
-        return opened.array(name)
-
-    with h5py.File(tmp_path / "a.hdf5", "w") as file:
-        file["held"] = np.array([[edge]])
-        file["other"] = np.array([[edge + (1 if edge > 0 else -1)]])
-        file["unsigned"] = np.array([[2**64 - 1]], np.uint64)
-    with ForeignFile(tmp_path / "a.hdf5") as opened:
-        held = StoredFeature("a", [Source(dataset="held")], [array("held")], shift=0)
-        assert [vector.tolist() for vector in held.vectors(1)] == [[edge]]
-        for name in ("other", "unsigned"):
-            feature = StoredFeature("a", [Source(dataset=name)], [array(name)], shift=0)
-            with pytest.raises(Hdf5FitError, match="whole numbers that float64 cannot hold"):
-                list(feature.vectors(1))
-
-
-def test_rows_of_a_file_without_groups_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = write_aloha(tmp_path / "episode_0.hdf5")
-    mapping = suggested(file)
-    with h5py.File(file, "r+") as opened:
-        opened.attrs["num_samples"] = 9
-    _refused(file, mapping, "file: the episode has 8 rows, but its attribute num_samples says 9", capsys)
-
-
-def test_objects_of_unknown_types_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = write_robomimic(tmp_path / "demo.hdf5")
-    mapping = suggested(file)
-
-    def unknown(group: h5py.Group, name: str) -> str:
-        raise TypeError("Unknown object type")  # as h5py does
-
-    monkeypatch.setattr(ForeignFile, "_kind", staticmethod(unknown))
-    with ForeignFile(file) as opened, pytest.raises(Hdf5Error, match="The file's root cannot be read"):
-        opened.children("")
-    _refused(file, mapping, "data cannot be read", capsys)
-
-
 def test_a_suggestion_lists_what_no_filter_reads(tmp_path: Path) -> None:
     file = write_aloha(tmp_path / "episode_0.hdf5")
     with h5py.File(file, "r+") as opened:
@@ -668,33 +472,6 @@ def test_a_suggestion_lists_what_no_filter_reads(tmp_path: Path) -> None:
     told = "observations/effort cannot be read (it is compressed in a way that is not installed here)"
     assert f"#     {told}" in lines
     assert 'dataset = "observations/qpos"' in lines
-
-
-def test_other_models_are_refused_at_once_and_the_same_is_kept_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def with_model(name: str, robot: str) -> Path:
-        file = write_aloha(tmp_path / name)
-        with h5py.File(file, "r+") as opened:
-            opened.attrs["model_file"] = f'<robot name="{robot}"><link name="base"/></robot>'
-        return file
-
-    first, same, other = (with_model(f"{k}.hdf5", robot) for k, robot in enumerate(("a", "a", "b")))
-    mapping = suggested(first)
-    assert 'urdf_attribute = "model_file"' in mapping.read_text()
-    (tmp_path / "damaged.hdf5").write_bytes(other.read_bytes()[:2000])
-    with pytest.raises(ConfigError, match=r"The episodes differ \(URDF"):
-        import_hdf5([first, other, tmp_path / "damaged.hdf5"], mapping, tmp_path / "run")
-    planned: list[Any] = []
-
-    def noted(plans: list[Any], *others: object) -> int:
-        planned.extend(plans)
-        return 0
-
-    monkeypatch.setattr("demorec.sources.hdf5_import._write", noted)
-    import_hdf5([first, same], mapping, tmp_path / "run")
-    assert len(planned) == 2
-    assert planned[0].info.urdf is planned[1].info.urdf
 
 
 def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -134,14 +134,6 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
         assert {time for time in times if begin <= time <= end} <= set(stamps)
 
 
-def test_cameras_that_come_one_after_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """All images of both, the first and the last ones too, and each row those of one moment."""
-    cameras = {FRONT: ticks(30, 90), SIDE: ticks(30, 90, phase=0.15)}
-    told, shown = imported(WRITERS["mcap"](bag(cameras), tmp_path), MAPPING, tmp_path, capsys)
-    assert "Nothing odd was found." in told
-    assert shown == {"front": cameras[FRONT], "side": cameras[SIDE]}
-
-
 def test_distances_registered_to_another_camera_are_no_swap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Stereo cameras give them in the coordinate frame of the left one."""
     left, right, depth = "/zed/left/image_rect_color", "/zed/right/image_rect_color", "/zed/depth/depth_registered"
@@ -163,31 +155,6 @@ def test_images_that_no_row_has_are_told(tmp_path: Path, capsys: pytest.CaptureF
     )
     assert len(shown["front"]) == 294
     assert "/front/image_raw/compressed: 1.67 % of its images are in no row: rows follow camera side" in told
-
-
-def test_cameras_of_slightly_different_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One has an image more each ten seconds, and its images come before those of the other, then after them."""
-    slow, fast = ticks(30, 360, jitter_s=0.001), ticks(30.1, 360, phase=0.3, jitter_s=0.001)
-    assert slow[0] < fast[0]
-    assert slow[-1] > fast[-1]
-    told, shown = imported(WRITERS["mcap"](bag({FRONT: fast, SIDE: slow}), tmp_path), MAPPING, tmp_path, capsys)
-    assert "Nothing odd was found." in told
-    assert "one for each message of camera front" in told  # the first one of those that have equally many
-    assert shown["front"] == fast
-    assert len(set(slow) - set(shown["side"])) <= 2
-
-
-def test_joints_whose_headers_are_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A camera's exposure and transport: the joints' times are 40 ms before or after."""
-    for number, shift in enumerate((-0.04, 0.04)):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        times = ticks(30, 60)
-        path = WRITERS["mcap"](bag({FRONT: times}, shift_s=shift), folder)
-        told, shown = imported(path, ONE_CAMERA, folder, capsys)
-        assert "Nothing odd was found." in told
-        joints = [note.header_ns for note in bags.of_topic(bag({FRONT: times}, shift_s=shift), STATE)]
-        assert shown["front"] == [time for time in times if time >= joints[0]]
 
 
 OFF_NS = np.random.default_rng(3).integers(-12_000_000, 12_000_000, 90).tolist()
@@ -216,27 +183,6 @@ def test_what_is_wrong_is_found(name: str, tmp_path: Path, capsys: pytest.Captur
     if name == "images dropped":  # of the whole camera none is lost, and rows stay a thirtieth of a second apart
         times = [note.header_ns for note in bags.of_topic(notes, SIDE)]
         assert set(times[1:-1]) <= set(shown["side"])
-
-
-def test_rows_on_the_edge_of_a_camera_are_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Joints and images of one phase: at the joints' stamps an image is now there, now not yet."""
-    cameras = {FRONT: ticks(30, 90, jitter_s=0.001)}
-    notes = bag(cameras, joints_rate=30.0)
-    mapping = ONE_CAMERA.replace("fps = 30", f'fps = 30\nrows = "{STATE}"')
-    half = bags.NS // 60
-    notes = bags.changed(notes, STATE, lambda k, note: replace(note, header_ns=note.header_ns - half))
-    state = [note.header_ns for note in bags.of_topic(notes, STATE)]
-    assert all(min(abs(time - moment) for moment in state) < 2_100_000 for time in cameras[FRONT])
-    told, shown = imported(WRITERS["mcap"](notes, tmp_path), mapping, tmp_path, capsys)
-    repeated = sum(a == b for a, b in zip(shown["front"], shown["front"][1:], strict=False))
-    assert repeated > 5
-    share = f"{100 * repeated / len(shown['front']):.3g} %"
-    (line,) = [line for line in told.splitlines() if line.startswith("  repeats: ")]
-    assert f"{share} of the rows show the image before" in line
-    assert 'use rows = "camera"' in line
-    assert told.splitlines()[-1].startswith("1 finding in the bags (repeats)")
-    result = CHECKS.load("import_times").run(ExternalRun(tmp_path / "run"))
-    assert (result.level, share in result.detail) == ("warn", True)
 
 
 @pytest.mark.parametrize(("fps", "slow"), [(30, 15), (15, 15), (25, 25)])
@@ -273,28 +219,3 @@ def test_a_rate_that_no_camera_has(fps: int, kind: str, tmp_path: Path, capsys: 
         assert float(share) == pytest.approx(100 * left_out / 90, abs=1)
     level = CHECKS.load("import_times").run(ExternalRun(tmp_path / "run")).level
     assert level == ("pass" if kind == "note" else "warn")
-
-
-def test_the_suggested_rate_is_that_of_the_slowest_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cameras = {FRONT: ticks(30, 60), SIDE: ticks(15, 30)}
-    clock = tomllib.loads(suggested(WRITERS["mcap"](bag(cameras), tmp_path), capsys))["clock"]
-    assert (clock["fps"], clock["rows"]) == (15, "camera")
-
-
-def test_a_depth_camera_decides_only_where_there_is_no_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    depth = [
-        bags.Note(
-            topic="/depth/image_raw", type="sensor_msgs/msg/Image", log_ns=time + 1_000_000, header_ns=time,
-            body={"encoding": "16UC1", "width": 8, "height": 6, "step": 16, "data": np.full(96, 7, np.uint8)},
-            frame_id="depth",
-        )
-        for time in ticks(30, 85)
-    ]  # fmt: skip
-    times = ticks(30, 90)
-    path = WRITERS["mcap"](bags.in_order(bag({FRONT: times}) + depth), tmp_path)
-    mapping = ONE_CAMERA + '[cameras.depth]\ntopic = "/depth/image_raw"\n'
-    told, shown = imported(path, mapping, tmp_path, capsys)
-    assert "one for each message of camera front" in told
-    assert shown["front"] == [time for time in times if time <= shown["front"][-1]]

@@ -18,7 +18,6 @@ from support.export import export
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot import dataset_digest
 from demorec.mcap import EpisodeWriter, Recording, recover
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
@@ -60,21 +59,6 @@ def rows_of(dataset: Path) -> list[dict[str, Any]]:
     (file,) = sorted((dataset / "data").rglob("*.parquet"))
     found: list[dict[str, Any]] = pq.read_table(file).to_pylist()
     return found
-
-
-def test_a_dataset_brings_its_subtasks_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
-    export(tmp_path / "run", tmp_path / "a", language=("subtask",))
-    assert exit_code("import", "lerobot", tmp_path / "a", "--out", tmp_path / "again") == 0
-    assert "language_persistent" not in capsys.readouterr().out
-    told = []
-    for run in ("run", "again"):
-        with Recording(recordings(tmp_path / run)[0]) as opened:
-            told.append(opened.subtasks)
-    assert len(told[0]) == 3
-    assert told[0] == told[1]
-    export(tmp_path / "again", tmp_path / "b", language=("subtask",))
-    assert dataset_digest(tmp_path / "b") == dataset_digest(tmp_path / "a")
 
 
 @pytest.mark.parametrize(

@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from support.export import data_table, export, make_run
 from support.training import CAMERA, DEPTH, write_by_lerobot
 
-from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
-from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.errors import DemorecError
 from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources.dataset_import import import_lerobot
-from demorec.view.sources import find_episodes
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 LENGTHS = (14, 9, 11)
@@ -140,24 +138,6 @@ def test_exported_again_it_has_equal_numbers(imported: tuple[str, Path, Path], t
         np.testing.assert_array_equal(again, columns_of(dataset, name).astype(np.float32))
     if kind == "video":
         assert all(np.array_equal(a, b) for a, b in zip(shown_by(tmp_path / "again"), shown_by(dataset), strict=True))
-
-
-def test_it_can_be_checked_and_viewed(imported: tuple[str, Path, Path]) -> None:
-    _, _, run = imported
-    report = check_subject(Subject(path=recordings(run)[0], kind="recording"), CheckOptions())
-    failed = [result.check for result in report.results if result.level == "fail"]
-    assert not failed
-    with find_episodes([run])[0].open() as episode:
-        assert NAME in episode.videos
-
-
-def test_the_same_command_again_goes_on(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
-    _, dataset, run = imported
-    shutil.copytree(run, tmp_path / "run")
-    recordings(tmp_path / "run")[1].unlink()
-    before = [path.read_bytes() for path in recordings(run)]
-    assert import_lerobot(dataset, tmp_path / "run").num_new == 1
-    assert [path.read_bytes() for path in recordings(tmp_path / "run")] == before
 
 
 def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
@@ -284,12 +264,3 @@ def test_the_command(imported: tuple[str, Path, Path], tmp_path: Path, capsys: p
         printed = capsys.readouterr()
         assert (ended.value.code, words in printed.out + printed.err) == (code, True), printed
     assert not (tmp_path / "x").exists()
-
-
-def test_another_dataset_is_refused(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
-    _, dataset, run = imported
-    shutil.copytree(dataset, tmp_path / "d")
-    path = tmp_path / "d" / "meta" / "info.json"
-    path.write_text(path.read_text().replace('"robot_type": null', '"robot_type": "so101"'))
-    with pytest.raises(ConfigError, match="choose another --out"):
-        import_lerobot(tmp_path / "d", run)

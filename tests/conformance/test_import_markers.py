@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support import bag_mappings, bags
 
@@ -93,27 +92,3 @@ def test_an_unknown_marker_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_what_the_refusal_says_helps(keys: str, kept: list[float], tmp_path: Path) -> None:
     assert _import(tmp_path, [*TAKES, (1.9, "abort")], keys=keys) == 0
     assert _begins(tmp_path / "run") == kept
-
-
-def test_markers_that_are_no_texts_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes = bags.so101(1.0)
-    for moment in bags.times(10, 1.0):
-        body = {"data": np.zeros(3)}
-        kind = "std_msgs/msg/Float64MultiArray"
-        notes.append(bags.Note(topic=TOPIC, type=kind, log_ns=moment, header_ns=0, body=body))
-    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
-    text = f'{bag_mappings.SO101}[episodes]\ncut = "marker"\ntopic = "{TOPIC}"\n'
-    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-    with pytest.raises(SystemExit) as ended:
-        main(["import", str(bag), "--mapping", str(mapping), "--out", str(tmp_path / "run")])
-    assert ended.value.code == 1
-    assert "the field 'data' is no text" in capsys.readouterr().err
-
-
-def test_subtasks_share_the_topic(tmp_path: Path) -> None:
-    """All other texts of it are subtasks then, but not those that discard or are ignored."""
-    marks = [*TAKES, (0.3, "reach"), (0.6, "grasp"), (0.7, "beep"), (1.5, "discard")]
-    assert _import(tmp_path, marks, keys='ignore = ["beep"]', more=f'[subtasks]\ntopic = "{TOPIC}"\n') == 0
-    assert _begins(tmp_path / "run") == [0.2, 2.0]
-    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
-        assert [text for _, text in recording.subtasks] == ["reach", "grasp"]

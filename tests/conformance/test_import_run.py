@@ -130,14 +130,6 @@ def test_pictures(imported: tuple[Layout, bags.Notes, Path]) -> None:
                     assert np.abs(shown.astype(float) - given).mean() < 12
 
 
-def test_the_same_command_again_changes_nothing(imported: tuple[Layout, bags.Notes, Path]) -> None:
-    _, _, run = imported
-    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    bag = next(path for path in run.parent.iterdir() if path.name.startswith("bag"))
-    assert import_bags([bag], run.parent / "robot.toml", run).num_new == 0
-    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
-
-
 def _so101(tmp_path: Path, notes: bags.Notes, name: str = "bag") -> Path:
     return bags.write_mcap(bags.in_order(notes), tmp_path / f"{name}.mcap")
 
@@ -148,23 +140,6 @@ def _mapping(tmp_path: Path, *changes: tuple[str, str]) -> Path:
         assert old in text
         text = text.replace(old, new)
     return bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-
-
-def test_bags_that_are_added_later(tmp_path: Path) -> None:
-    first, second = _so101(tmp_path, bags.so101(1.0), "a"), _so101(tmp_path, bags.so101(1.2), "b")
-    mapping, run = _mapping(tmp_path), tmp_path / "run"
-    import_bags([first], mapping, run)
-    alone = (run / "episodes/episode_000000.mcap").read_bytes()
-    assert import_bags([first, second], mapping, run).num_new == 1
-    assert (run / "episodes/episode_000000.mcap").read_bytes() == alone
-    with _open(run, 1) as recording:
-        assert recording.info.episode_index == 1
-        assert [file.name for file in recording.info.origin.files] == ["b.mcap"]
-    at_once = tmp_path / "at_once"
-    import_bags([first, second], mapping, at_once)
-    for index in range(2):
-        name = f"episodes/episode_{index:06d}.mcap"
-        assert (run / name).read_bytes() == (at_once / name).read_bytes()
 
 
 def test_an_import_that_was_killed_goes_on(tmp_path: Path) -> None:
@@ -181,13 +156,6 @@ def test_an_import_that_was_killed_goes_on(tmp_path: Path) -> None:
     second.unlink()
     assert import_bags([bag], mapping, run).num_new == 1
     assert {path.name: path.read_bytes() for path in run.glob("episodes/*")} == whole
-
-
-def test_another_mapping_is_refused(tmp_path: Path) -> None:
-    bag, run = _so101(tmp_path, bags.so101(1.0)), tmp_path / "run"
-    import_bags([bag], _mapping(tmp_path), run)
-    with pytest.raises(ConfigError, match="imported by another mapping"):
-        import_bags([bag], _mapping(tmp_path, ("fps = 30", "fps = 15")), run)
 
 
 def test_an_episode_that_lacks_something_is_dropped_where_the_mapping_says_so(tmp_path: Path) -> None:
@@ -226,16 +194,6 @@ def test_raw_pictures_of_other_encodings(encoding: str, tmp_path: Path) -> None:
     assert np.abs(raw_picture(values).astype(int) - expected).max() <= (5 if "bayer" in encoding else 0)
 
 
-def test_h265_and_av1_stay_as_they_are(tmp_path: Path) -> None:
-    from demorec.sources.picture_messages import picture_head
-
-    for codec, name in (("libx265", "h265"), ("libsvtav1", "av1")):
-        packets = bags.video([bags.picture(bags.EPOCH_NS + k * 33_000_000, 0) for k in range(12)], gop=5, codec=codec)
-        heads = [picture_head({"data": packet, "format": name, "frame_id": ""}) for packet in packets]
-        assert [head.is_keyframe for head in heads] == [k % 5 == 0 for k in range(12)]
-        assert {(head.width, head.height) for head in heads if head.is_keyframe} == {(bags.WIDTH, bags.HEIGHT)}
-
-
 def test_a_picture_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(buffer, format="PNG")
@@ -268,16 +226,6 @@ def test_a_run_whose_recording_was_exchanged_is_refused(tmp_path: Path) -> None:
     shutil.copy(tmp_path / "other_run/episodes/episode_000000.mcap", run / "episodes/episode_000000.mcap")
     with pytest.raises(ConfigError, match="Another recording is there"):
         import_bags([bag], mapping, run)
-
-
-def test_pictures_of_jpeg_are_what_the_camera_sent(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    import_bags([_so101(tmp_path, bags.so101(1.0))], _mapping(tmp_path), run)
-    with _open(run) as recording:
-        stamps = recording.columns().picture_stamps["front"]
-        for shown, stamp in zip(recording.images("front"), stamps.tolist(), strict=True):
-            expected = np.asarray(Image.open(io.BytesIO(bags.jpeg(bags.picture(stamp, 0)))))
-            assert np.array_equal(shown, expected)
 
 
 @pytest.fixture(scope="module")

@@ -97,35 +97,6 @@ def _so101(tmp_path: Path, notes: bags.Notes, *changes: tuple[str, str]) -> list
     return _rows(bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap"), _mapping(text, tmp_path))
 
 
-def test_a_row_for_each_message_of_a_topic(tmp_path: Path) -> None:
-    notes = bags.so101(1.5)
-    topic = "/follower/cam_front/image_raw/compressed"
-    (episode,) = _so101(tmp_path, notes, ("fps = 30", f'fps = 30\nrows = "{topic}"'))
-    times = [note.header_ns for note in bags.of_topic(notes, topic)]
-    assert np.all(np.isin(episode.times_ns, times))
-    assert np.all(np.diff(episode.cameras["front"].numbers) == 1)
-    assert not np.any(episode.cameras["front"].ages_ns)
-
-
-def test_log_times(tmp_path: Path) -> None:
-    notes = bags.so101(1.5)
-    (episode,) = _so101(tmp_path, notes, ("fps = 30", 'fps = 30\nstamp = "log"'))
-    states = bags.of_topic(notes, "/follower/joint_states")
-    for time_ns, values in zip(episode.times_ns.tolist(), episode.features["observation.state"].values, strict=True):
-        expected = max((note for note in states if note.log_ns <= time_ns), key=lambda note: note.log_ns)
-        assert values.tobytes() == expected.body["position"].tobytes()
-
-
-def test_the_next_observation_as_the_action(tmp_path: Path) -> None:
-    action = 'topic = "/leader/joint_states"\nfield = "position"'
-    (plain,) = _so101(tmp_path, bags.so101(1.5))
-    (episode,) = _so101(tmp_path, bags.so101(1.5), (action, 'next = "observation.state"'))
-    state = plain.features["observation.state"].values
-    assert len(episode.times_ns) in (len(plain.times_ns) - 1, len(plain.times_ns))
-    assert episode.features["action"].values.tobytes() == state[1 : len(episode.times_ns) + 1].tobytes()
-    assert np.all(episode.features["action"].ages_ns < 0)
-
-
 def test_a_stream_that_pauses_is_refused_with_its_name(tmp_path: Path) -> None:
     topic = "/leader/joint_states"
     notes = bags.changed(bags.so101(1.5), topic, lambda k, note: None if 30 <= k < 50 else note)

@@ -13,7 +13,6 @@ import pyarrow.parquet as pq
 import pytest
 from support.docs import run_examples
 from support.export import export, make_run
-from support.external import TOP, make_external, write_external
 from support.training import CAMERA, assert_same_item, write_by_lerobot
 
 if TYPE_CHECKING:
@@ -177,16 +176,6 @@ def _plain_state(kind: pa.ListType) -> pa.StructType:
     return pa.struct([calls if field.name == "tool_calls" else field for field in kind.value_type])
 
 
-def test_a_dataset_of_external_episodes_is_read_equally(tmp_path: Path) -> None:
-    (tmp_path / "run" / "episodes").mkdir(parents=True)
-    for index, length in enumerate((20, 33)):
-        given = make_external(cameras=(TOP,), num_frames=length, episode_index=index)
-        write_external(tmp_path / "run" / "episodes" / f"episode_{index:06d}.mcap", given)
-    export(tmp_path / "run", tmp_path / "d")
-    fast, slow = pair(tmp_path / "d")
-    assert_same(fast, slow)
-
-
 def test_some_episodes_only(roots: dict[str, Path]) -> None:
     chosen = {"episodes": [3, 1, 2], "episode_filter": lambda episode: episode["length"] < 11}
     fast, slow = pair(roots["lerobot"], delta_timestamps={CAMERA: HISTORY, "action": CHUNK}, **chosen)
@@ -210,16 +199,6 @@ def test_transforms_draw_the_same_random_numbers(roots: dict[str, Path]) -> None
     for dataset in (fast, slow):
         dataset.clear_image_transforms()
     assert_same_item(fast[5], slow[5])
-
-
-@pytest.mark.parametrize("kind", ["lerobot", "lerobot_images"])
-def test_items_own_their_values(kind: str, roots: dict[str, Path]) -> None:
-    fast, slow = pair(roots[kind])
-    first, second, _ = fast.__getitems__([3, 3, 4])
-    for key in (CAMERA, "observation.state"):
-        first[key].zero_()
-    assert_same_item(second, slow[3])
-    assert_same_item(fast[3], slow[3])
 
 
 @pytest.mark.parametrize("start_method", [None, *(pytest.param(m, marks=pytest.mark.slow) for m in ("fork", "spawn"))])
@@ -279,24 +258,5 @@ def test_what_cannot_be_read_is_refused_as_by_lerobot(roots: dict[str, Path]) ->
             dataset[4]
 
 
-@pytest.mark.parametrize(
-    "count", [pytest.param(150, id="few"), pytest.param(10_000, id="many", marks=pytest.mark.slow)]
-)
-def test_random_items_of_numbers_are_equal(count: int, tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", [40 + 7 * k for k in range(6)], cameras=())
-    export(run, tmp_path / "d", privileged=True, data_files_mb=0.05)
-    fast, slow = pair(tmp_path / "d", delta_timestamps={"observation.state": HISTORY, "action": CHUNK})
-    rows = np.random.default_rng(1).integers(0, len(slow), count).tolist()
-    for start in range(0, count, 64):
-        for row, item in zip(rows[start : start + 64], fast.__getitems__(rows[start : start + 64]), strict=True):
-            assert_same_item(item, slow[row])
-
-
 def test_the_example_of_the_docs_runs(roots: dict[str, Path]) -> None:
     assert run_examples("docs/training.md", "FastDataset", {"recordings/demo/dataset": roots["ours"]}) == 1
-
-
-def test_an_unknown_decoder_is_refused_as_by_lerobot(roots: dict[str, Path]) -> None:
-    for dataset in pair(roots["ours"], video_backend="nonesuch"):
-        with pytest.raises(ValueError, match="nonesuch"):
-            dataset[0]

@@ -11,14 +11,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from support.export import data_table, export, info
-from support.recording import write_episode
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array, Pose
 from demorec.core.plain import to_plain
-from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation, interventions
+from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation
 from demorec.episode.features import ActionKind
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
@@ -129,23 +128,6 @@ def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Pa
     assert data_table(tmp_path / "slow").column("intervention").to_pylist() == acted[::2]
 
 
-def test_a_demonstration_has_no_interventions(tmp_path: Path) -> None:
-    export(write_episode(tmp_path / "plain.mcap", num_frames=5, cameras=()), tmp_path / "dataset", intervention=True)
-    assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == [False] * 5
-
-
-@pytest.mark.parametrize(
-    ("phases", "expected"),
-    [
-        (("approach", "halt", "grasp"), [False, False, False]),  # nobody was taken over from
-        (("policy", "halt", "halt"), [False, False, False]),
-        (("policy", "halt", "approach", "policy"), [False, False, True, False]),
-    ],
-)
-def test_interventions(phases: tuple[str, ...], expected: list[bool]) -> None:
-    assert interventions(phases).tolist() == expected
-
-
 @pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
 def test_what_a_policy_did_alone_can_be_left_out(
     rollout: tuple[Attempt, Path], expert_poses: Array, tmp_path: Path, exporter: str
@@ -210,21 +192,6 @@ def test_the_moment(takeover: TakeOver, speed: float, expected: tuple[int, str])
     watch = Watch(takeover, episode, max_frames=300)
     told = enumerate(watch.reason(situation, UNSEEN) for situation in situations(speed))
     assert next((frame, reason) for frame, reason in told if reason) == expected
-
-
-def test_random_moments_are_those_of_the_episode_and_as_many_as_asked_for() -> None:
-    rules = TakeOver(stuck_seconds=0.0, random_share=0.5)
-    moments, seen = [], situations(0.0)
-    for index in range(200):
-        episode = prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=index))
-        for _ in range(2):
-            watch = Watch(rules, episode, max_frames=300)
-            moments.append(next((frame, why) for frame, s in enumerate(seen) if (why := watch.reason(s, UNSEEN))))
-    assert moments[::2] == moments[1::2]
-    random = [frame for frame, why in moments[::2] if why == "a random moment"]
-    assert 75 < len(random) < 125  # 100 +- 3.5 standard deviations of the binomial distribution
-    assert min(random) < 30
-    assert max(random) > 270
 
 
 class Wanderer:

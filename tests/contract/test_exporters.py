@@ -16,7 +16,6 @@ from support.recording import make_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.tables import EXPORTERS
-from demorec.datasets.options import CommonOptions
 from demorec.episode.sensed import SENSED
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.mcap.recover import recover
@@ -34,10 +33,6 @@ def content(place: Path) -> dict[str, bytes]:
     return {"": place.read_bytes()} if place.is_file() else files_of(place)
 
 
-def test_options_are_the_common_ones_and_more(exporter: str) -> None:
-    assert issubclass(EXPORTERS.load(exporter).options, CommonOptions)
-
-
 def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: Path, tmp_path: Path) -> None:
     before = files_of(run)
     row = EXPORTERS.load(exporter)
@@ -49,11 +44,6 @@ def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: 
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["d"]
     assert files_of(run) == before
-
-
-def test_failed_attempts_go_in_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
-    report = export(run, tmp_path / "d", exporter, include_failures=True)
-    assert (report.num_episodes, report.num_frames, report.skipped_failures) == (4, 27, 0)
 
 
 @pytest.mark.parametrize("name", [*SENSED, "command"])

@@ -18,14 +18,12 @@ from support.present import present
 from support.sim import episode
 from support.tasks import tasks_with_slow_ones
 
-import demorec.gym_env
 from demorec.core.errors import ConfigError, SceneError
-from demorec.core.tables import TASKS
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
 from demorec.episode.episode import SimulatedColumns, SimulatedInfo
-from demorec.episode.sensed import SENSED, ObservationRows, SensedFeature
+from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
@@ -103,19 +101,6 @@ def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> 
     env.close()
 
 
-def test_a_new_sensed_feature_needs_no_change_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    double = SensedFeature(
-        meaning="twice the opening (m)", names=lambda _: ("x",), values=lambda rows, _: 2 * rows.gripper_width
-    )
-    monkeypatch.setattr("demorec.episode.sensed.SENSED", {**SENSED, "observation.twice": double})
-    monkeypatch.setattr("demorec.episode.features.SENSED", {**SENSED, "observation.twice": double})
-    monkeypatch.setattr("demorec.gym_env.SENSED", {**SENSED, "observation.twice": double})
-    env = make(sensed=("observation.twice",))
-    observation, _ = env.reset(seed=0)
-    assert observation["twice"] == np.float32(2 * env.situation.observation.gripper_width)
-    env.close()
-
-
 @pytest.fixture(scope="module")
 def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedInfo, SimulatedColumns]:
     """What the expert did in an episode without noise, read from a file."""
@@ -170,16 +155,6 @@ def test_a_recordings_scene_can_be_set_up() -> None:
     env.reset(seed=0, options={"scene": scene, "something of LeRobot's": True})
     assert env.info.scene == scene
     env.close()
-
-
-def test_the_splits_and_seeds_give_other_scenes() -> None:
-    starts = set()
-    for split, seed in (("all", 0), ("all", 1), ("train", 0), ("eval", 0)):
-        env = make(split=split, seed=seed)
-        env.reset(seed=4)
-        starts.add(tuple(env.info.scene.body("red_cube").world_from_body.position))
-        env.close()
-    assert len(starts) >= 3
 
 
 def test_a_varying_number_of_objects_is_refused_where_a_vector_must_hold_them() -> None:
@@ -264,12 +239,6 @@ def test_vectors_of_environments_give_what_single_ones_give(vector: type) -> Non
             assert np.array_equal(after[key][i], value)
     envs.close()
     single.close()
-
-
-def test_every_task_is_registered_on_import() -> None:
-    assert demorec.gym_env is not None
-    for task in TASKS.names():
-        assert gymnasium.spec(env_id(task)).kwargs["task"] == task
 
 
 def test_the_example_of_the_docs_runs(capsys: pytest.CaptureFixture[str]) -> None:

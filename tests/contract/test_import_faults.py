@@ -34,10 +34,6 @@ def _findings(bag: Path, tmp_path: Path, text: str = MAPPING) -> set[str]:
     return {finding.kind for finding in all_findings(Timelines(streams, mapping))}
 
 
-def test_there_are_enough() -> None:
-    assert len(FAULTS) >= 25
-
-
 @pytest.mark.parametrize("name", sorted(FAULTS))
 def test_a_fault_is_named(name: str, notes: bags.Notes, tmp_path: Path) -> None:
     hurt_notes = hurt(notes, name)
@@ -143,10 +139,6 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
     for check, result in found.items():
         assert result.level == ("warn" if CHECK_OF.get(kind) == check else "pass"), check
         assert (kind in result.detail) == (CHECK_OF.get(kind) == check)
-
-
-def test_a_run_that_was_not_imported_has_no_report(tmp_path: Path) -> None:
-    assert CHECKS.load("import_times").run(ExternalRun(tmp_path)).level == "skip"
 
 
 def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:

@@ -50,14 +50,6 @@ def test_the_jaw_opens_as_far_as_its_tip_is_away(q: float, speed: float) -> None
     assert JAW.width_velocity(joints, np.array([[speed]])) == pytest.approx(rate, abs=2e-3)
 
 
-def test_a_jaw_beyond_its_rows_is_as_closed_or_as_open_as_it_gets() -> None:
-    assert JAW.joint_position(0.0).tolist() == [pytest.approx(-0.34)]
-    assert JAW.width(np.array([1.5])) == JAW.max_width
-    assert JAW.stroke_seconds() == pytest.approx(0.80), "from -0.34 to 0.46 rad at 1 rad/s"
-    larger = JAW.scaled(2.0)
-    assert (larger.max_width, larger.force) == (2 * JAW.max_width, JAW.force)
-
-
 @pytest.mark.parametrize("rows", [(), ((0.0, 0.01),), ((0.0, 0.02), (0.1, 0.01)), ((0.0, 0.0), (0.2, 0.1), (0.1, 0.2))])
 def test_an_opening_that_is_no_function_is_refused(rows: tuple[tuple[float, float], ...]) -> None:
     with pytest.raises(ValueError, match="from closed to open"):
@@ -66,12 +58,6 @@ def test_an_opening_that_is_no_function_is_refused(rows: tuple[tuple[float, floa
     plain["gripper"]["opening"] = [list(row) for row in rows]
     with pytest.raises(ValueError, match=r"RobotSpec\.gripper"):
         from_json(json.dumps(plain), RobotSpec)
-
-
-def test_a_robot_with_a_jaw_comes_back_from_a_file() -> None:
-    back = from_json(to_json(JAW_ARM), RobotSpec)
-    assert back == JAW_ARM
-    assert isinstance(back.gripper, JawGripper)
 
 
 @pytest.mark.parametrize("yaw", [-0.8, 0.0, 0.8])

@@ -23,7 +23,7 @@ from demorec.generate.run import generate
 from demorec.generate.worker import make_episode
 from demorec.mcap import SimulatedRecording
 from demorec.replay import ReplayOptions, open_file, replay_all
-from demorec.robots.assets import asset_path, modules_of_models
+from demorec.robots.assets import asset_path
 from demorec.runs.run_file import load_run_file
 
 ROOT = Path(__file__).parents[2]
@@ -151,20 +151,6 @@ def test_a_link_without_a_mass_is_refused_before_anything_is_made(
     assert not (tmp_path / "run").exists()
 
 
-def test_only_what_can_be_a_module_is_named_as_one() -> None:
-    names = [
-        "lab.arms:a.urdf",
-        "x; rm -rf ~:a.urdf",
-        "\x1b[2J:a.urdf",
-        "demorec:a.urdf",
-        "xarm/a.urdf",
-        "lab.arms:b.obj",
-    ]
-    assert modules_of_models(names) == ("lab.arms",)
-    with pytest.raises(SceneError, match="was not found"):
-        asset_path(names[1])
-
-
 def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
     source = "from demorec.tasks.pick_place import PickPlace\n\n\nclass Mine(PickPlace):\n    speed = 1.0\n"
     (folder / "my_tasks.py").write_text(source)
@@ -230,30 +216,6 @@ def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> 
         look()
     assert len(set(digests)) == 1 + 5
     assert "my_robots" not in sys.modules  # read, not run
-
-
-@pytest.mark.parametrize("has_init", [True, False])
-def test_modules_in_packages_name_models_of_their_package(has_init: bool, folder: Path) -> None:
-    from demorec.robots.assets import allow_models, model_name
-
-    package = folder / "my_lab"
-    (package / "arms").mkdir(parents=True)
-    for place in (package, package / "arms") if has_init else ():
-        (place / "__init__.py").touch()
-    (package / "arms" / "xarm.py").write_text("from my_lab.arms import limits\n")
-    (package / "arms" / "limits.py").write_text("FORCE = 1.0\n")
-    shutil.copy(folder / "xarm6.urdf", package / "xarm6.urdf")
-    name = model_name("../xarm6.urdf", "my_lab.arms.xarm")
-    assert name == "my_lab.arms.xarm:../xarm6.urdf"
-    allow_models(["my_lab"])
-    assert asset_path(name) == package / "xarm6.urdf"
-    with pytest.raises(SceneError, match="lies outside of"):
-        asset_path("my_lab.arms.xarm:../../xarm6.urdf")
-    before = own_versions(["my_lab.arms.xarm"])
-    (package / "arms" / "limits.py").write_text("FORCE = 2.0\n")
-    forget("my_lab", "my_lab.arms")
-    assert own_versions(["my_lab.arms.xarm"]) != before
-    forget("my_lab", "my_lab.arms")
 
 
 @pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])

@@ -21,7 +21,6 @@ from demorec.core.geometry import Pose, quat_from_rotation, rotation_from_quat
 from demorec.core.tables import RENDERERS
 from demorec.episode.scene import Light
 from demorec.render import Renderer
-from demorec.sim.renderers import TinyRenderer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,35 +83,6 @@ def stage(warm_stage: Stage) -> Stage:
     return warm_stage
 
 
-class _WithoutNumPy(TinyRenderer):
-    """TinyRenderer of a PyBullet that was built without NumPy, which gives an image as tuples of numbers."""
-
-    def _connect(self) -> Any:
-        client = super()._connect()
-        draw = client.getCameraImage
-
-        def image(*args: Any, **options: Any) -> tuple[Any, ...]:
-            return tuple(
-                tuple(part.ravel().tolist()) if isinstance(part, np.ndarray) else part
-                for part in draw(*args, **options)
-            )
-
-        client.getCameraImage = image
-        return client
-
-
-def test_a_pybullet_without_numpy_draws_the_same() -> None:
-    client = scenes.connect()
-    scenes.add(client, "box", (0.2, 0.2, 0.2))
-    with TinyRenderer() as usual, _WithoutNumPy() as without:
-        expected, found = (_render(renderer, client, scenes.camera(80, 60)) for renderer in (usual, without))
-    client.disconnect()
-    for name in ("color", "depth", "segmentation"):
-        assert getattr(found, name).dtype == getattr(expected, name).dtype
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    assert len(np.unique(found.segmentation)) == 2
-
-
 def tilted(position: tuple[float, float, float]) -> Pose:
     axis = np.array([0.3, -0.5, 0.2])
     c = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -141,15 +111,6 @@ def test_pictures_have_the_promised_shapes(stage: Stage, width: int, height: int
     images = scenes.draw(stage.renderer, stage.client)["front"]
     assert images.depth is None
     assert images.segmentation is None
-
-
-def test_several_cameras_come_in_order(stage: Stage) -> None:
-    scenes.add(stage.client, "box", (0.2, 0.2, 0.2))
-    one, two = scenes.camera(name="b"), scenes.camera(64, 48, name="a")
-    stage.renderer.setup(scenes.setup(stage.client, one, two))
-    images = scenes.draw(stage.renderer, stage.client)
-    assert list(images) == ["b", "a"]
-    assert images["a"].color.shape == (48, 64, 3)
 
 
 SHAPES: list[tuple[str, tuple[float, ...], Any]] = [
@@ -335,14 +296,6 @@ def test_impossible_cameras_are_named(stage: Stage, changes: dict[str, Any], wor
     scenes.add(stage.client, "box", (0.2, 0.2, 0.2))
     with pytest.raises(RenderError, match=words):
         _render(stage.renderer, stage.client, scenes.camera(**changes))
-
-
-def test_closing_twice_is_harmless() -> None:
-    for name in RENDERERS.names():
-        if name != "egl":
-            renderer = RENDERERS.load(name)()
-            renderer.close()
-            renderer.close()
 
 
 @pytest.mark.parametrize("antialias", [True, False])

@@ -76,12 +76,6 @@ def test_another_final_state_is_found(recorded: Path, tmp_path: Path) -> None:
     assert report.first_difference == (report.num_steps, "the final state")
 
 
-def test_states(recorded: Path) -> None:
-    report = _replay(recorded, states=True)
-    assert report.is_identical
-    assert report.success is None
-
-
 @pytest.mark.slow
 def test_noise_delay_and_rate_change_the_motion(recorded: Path) -> None:
     plain = _replay(recorded)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,10 @@ from support.check import checked, simulate
 from support.commands import exit_code
 
 from demorec.core.errors import ConfigError
-from demorec.core.geometry import Pose
 from demorec.mcap import SimulatedRecording
 from demorec.render.painter import WarmRenderer
 from demorec.replay.free_camera import read_cameras
-from demorec.replay.rerender import RerenderOptions, SceneView, rerender, view_behaviour
+from demorec.replay.rerender import RerenderOptions, rerender
 
 SIDE = """
 [side]
@@ -73,20 +71,6 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
             for a, b in zip(first.images("front"), last.images("front"), strict=True)
         ]
     assert max(off) <= 2  # poses may differ in their last bit
-
-
-def test_a_new_camera_has_no_calibration_error(filmed: Path) -> None:
-    """Though it has the name of one that had."""
-    with SimulatedRecording(filmed) as recording:
-        info = recording.info
-    names = ("front", "wrist", "wrist_2")
-    values = {f"calibration_{name}_{what}": 0.001 for name in names for what in ("x", "y", "z", "angle")}
-    info = replace(info, behaviour={"speed": 1.0, **values})
-    view = SceneView(scene=info.scene, true_cameras=info.scene.cameras, true_from_recorded={"wrist": Pose()})
-    assert view_behaviour(info, view) == {
-        "speed": 1.0,
-        **{f"calibration_wrist_{what}": 0.001 for what in ("x", "y", "z", "angle")},
-    }
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.check import checked, edit_column, level_of, simulate_run
-from support.commands import exit_code
 from support.export import data_table, info
 from support.external import make_external, write_external
 
@@ -18,13 +17,10 @@ from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.features import Vectors
-from demorec.generate.reproduce import read_original
 from demorec.gym_env import DemorecEnv
 from demorec.learn.evaluate.policy import CONFIG_NAME
 from demorec.learn.evaluate.rollouts import settings_for
 from demorec.mcap import SimulatedRecording
-from demorec.replay.demonstration import ReplayOptions
-from demorec.view.from_dataset import open_dataset_episode
 
 STATE = "observation.state"
 SMALL = ExportOptions(verify=False, action="ee_delta", state="joint_ee", features=(STATE,))
@@ -90,29 +86,6 @@ def test_late_actions_are_found_by_the_pose_in_the_state(small: Path) -> None:
     assert level_of(small, "dataset_action_lag", "dataset") == "fail"
 
 
-def test_it_is_shown_as_one_with_joints_alone(run: Path, dataset: Path, tmp_path: Path) -> None:
-    export_lerobot([run], tmp_path / "plain", ExportOptions(verify=False))
-    with open_dataset_episode(dataset, 1) as shown, open_dataset_episode(tmp_path / "plain", 1) as plain:
-        assert shown.simulated is not None
-        assert plain.simulated is not None
-        for name, values in plain.joint_position.items():
-            np.testing.assert_array_equal(shown.joint_position[name], values)
-        np.testing.assert_array_equal(np.asarray(shown.base_from_tcp), np.asarray(plain.base_from_tcp))
-        assert shown.curves.keys() == plain.curves.keys()
-        assert all(np.array_equal(shown.curves[name].values, plain.curves[name].values) for name in plain.curves)
-        for name, poses in plain.object_poses.items():
-            assert np.array_equal(shown.object_poses[name], poses)
-
-
-def test_it_replays(dataset: Path) -> None:
-    from demorec.cli.replay import demonstrations
-
-    options = ReplayOptions()
-    joints = [each.joint_position.shape[1] for each in demonstrations([dataset], options)]
-    assert joints == [7, 7]
-    assert exit_code("replay", dataset, "--episodes", "1") == 0
-
-
 def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path) -> None:
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
     export_lerobot([first], tmp_path / "one", SMALL)
@@ -136,12 +109,6 @@ def test_a_policy_tells_which_state_it_takes(length: int, kind: str, tmp_path: P
     assert settings_for(tmp_path, GenerateConfig(cameras=()), action="ee_delta").state == kind
 
 
-def test_a_policy_is_given_what_else_it_takes(tmp_path: Path) -> None:
-    inputs = {name: {"type": "STATE", "shape": [6]} for name in ("observation.wrench", STATE)}
-    (tmp_path / CONFIG_NAME).write_text(json.dumps({"type": "act", "input_features": inputs}))
-    assert settings_for(tmp_path, GenerateConfig(cameras=()), action="joint").sensed == ("observation.wrench",)
-
-
 def test_lerobot_is_told_of_the_state() -> None:
     from demorec.lerobot_env import DemorecEnvConfig
 
@@ -159,13 +126,6 @@ def test_states_of_two_kinds_do_not_go_into_one_dataset(run: Path, dataset: Path
     with pytest.raises(ConfigError, match=STATE):
         export_lerobot([run], dataset, ExportOptions(verify=False, append=True, allow_duplicates=True))
     assert np.array_equal(states(dataset), before)
-
-
-def test_the_dataset_tells_how_to_make_it_again(dataset: Path) -> None:
-    original = read_original(dataset)
-    assert original.export is not None
-    assert original.export.state == "joint_ee"
-    assert "--state joint_ee" in (dataset / "README.md").read_text()
 
 
 def test_the_state_of_a_external_episode_stays_as_it_came(tmp_path: Path) -> None:

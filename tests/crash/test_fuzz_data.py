@@ -20,7 +20,7 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> FuzzedData:
 
 @pytest.mark.filterwarnings("ignore")
 def test_a_few_hundred_inputs(fuzzed: FuzzedData) -> None:
-    results = results_here(fuzzed, range(150))
+    results = results_here(fuzzed, range(190))
     assert min(results["done"], results["refused"]) > 30, results
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from demorec.sources.clock import MISSING, NS, Chosen, choose, grid, sampled
+from demorec.sources.clock import MISSING, Chosen, choose, sampled
 
 TIMES = st.lists(st.integers(0, 10**6), min_size=1, max_size=30, unique=True).map(sorted)
 ROWS = st.lists(st.integers(-10, 10**6 + 10), min_size=1, max_size=30, unique=True).map(sorted)
@@ -69,17 +69,3 @@ def test_quaternions_against_scipy(seed: int, fraction: float) -> None:
     mixed = sampled(values, chosen, unit="", quaternions=(0,))[0]
     expected = Slerp([0, 1], pair)([fraction])
     assert (Rotation.from_quat(mixed).inv() * expected[0]).magnitude() < 1e-6
-
-
-def test_one_message_is_taken_to_the_bit() -> None:
-    values = np.array([[0.1], [np.pi]], dtype=np.float32)
-    chosen = choose(np.array([0, 10]), np.array([10]), "linear")
-    assert sampled(values, chosen, unit="rad", quaternions=()).tobytes() == values[1:].tobytes()
-
-
-@given(st.integers(1, 1000), st.integers(0, 20 * NS))
-def test_grid_never_drifts(fps: int, length: int) -> None:
-    rows = grid(5, 5 + length, fps)
-    assert rows[0] == 5
-    assert rows[-1] <= 5 + length < rows[-1] + NS // fps + 1
-    assert np.all(np.abs((rows - 5) - np.arange(len(rows)) * (NS / fps)) <= 1)

@@ -18,7 +18,6 @@ from support import bags
 from support.bags import EPOCH_NS, Note
 
 from demorec.cli import main
-from demorec.sources.words import quoted
 
 TEXTS = st.text(min_size=1, max_size=12)
 ODD = [
@@ -103,15 +102,3 @@ def test_messages_of_any_shape_are_suggested_or_left_out(messages: list[dict[str
                 writer.add_message(channel, EPOCH_NS + number, json.dumps(message).encode(), EPOCH_NS + number)
             writer.finish()
         tomllib.loads(_suggestion(bag))
-
-
-@given(st.text())
-def test_a_text_comes_back_from_toml(text: str) -> None:
-    line = quoted(text)
-    assert tomllib.loads(f"x = {line}")["x"] == text
-    assert line.isprintable()
-
-
-def test_half_a_character_becomes_a_replacement() -> None:
-    """JSON and file names may hold surrogates, TOML cannot."""
-    assert tomllib.loads(f"x = {quoted('a' + chr(0xDC80))}")["x"] == "a\ufffd"

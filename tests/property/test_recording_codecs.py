@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap_ros2._dynamic import generate_dynamic
-from support.present import present
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
@@ -146,19 +144,6 @@ def test_primitives_cover_the_robot_and_little_more(name: str) -> None:
     assert sum(primitive.volume for primitive in primitives) < 2.2 * hull
 
 
-def test_a_box_is_a_box_and_a_ball_a_ball() -> None:
-    box = trimesh.creation.box((0.1, 0.2, 0.3))
-    (found,) = fit_primitives(np.asarray(box.vertices), np.asarray(box.faces))
-    assert found.kind == "box"
-    assert np.allclose(found.size, (0.1, 0.2, 0.3))
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
-    assert fit_primitives(np.asarray(ball.vertices), np.asarray(ball.faces), max_parts=1)[0].kind == "sphere"
-    tube = trimesh.creation.cylinder(0.05, 0.4)
-    (found,) = fit_primitives(np.asarray(tube.vertices), np.asarray(tube.faces))
-    assert (found.kind, found.axis) == ("cylinder", 2)
-    assert np.allclose(found.size, (0.05, 0.4), atol=1e-3)
-
-
 def test_descriptions_are_urdf_that_pybullet_loads(tmp_path: Path) -> None:
     pybullet = pytest.importorskip("pybullet")
     client = pybullet.connect(pybullet.DIRECT)
@@ -180,30 +165,6 @@ def test_descriptions_are_urdf_that_pybullet_loads(tmp_path: Path) -> None:
             assert len(pybullet.getVisualShapeData(body_index, physicsClientId=client)) >= 1
     finally:
         pybullet.disconnect(client)
-
-
-def test_a_larger_robot_is_described_larger() -> None:
-    small, large = (robot_description("franka_panda/panda.urdf", scale) for scale in (1.0, 2.0))
-    origins = [
-        [
-            [float(value) for value in present(joint.find("origin")).attrib["xyz"].split()]
-            for joint in ET.fromstring(text).findall("joint")
-        ]
-        for text in (small, large)
-    ]
-    assert np.allclose(2 * np.array(origins[0]), origins[1], atol=1e-4)
-    assert np.array(origins[0]).max() > 0.3
-    assert small.count("<visual") == large.count("<visual")
-
-
-def test_a_body_of_every_file_is_described() -> None:
-    for shape in (
-        Shape(kind="urdf", size=(0.1, 0.1, 0.1), file="duck_vhacd.urdf"),
-        Shape(kind="mesh", size=(0.1, 0.1, 0.1), file="duck.obj", scale=0.1),
-    ):
-        text = body_description(Body(name="duck", role="object", shape=shape, world_from_body=Pose()))
-        assert "<visual" in text
-        assert "mesh" not in text
 
 
 def test_pngs_of_others_are_refused() -> None:

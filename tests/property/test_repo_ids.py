@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 
-import pytest
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils._validators import validate_repo_id
 from hypothesis import given
@@ -30,9 +29,3 @@ def test_what_is_accepted_is_what_the_hub_accepts(name: str) -> None:
         assert refused or not name.isascii()
     else:
         assert not refused
-
-
-@pytest.mark.parametrize("name", ["me/cubes", "local/pick_place", "Foo-BAR_foo/bar.123", "a/b"])
-def test_usual_names_are_accepted(name: str) -> None:
-    check_repo_id(name)
-    validate_repo_id(name)

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.core.own_versions import plain_differences
 from demorec.generate.run import Schedule
 from demorec.runs.run_file import Attempt, RunFile
 
@@ -74,13 +73,3 @@ def test_every_order_and_every_interruption_come_to_the_same_attempts(outcomes: 
     complete = run.with_attempts(line(*key, success) for key, success in made.items())
     assert complete.is_complete
     assert set(complete.given_up) == {i for i, of_episode in enumerate(outcomes) if not any(of_episode)}
-
-
-def test_differences_name_every_value_that_differs_and_only_those() -> None:
-    there = {"seed": 0, "cameras": ["front"], "video": {"codec": "h264", "gop": 2}}
-    here = {"seed": 1, "cameras": ("front",), "video": {"codec": "av1", "gop": 2}, "new": 3}
-    assert plain_differences(there, here) == (
-        "seed is 0 there and 1 here",
-        "video codec is h264 there and av1 here",
-        "new is nothing there and 3 here",
-    )

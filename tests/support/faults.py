@@ -157,8 +157,3 @@ def noisy(rows: Rows) -> Rows:
     """A tenth of the range of noise."""
     rng = np.random.default_rng(1)
     return np.asarray(rows + rng.normal(0.0, 0.1, rows.shape) * np.ptp(rows, axis=0))
-
-
-def thousandfold(rows: Rows) -> Rows:
-    """Another unit."""
-    return rows * 1000.0

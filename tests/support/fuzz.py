@@ -26,6 +26,7 @@ from typing import Protocol, Self
 
 from demorec.cli import COMMANDS, main, parse_command
 from demorec.core.errors import DemorecError
+from demorec.core.text import printable
 
 if __name__ != "__main__":
     from support.commands import MOST_BYTES, Told
@@ -132,11 +133,14 @@ def results_here(fuzzed: Fuzzed, numbers: Iterable[int]) -> Counter[str]:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
                 parse_command(COMMANDS.load(name), arguments, prog=f"demorec {name}").run()
             results["done"] += 1
-        except DemorecError:
-            results["refused"] += 1
+        except DemorecError as error:
+            said.write(str(error))
+            results["refused" if 0 < len(str(error)) < 4000 else "refused without words, or with too many"] += 1
         except Exception as error:
             raise AssertionError(f"case {number}, {what}: demorec {name} {' '.join(arguments)}") from error
+        assert all(printable(line) == line for line in said.getvalue().split("\n")), said.getvalue()
         fuzzed.clear()
+    assert results.keys() <= {"done", "refused"}, results
     return results
 
 

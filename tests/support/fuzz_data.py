@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import random
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -119,7 +121,9 @@ class FuzzedData:
         commands = (
             ["info", root], ["info", root], ["import", "lerobot", root, "--out", self.folder / "out"],
             ["check", root, "--only", *_CHECKS], ["report", root, "--out", self.folder / "out.html"],
-            ["export", "lerobot", self._good, "--out", root, "--append", "--no-verify"],
+            ["export", "lerobot", self._good, "--out", root, "--append", "--no-verify"], ["replay", root],
+            ["view", root, "--save", self.folder / "out.rrd"],
+            ["reproduce", root, "--out", self.folder / "out", "--workers", "0"],
         )  # fmt: skip
         return what, list(map(str, chance.choice(commands)))
 
@@ -175,15 +179,31 @@ class FuzzedData:
             data = json.loads(self._metadata[name][key])
             what = f"{name}: {_change_json(data, chance)}"
             path.write_bytes(rewritten(self._good, change={name: {key: json.dumps(data)}}))
+        elif chance.random() < 0.5:
+            with SimulatedRecording(self._good) as recording:
+                wanted = chance.choice(sorted(recording.topics))
+            share, what = chance.choice((0.05, 1.0)), f"messages of {wanted}"
+
+            def spoilt(topic: str, data: bytes) -> bytes:
+                return _change_message(data, chance) if topic == wanted and chance.random() < share else data
+
+            path.write_bytes(rewritten(self._good, messages=spoilt))
         else:
             what = "bytes"
             source = chance.choice((self._good, self._external))
             path.write_bytes(changed_bytes(source.read_bytes(), chance))
+        lerobot = ["export", "lerobot", path, "--out", self.folder / "out", "--no-verify"]
         commands = (
-            ["info", path], ["info", path], ["check", path], ["report", path, "--out", self.folder / "out.html"],
-            ["export", "lerobot", path, "--out", self.folder / "out", "--no-verify"],
+            ["info", path], ["info", path, "--json"], ["check", path],
+            ["report", path, "--out", self.folder / "out.html"],
+            ["check", path, "--no-pictures", "--coverage-picture", self.folder / "out.png"],
+            ["view", path, "--save", self.folder / "out.rrd"],
+            ["view", path, self._good, "--compare", "--save", self.folder / "out.rrd"],
+            [*lerobot, "--privileged"], [*lerobot, "--action", "ee_delta"],
             ["export", "hdf5", path, "--out", self.folder / "out.hdf5"],
-            ["recover", path, "--out", self.folder / "out.mcap"],
+            ["recover", path, "--out", self.folder / "out.mcap"], ["replay", path], ["replay", path, "--states"],
+            ["render", path, "--cameras", "front", "--width", "32", "--height", "32", "--workers", "1",
+             "--out", self.folder / "out.mcap"],
         )  # fmt: skip
         return f"recording {what}", list(map(str, chance.choice(commands)))
 
@@ -290,6 +310,23 @@ def _change_json(data: Any, chance: random.Random) -> str:
                 parent.insert(0, copy.deepcopy(parent[key]))
     shown = parent.get(key) if isinstance(parent, dict) else parent
     return f"{key}: {repr(shown)[:100]}"
+
+
+def _change_message(data: bytes, chance: random.Random) -> bytes:
+    """A message cut off, longer, empty, or with other numbers in it."""
+    kind = chance.randrange(6)
+    if kind == 0:
+        return data[: chance.randrange(len(data) + 1)]
+    if kind == 1:
+        return data + chance.randbytes(chance.randrange(1, 40))
+    if kind == 2:
+        return b""
+    at = 4 + 8 * chance.randrange(max(1, (len(data) - 4) // 8))
+    odd = chance.choice((0.0, -1.0, math.nan, math.inf, -math.inf, 1e300, 1e-310))
+    word = struct.pack("<d", odd) if kind == 3 else struct.pack("<q", chance.choice((-1, 2**62, -(2**62), 0, 5)))
+    if kind == 5:
+        word = chance.randbytes(4)
+    return data[:at] + word + data[at + len(word) :]
 
 
 def _change_table(table: pa.Table, chance: random.Random) -> tuple[pa.Table, str]:

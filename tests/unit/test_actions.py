@@ -22,16 +22,6 @@ def world() -> Iterator[World]:
         yield made
 
 
-def test_recorded_targets_are_sent_as_they_are(world: World) -> None:
-    far = np.append(np.full(7, 100.0), 5.0)
-    sent = ActionDecoder(world, "joint", is_limited=False).command(far)
-    assert np.array_equal(sent.joint_target, far[:7])
-    assert sent.gripper_target == 5.0
-    limited = ActionDecoder(world, "joint").command(far)
-    assert np.all(limited.joint_target - world.arm.target <= np.array(world.robot.velocity_limit) / world.fps + 1e-12)
-    assert limited.gripper_target == world.robot.gripper.max_width
-
-
 @pytest.mark.parametrize("is_limited", [True, False])
 @pytest.mark.parametrize("kind", ["ee", "ee_delta"])
 def test_a_pose_out_of_reach_keeps_the_targets_and_is_counted(

@@ -6,26 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from demorec.core.geometry import Pose
 from demorec.episode.camera_error import error_values, told_error
-
-small = st.floats(-0.3, 0.3)
-
-
-@given(position=st.tuples(small, small, small), turn=st.tuples(small, small, small), flip=st.booleans())
-def test_errors_come_back(position: tuple[float, ...], turn: tuple[float, ...], flip: bool) -> None:
-    quat = np.array([*turn, 1.0]) / math.hypot(*turn, 1.0)
-    error = Pose(position=np.array(position), quat_xyzw=-quat if flip else quat)
-    told = told_error("wrist", error_values({"front": Pose(), "wrist": error}))
-    if np.array_equal(error.vector(), Pose().vector()):
-        assert told is None
-    else:
-        assert told is not None
-        np.testing.assert_allclose(told.matrix(), error.matrix(), atol=1e-12)
-    assert told_error("front", error_values({"front": Pose(), "wrist": error})) is None
 
 
 @pytest.mark.parametrize(

@@ -50,12 +50,6 @@ def test_a_pad_against_the_side_of_a_body(kind: ShapeKind, size: tuple[float, ..
     assert depth(PAD, pad, Shape(kind=kind, size=size), Pose()) == pytest.approx(deep, abs=1e-12)
 
 
-def test_every_frame_is_measured_by_itself() -> None:
-    pads = poses(*(at(y=0.025 + 0.007 - deep) for deep in (-0.001, 0.0, 0.002)))
-    found = depth_in(Convex.of_shape(PAD), pads, Convex.of_shape(BOX), poses(*[Pose()] * 3))
-    assert found == pytest.approx([-0.001, 0.0, 0.002], abs=1e-12)
-
-
 @given(x=small, y=small, z=small, yaw=turn, far=turn, turned=turn)
 def test_a_rigid_motion_of_both_changes_nothing(
     x: float, y: float, z: float, yaw: float, far: float, turned: float
@@ -89,8 +83,3 @@ def test_bullet_finds_the_same_depth_of_two_boxes(
     client.performCollisionDetection()
     judged = -min(point[8] for point in client.getClosestPoints(pad, box, 0.0))
     assert depth(PAD, pose, BOX, Pose()) == pytest.approx(judged, abs=1e-5)
-
-
-def test_a_hull_is_no_shape_of_a_scene() -> None:
-    with pytest.raises(ValueError, match="'mesh' is no solid"):
-        Convex.of_shape(Shape(kind="mesh", size=(0.1, 0.1, 0.1), file="duck.obj"))

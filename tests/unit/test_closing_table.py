@@ -43,12 +43,6 @@ def test_modules_of_the_users_own_are_allowed_in_them() -> None:
         assert shlex.split(line)[2:] == ["/data", "--allow", "mytask", "--allow", "lab.arms"]
 
 
-def test_a_program_that_is_not_on_the_path_is_given_by_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    for line in next_commands(result_of(Path("/data")), EXPORT):
-        assert Path(shlex.split(line)[0]).is_file()
-
-
 @pytest.mark.parametrize("without", ["a dataset", "pictures", "torch"])
 def test_no_training_is_offered_that_would_not_start(monkeypatch: pytest.MonkeyPatch, without: str) -> None:
     if without == "torch":

@@ -24,7 +24,6 @@ from support.external import (
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
-from demorec.episode.episode import Outcome
 from demorec.episode.external import (
     NO_PICTURE,
     Camera,
@@ -34,9 +33,7 @@ from demorec.episode.external import (
     SampledFrame,
     SourceFile,
 )
-from demorec.episode.validity import find_problems
-from demorec.mcap import EpisodeWriter, Recording, SimulatedRecording, recover
-from demorec.mcap.transforms import JointPositions
+from demorec.mcap import EpisodeWriter, Recording, recover
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 45, 100])
@@ -121,44 +118,6 @@ def test_packets_that_came_coded_stay_byte_for_byte(tmp_path: Path, codec: Liter
     assert all(abs(int(picture.mean()) - 4 * index) < 6 for index, picture in enumerate(pictures))
 
 
-def test_pictures_need_not_be_held(tmp_path: Path) -> None:
-    """A camera may be quicker than the frames."""
-    episode = make_external(num_frames=2, cameras=(WRIST,))
-    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        for index in range(9):
-            writer.picture("wrist", index, episode.pictures["wrist"][0][1])
-        for number, frame in zip((3, 8), episode.frames, strict=True):
-            writer.write(replace(frame, pictures={"wrist": number}))
-        writer.finish(episode.outcome)
-    with Recording(tmp_path / "a.mcap") as recording:
-        columns = recording.columns()
-        assert columns.pictures["wrist"].tolist() == [3, 8]
-        assert columns.picture_stamps["wrist"].tolist() == list(range(9))
-
-
-def test_a_digest_is_of_the_content(tmp_path: Path) -> None:
-    def digest(name: str, **changes: Any) -> str:
-        with Recording(write_external(tmp_path / name, make_external(num_frames=5, **changes))) as recording:
-            return recording.digest()
-
-    assert digest("a.mcap") == digest("b.mcap")
-    assert len({digest("c.mcap"), digest("d.mcap", success=None), digest("e.mcap", urdf="")}) == 3
-
-
-def test_the_description_says_where_it_came_from(tmp_path: Path) -> None:
-    origin = Origin(kind="import", files=(SourceFile(name="a.mcap", sha256="00"),), mapping_digest="11")
-    episode = make_external(num_frames=3)
-    path = write_external(tmp_path / "a.mcap", replace(episode, info=replace(episode.info, origin=origin)))
-    with Recording(path) as recording:
-        assert recording.info.origin == origin
-
-
-def test_what_needs_a_scene_says_why_it_cannot_be(tmp_path: Path) -> None:
-    path = write_external(tmp_path / "a.mcap")
-    with pytest.raises(RecordingError, match="recorded by another robot or program and has no scene"):
-        SimulatedRecording(path)
-
-
 def _frame(**changes: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
     return lambda writer, frame: writer.write(replace(frame, **changes))
 
@@ -236,10 +195,6 @@ def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str,
     assert not list(tmp_path.iterdir())
 
 
-def test_a_good_description_has_nothing_wrong() -> None:
-    assert find_problems(make_external().info) == []
-
-
 def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) -> None:
     episode = make_external(num_frames=100)
     with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
@@ -285,19 +240,3 @@ def test_what_a_killed_import_left_is_made_again(tmp_path: Path) -> None:
         write_pictures_and_frames(writer, episode)
     with pytest.raises(ConfigError, match="unfinished recording"):  # of the Recorder: nobody can make it again
         write_external(tmp_path / "a.mcap", episode)
-
-
-def test_joints_are_told_in_radians() -> None:
-    state = replace(STATE, units=("deg", "rad", ""))
-    positions = JointPositions((ACTION, state))
-    assert positions.joints == ("shoulder", "elbow")
-    found = positions.of({"observation.state": np.array([[180.0, 1.0, 7.0]]), "action": np.zeros((1, 3))})
-    assert found.tolist() == [[np.pi, 1.0]]
-
-
-def test_an_outcome_of_another_length_is_refused(tmp_path: Path) -> None:
-    episode = make_external(num_frames=3)
-    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        write_pictures_and_frames(writer, episode)
-        with pytest.raises(RecordingError, match="The outcome has 4 frames, the recording 3"):
-            writer.finish(Outcome(num_frames=4))

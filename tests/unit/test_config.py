@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,11 +12,8 @@ from demorec.core.config import (
     VideoConfig,
     _deciding_versions,
     deciding_versions,
-    parse_config,
-    read_toml,
 )
 from demorec.core.errors import ConfigError
-from demorec.episode.episode import frame_time_ns
 
 
 @pytest.mark.parametrize(
@@ -53,46 +49,6 @@ def test_impossible_values_are_refused(change: dict[str, Any], message: str) -> 
         GenerateConfig(**change).validate()
 
 
-def test_the_defaults_are_possible() -> None:
-    GenerateConfig().validate()
-
-
-@pytest.mark.parametrize("fps", [1, 3, 48, 240])
-def test_every_divisor_of_the_physics_rate_is_possible(fps: int) -> None:
-    GenerateConfig(fps=fps).validate()
-
-
-def test_no_cameras() -> None:
-    assert GenerateConfig(cameras=("none",)).cameras == ()
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("seed = 3\nspeed = 4", "speed"),
-        ("seed = 'three'", "seed"),
-        ("seed = ", "no valid TOML"),
-    ],
-)
-def test_broken_config_files_are_named(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "run.toml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=message):
-        parse_config(read_toml(path), GenerateConfig, source=str(path))
-
-
-def test_a_missing_config_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_toml(tmp_path / "none.toml")
-
-
-def test_a_config_file_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "run.toml"
-    path.write_text('seed = 3\ncameras = ["wrist"]\n[video]\ncodec = "av1"\n')
-    config = parse_config(read_toml(path), GenerateConfig, source=str(path))
-    assert (config.seed, config.cameras, config.video.codec) == (3, ("wrist",), "av1")
-
-
 def test_the_fork_in_pybullets_place_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def version(name: str) -> str:
         if name == "pybullet":
@@ -102,7 +58,3 @@ def test_the_fork_in_pybullets_place_is_named(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("demorec.core.config.version", version)
     monkeypatch.setattr("demorec.core.config._deciding_versions", _deciding_versions.__wrapped__)
     assert deciding_versions()["pybullet"] == "3.2.8 (pybullet-arm64)"
-
-
-def test_frame_times_are_exact_integers() -> None:
-    assert [frame_time_ns(i, 30) for i in (0, 1, 2, 3, 30)] == [0, 33_333_333, 66_666_667, 100_000_000, 1_000_000_000]

@@ -19,7 +19,7 @@ from support.check import level_of
 from support.export import data_table, export
 from support.external import TOP, URDF, Episode, make_external, write_external
 
-from demorec.core.errors import ExportError, MissingDependencyError
+from demorec.core.errors import MissingDependencyError
 from demorec.core.plain import digest, from_json, to_json
 from demorec.datasets.lerobot.robots import RobotRecord, portable_urdf, read_robot
 from demorec.mcap import SimulatedRecording
@@ -285,9 +285,3 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
         assert played.simulated is None
         assert 'xyz="0.4 0 0"' in str(played.robot_description)
     assert level_of(tmp_path / "d", "dataset_robots", "dataset") == "pass"
-
-
-@pytest.mark.parametrize("name", ["", "../../secret", "0123456789abcdef"])
-def test_a_name_that_is_none_is_refused(name: str, exported: Path) -> None:
-    with pytest.raises(ExportError, match="description of the robot cannot be read"):
-        read_robot(exported, name)

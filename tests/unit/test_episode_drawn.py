@@ -36,8 +36,3 @@ def test_of_an_older_recording_the_offset_is_taken_back(index: int) -> None:
         # All but what the unknown rotation turns the offset by.
         assert np.linalg.norm(after.position - truth.position) <= angle * offset + 1e-9
         assert angle_between(after, truth) == pytest.approx(angle)
-
-
-def test_cameras_without_an_error_stay() -> None:
-    info = prepare(EpisodePlan(config=GenerateConfig(variation="mild"), episode_index=0)).info
-    assert drawable_scene(info) == info.scene

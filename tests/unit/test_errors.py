@@ -12,7 +12,7 @@ import av
 import pytest
 from support.present import present
 
-from demorec.core.errors import RecordingError, ResourceError, in_words, resource_error
+from demorec.core.errors import RecordingError, in_words, resource_error
 
 
 @pytest.mark.parametrize(
@@ -57,11 +57,6 @@ def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(
 )
 def test_every_other_error_is_left_alone(error: Exception) -> None:
     assert resource_error(error) is None
-
-
-def test_without_a_file_nothing_is_said_of_one() -> None:
-    assert str(resource_error(MemoryError())).endswith("(ulimit -v).")
-    assert ResourceError("x").exit_code == 1
 
 
 def _raised(code: str) -> Exception:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,11 +16,6 @@ def test_the_interval_is_wilsons(counts: tuple[int, int]) -> None:
     k, n = counts
     expected = binomtest(k, n).proportion_ci(0.95, method="wilson")
     assert Rate(successes=k, trials=n).interval == pytest.approx((expected.low, expected.high), abs=1e-9)
-
-
-def test_nothing_tried_is_nothing_known() -> None:
-    assert Rate(successes=0, trials=0).interval == (0.0, 1.0)
-    assert math.isnan(Rate(successes=0, trials=0).value)
 
 
 @given(st.integers(0, 60), st.integers(0, 60))
@@ -40,11 +33,6 @@ def test_newcombes_interval_of_a_difference() -> None:
     assert comparison.interval == pytest.approx((0.0524, 0.3339), abs=5e-5)
 
 
-def test_pairs_are_the_scenes_that_both_tried() -> None:
-    comparison = compare({0: True, 1: True, 2: False, 9: True}, {0: True, 1: False, 2: True, 3: True})
-    assert (comparison.only_first, comparison.only_second) == (1, 1)
-
-
 def test_cells_cut_each_range_in_equal_parts() -> None:
     factors = [{"x": float(x), "same": 1.0} for x in range(10)]
     found = cells(factors, [x >= 6 for x in range(10)], parts=3)
@@ -52,7 +40,3 @@ def test_cells_cut_each_range_in_equal_parts() -> None:
     assert [(c.low, c.high) for c in found] == [(0.0, 3.0), (3.0, 6.0), (6.0, 9.0)]
     assert [(c.rate.successes, c.rate.trials) for c in found] == [(0, 3), (0, 3), (4, 4)]
     assert np.sum([c.rate.trials for c in found]) == 10
-
-
-def test_a_rate_without_trials_has_no_percentage() -> None:
-    assert str(Rate(successes=0, trials=0)) == "0/0"

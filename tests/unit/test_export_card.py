@@ -79,34 +79,6 @@ def test_the_flags_of_an_export_are_parsed_to_it(language: tuple[str, ...] | Non
     assert parsed.options == options
 
 
-def test_language_columns_are_explained(tmp_path: Path) -> None:
-    export(make_run(tmp_path / "run", (6,)), tmp_path / "d", language=("subtask",))
-    rows = [line for line in (tmp_path / "d" / "README.md").read_text().splitlines() if line.startswith("| `language_")]
-    assert [row.split("`")[1] for row in rows] == ["language_persistent", "language_events"]
-    assert "until the next one of its style" in rows[0]
-    assert "at this row alone" in rows[1]
-
-
-def test_an_appended_dataset_has_no_such_commands(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", (6, 5))
-    export(run, tmp_path / "d", episodes="0")
-    export(run, tmp_path / "d", episodes="1", append=True)
-    assert "Made by these commands" not in (tmp_path / "d" / "README.md").read_text()
-
-
-def test_an_edited_card_stays_when_the_dataset_is_appended_to(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", (6, 5, 4), cameras=())
-    card, beside = tmp_path / "d" / "README.md", tmp_path / "d" / "demorec" / "README.md"
-    export(run, tmp_path / "d", episodes="0")
-    export(run, tmp_path / "d", episodes="1", append=True)
-    assert "2 scripted demonstrations" in card.read_text()  # nobody has edited it, so it is renewed
-    edited = card.read_text().replace("scripted", "beautiful")
-    card.write_text(edited)
-    export(run, tmp_path / "d", episodes="2", append=True)
-    assert card.read_text() == edited
-    assert "3 scripted demonstrations" in beside.read_text()
-
-
 def test_an_edited_card_stays_when_the_dataset_is_replaced(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (6, 5), cameras=())
     card, beside = tmp_path / "d" / "README.md", tmp_path / "d" / "demorec" / "README.md"

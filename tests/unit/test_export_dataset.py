@@ -16,10 +16,9 @@ from mcap.reader import make_reader
 from support.export import data_table, episode_rows, export, files_of, info, make_run
 from support.recording import make_episode, write_episode
 
-import demorec.datasets.lerobot.writer
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError, RecordingError
-from demorec.datasets.lerobot import ExportOptions, dataset_digest, is_dataset
+from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.inspect import attempt_counts
 from demorec.datasets.options import parse_episodes
 from demorec.mcap import SimulatedRecording
@@ -87,13 +86,6 @@ def test_a_dataset_holds_what_was_recorded(run: Path, tmp_path: Path) -> None:
         assert next(found, None) is None
 
 
-def test_two_exports_are_the_same_to_the_byte(run: Path, tmp_path: Path) -> None:
-    first, second = export(run, tmp_path / "a"), export(run, tmp_path / "b", workers=2)
-    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
-    assert first.digest == second.digest == dataset_digest(tmp_path / "a")
-    assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
-
-
 def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> None:
     whole = export(run, tmp_path / "a").digest
     split = export(run, tmp_path / "b", video_files_mb=0.005, data_files_mb=0.005).digest
@@ -105,34 +97,6 @@ def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> N
     data[-20] ^= 1
     path.write_bytes(data)
     assert dataset_digest(tmp_path / "a") != whole
-
-
-def test_every_kind_of_file_rolls_over_by_itself(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demorec.datasets.lerobot.writer, "_EPISODES_PER_TABLE", 1)
-    out = tmp_path / "d"
-    export(run, out, video_files_mb=0.006, data_files_mb=0.001, files_per_chunk=2)
-    rows = episode_rows(out)
-    assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
-    places = [(row["data/chunk_index"], row["data/file_index"]) for row in rows]
-    assert places == [(0, 0), (0, 1), (1, 0), (1, 1)]
-    for row in rows:
-        path = out / f"data/chunk-{row['data/chunk_index']:03d}/file-{row['data/file_index']:03d}.parquet"
-        assert set(pq.read_table(path).column("episode_index").to_pylist()) == {row["episode_index"]}
-        path = (
-            out
-            / "meta/episodes/chunk-{meta/episodes/chunk_index:03d}/file-{meta/episodes/file_index:03d}.parquet".format(
-                **row
-            )
-        )
-        assert row["episode_index"] in pq.read_table(path).column("episode_index").to_pylist()
-    assert len({row["meta/episodes/file_index"] for row in rows}) > 1
-    files = {
-        (row["videos/observation.images.front/chunk_index"], row["videos/observation.images.front/file_index"])
-        for row in rows
-    }
-    assert len(files) > 1
-    first = [row for row in rows if row["videos/observation.images.front/from_timestamp"] == 0]
-    assert len(first) == len(files)  # time starts anew in each file
 
 
 def test_an_mp4_file_holds_one_set_of_parameters(tmp_path: Path) -> None:
@@ -147,17 +111,6 @@ def test_an_mp4_file_holds_one_set_of_parameters(tmp_path: Path) -> None:
     coding = info(out)["features"]["observation.images.front"]["info"]
     assert coding["video.crf"] is None  # they differ
     assert coding["video.g"] == 2
-
-
-@pytest.mark.parametrize("codec", ["h264", "av1"])
-def test_the_coding_is_told_as_it_is(tmp_path: Path, codec: str) -> None:
-    write_episode(tmp_path / "e.mcap", num_frames=8, cameras=("front",), video=VideoConfig(codec=codec, gop=4, crf=33))  # type: ignore[arg-type]
-    export(tmp_path, tmp_path / "d")
-    coding = info(tmp_path / "d")["features"]["observation.images.front"]["info"]
-    assert (coding["video.codec"], coding["video.g"], coding["video.crf"], coding["video.fps"]) == (codec, 4, 33, 30)
-    with av.open(str(next((tmp_path / "d").rglob("*.mp4")))) as container:
-        stream = container.streams.video[0]
-        assert (stream.codec.canonical_name, stream.pix_fmt) == (codec, coding["video.pix_fmt"])
 
 
 def test_jpeg_recordings_are_transcoded_and_it_is_said(tmp_path: Path) -> None:
@@ -201,16 +154,6 @@ def test_fewer_frames_a_second(run: Path, tmp_path: Path, fps: int, stride: int,
     assert difference < 5 if transcoded else difference == 0
 
 
-def test_failures_only_when_asked_for(run: Path, tmp_path: Path) -> None:
-    report = export(run, tmp_path / "d", include_failures=True)
-    assert (report.num_episodes, report.skipped_failures) == (5, 0)
-    rows = [row["length"] for row in episode_rows(tmp_path / "d")]
-    assert rows == [20, 15, 12, 17, 9]  # the failed attempt stands before the one that succeeded
-    success = data_table(tmp_path / "d").column("next.success").to_pylist()
-    assert sum(success) == 4
-    assert not any(success[35:47])
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -225,26 +168,6 @@ def test_failures_only_when_asked_for(run: Path, tmp_path: Path) -> None:
 )
 def test_episode_ranges(text: str, expected: list[int]) -> None:
     assert [n for n in range(12) if parse_episodes(text)(n)] == list(expected)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        *((text, "0:100") for text in ("a", "1:2:0", "-1", ",", "1;2", "1:2:3:4")),
-        *((text, "ends before it begins") for text in ("5:2", "3:3", "0:2,9:4:2")),
-    ],
-)
-def test_wrong_episode_ranges(text: str, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        ExportOptions(episodes=text).validate()
-
-
-def test_recordings_of_several_runs_go_together(run: Path, tmp_path: Path) -> None:
-    other = make_run(tmp_path / "other", (7,))
-    report = export([run, other / "episodes" / "episode_000000.mcap"], tmp_path / "d")
-    assert (report.num_episodes, report.num_frames) == (5, 68)
-    with pytest.raises(ConfigError, match="given twice"):
-        export([run, recordings(run)[0]], tmp_path / "e")
 
 
 def test_all_differences_are_told_at_once(run: Path, tmp_path: Path) -> None:
@@ -262,12 +185,6 @@ def test_all_differences_are_told_at_once(run: Path, tmp_path: Path) -> None:
     ):
         assert part in text
     assert not (tmp_path / "d").exists()
-
-
-def test_an_empty_folder_is_not_in_the_way(run: Path, tmp_path: Path) -> None:
-    (tmp_path / "d").mkdir()
-    export(run, tmp_path / "d", episodes="0")
-    assert is_dataset(tmp_path / "d")
 
 
 @pytest.mark.parametrize("topic", ["/action", "/camera/wrist/h264"])
@@ -367,13 +284,6 @@ def test_only_the_chosen_features(tmp_path: Path, chosen: tuple[str, ...]) -> No
     assert "observation.ee_pose" not in card
 
 
-def test_recordings_may_differ_in_what_is_left_out(run: Path, tmp_path: Path) -> None:
-    other = make_run(tmp_path / "other", (6,), width=80, height=48)
-    with pytest.raises(ConfigError, match="size of camera front is 80x48"):
-        export([run, other], tmp_path / "d")
-    assert export([run, other], tmp_path / "d", features=("observation.velocity",)).num_episodes == 5
-
-
 def test_append_to_a_damaged_dataset_is_refused(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     export(run, out)
@@ -381,19 +291,6 @@ def test_append_to_a_damaged_dataset_is_refused(run: Path, tmp_path: Path) -> No
     path.write_text(path.read_text().replace('"total_frames": 61', '"total_frames": 60'))
     with pytest.raises(ExportError, match="not whole"):
         export(run, out, append=True)
-
-
-def test_append_to_nothing_makes_a_dataset(run: Path, tmp_path: Path) -> None:
-    assert export(run, tmp_path / "d", append=True).new_episodes == 4
-
-
-def test_a_readme_of_the_user_is_kept(run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "d"
-    export(run, out, episodes="0")
-    (out / "README.md").write_text("mine")
-    export(run, out, episodes="1", append=True)
-    assert (out / "README.md").read_text() == "mine"
-    assert "2 scripted demonstrations" in (out / "demorec" / "README.md").read_text()
 
 
 def test_the_sidecar_tells_what_lerobot_cannot_hold(run: Path, tmp_path: Path) -> None:
@@ -419,57 +316,11 @@ def test_the_sidecar_tells_what_lerobot_cannot_hold(run: Path, tmp_path: Path) -
     assert json.loads((out / "demorec/configs.json").read_text()) == {made.config_digest: made.config}
 
 
-def test_the_card_counts_failed_attempts(run: Path, tmp_path: Path) -> None:
-    export(run, tmp_path / "d", license="mit")
-    text = (tmp_path / "d" / "README.md").read_text()
-    assert "4 of 5 attempts" in text
-    assert "1 failed: distance_to_target in phase place" in text
-    assert "license: mit" in text
-    assert (tmp_path / "d" / "demorec" / "thumbnails.jpg").stat().st_size > 1000
-
-
-def test_depth_is_kept_to_the_step_of_its_codes(tmp_path: Path) -> None:
-    write_episode(tmp_path / "e.mcap", num_frames=6, depth=True)
-    export(tmp_path, tmp_path / "d", depth=True)
-    feature = info(tmp_path / "d")["features"]["observation.images.front_depth"]
-    assert feature["info"]["is_depth_map"] is True
-    assert feature["shape"] == [48, 64, 1]
-    with pytest.raises(ConfigError, match="needs recordings with depth"):
-        export(make_run(tmp_path / "run", (5,)), tmp_path / "e", depth=True)
-
-
 def test_episodes_without_cameras(tmp_path: Path) -> None:
     write_episode(tmp_path / "e.mcap", num_frames=6, cameras=())
     export(tmp_path, tmp_path / "d")
     assert info(tmp_path / "d")["video_path"] is None
     assert not (tmp_path / "d" / "videos").exists()
-
-
-def test_a_single_frame(tmp_path: Path) -> None:
-    write_episode(tmp_path / "e.mcap", num_frames=1)
-    report = export(tmp_path, tmp_path / "d", privileged=True, action="ee_delta")
-    assert report.num_frames == 1
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"append": True, "overwrite": True}, "exclude"),
-        ({"repo_id": "a b"}, "OWNER/NAME"),
-        ({"workers": -1}, "workers"),
-        ({"state": "velocity"}, "joint_ee"),
-    ],
-)
-def test_impossible_options(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        ExportOptions(**options).validate()  # type: ignore[arg-type]
-
-
-def test_no_recordings(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="holds no recording"):
-        export(tmp_path, tmp_path / "d")
-    with pytest.raises(ConfigError, match="There is no such file"):
-        export(tmp_path / "nothing", tmp_path / "d")
 
 
 def test_append_refuses_episodes_that_are_there_already(run: Path, tmp_path: Path) -> None:
@@ -488,11 +339,3 @@ def test_append_refuses_episodes_that_are_there_already(run: Path, tmp_path: Pat
     assert export(copies, out, append=True, allow_duplicates=True).num_episodes == 6
     with pytest.raises(ConfigError, match="belongs to --append"):
         export(run, tmp_path / "e", allow_duplicates=True)
-
-
-def test_append_knows_the_episodes_of_a_dataset_without_a_sidecar(run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "d"
-    export(run, out, episodes=":2")
-    shutil.rmtree(out / "demorec")
-    with pytest.raises(ConfigError, match="has 1 of these episodes already"):
-        export(run, out, append=True, episodes="1:")

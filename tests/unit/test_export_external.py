@@ -156,12 +156,6 @@ def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
         export(run, tmp_path / "d")
 
 
-def test_a_dataset_can_be_appended_to(tmp_path: Path) -> None:
-    export(run_of(tmp_path / "a", complete(num_frames=5)), tmp_path / "d")
-    report = export(run_of(tmp_path / "b", complete(num_frames=7, episode_index=3)), tmp_path / "d", append=True)
-    assert (report.num_episodes, report.num_frames) == (2, 12)
-
-
 def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     from typing import cast
 
@@ -256,23 +250,3 @@ def test_an_episode_without_actions_is_refused(tmp_path: Path) -> None:
     path = write_external(tmp_path / "a.mcap", replace(given, info=info, frames=frames))
     with pytest.raises(ConfigError, match="needs actions"):
         export(path, tmp_path / "d.hdf5", "hdf5")
-
-
-def test_robomimic_reads_it(tmp_path: Path) -> None:
-    """robomimic's own reader, where it is installed: its dependencies need a compiler, so it is none of ours."""
-    dataset = pytest.importorskip("robomimic.utils.dataset", reason="robomimic is not installed")
-    from robomimic.utils import file_utils, obs_utils
-
-    export(run_of(tmp_path / "run", *of_outcomes(True, True)), tmp_path / "d.hdf5", "hdf5")
-    obs_utils.initialize_obs_utils_with_obs_specs({"obs": {"low_dim": ["state"], "rgb": ["top_image"]}})
-    assert file_utils.get_env_metadata_from_dataset(tmp_path / "d.hdf5")["env_name"] == "demorec/collected"
-    read = dataset.SequenceDataset(
-        hdf5_path=str(tmp_path / "d.hdf5"),
-        obs_keys=["state", "top_image"],
-        dataset_keys=["actions", "rewards", "dones"],
-        seq_length=3,
-        load_next_obs=False,
-    )
-    given = make_external(cameras=(TOP,), num_frames=20)
-    expected = np.array([frame.samples[STATE.name].vector for frame in given.frames[1:4]])
-    np.testing.assert_array_equal(read[1]["obs"]["state"], expected)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from support.export import export, make_run
 
-from demorec.cli import main
 from demorec.core.errors import ConfigError
 from demorec.mcap import SimulatedRecording
 
@@ -60,20 +59,6 @@ def test_numbers_are_those_of_the_recording(run: Path, tmp_path: Path) -> None:
             assert observed["object"].shape[1] == len(json.loads(demo["obs/object"].attrs["names"]))
 
 
-def test_names_tell_every_component(run: Path, tmp_path: Path) -> None:
-    export(run, tmp_path / "d.hdf5", "hdf5", action="ee_delta", episodes="0")
-    with h5py.File(tmp_path / "d.hdf5") as file, recording(run, 0) as source:
-        demo = file["data/demo_0"]
-        names = {name: json.loads(demo[name].attrs["names"]) for name in ("actions", "states", "obs/robot0_joint_pos")}
-        assert names["actions"] == ["tcp.dx", "tcp.dy", "tcp.dz", "tcp.rx", "tcp.ry", "tcp.rz", "gripper.width"]
-        assert names["obs/robot0_joint_pos"] == [f"panda_joint{n}.pos" for n in range(1, 8)]
-        columns = source.columns()
-        for body, poses in columns.object_poses.items():
-            number = names["states"].index(f"{body}.x")
-            np.testing.assert_array_equal(demo["states"][:, number : number + 7], poses)
-        assert len(names["states"]) == demo["states"].shape[1]
-
-
 def test_pictures_are_the_decoded_ones(run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d.hdf5", "hdf5", depth=True)
     with h5py.File(tmp_path / "d.hdf5") as file:
@@ -98,22 +83,6 @@ def test_fewer_frames(run: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(demo["actions"][:, :7], columns.action_joint_target[[2, 4]])
         np.testing.assert_array_equal(demo["obs/front_image"][1], source.image("front", 3))
         assert file["data"].attrs["fps"] == 10
-
-
-def test_features_leave_observations_out(run: Path, tmp_path: Path) -> None:
-    export(run, tmp_path / "d.hdf5", "hdf5", features=("observation.images.wrist",))
-    with h5py.File(tmp_path / "d.hdf5") as file:
-        assert set(file["data/demo_0/obs"]) == {"robot0_joint_pos", "robot0_gripper_qpos", "wrist_image"}
-        assert {"actions", "states", "rewards", "dones"} <= set(file["data/demo_0"])
-
-
-def test_failed_attempts_have_no_reward(run: Path, tmp_path: Path) -> None:
-    export(run, tmp_path / "d.hdf5", "hdf5", include_failures=True)
-    with h5py.File(tmp_path / "d.hdf5") as file:
-        demos = [file[f"data/demo_{number}"] for number in range(4)]
-        assert [bool(demo.attrs["success"]) for demo in demos] == [True, False, True, True]
-        assert [demo["rewards"][-1] for demo in demos] == [1, 0, 1, 1]
-        assert [demo["dones"][-1] for demo in demos] == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -207,34 +176,6 @@ def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
     make("later")
     assert (tmp_path / "now.hdf5").read_bytes() == (tmp_path / "later.hdf5").read_bytes()
     assert (tmp_path / "now-timed.hdf5").read_bytes() != (tmp_path / "later-timed.hdf5").read_bytes()
-
-
-@pytest.mark.parametrize(("option", "value"), [("valid_share", 1.0), ("valid_share", -0.1), ("compression", 10)])
-def test_impossible_options(run: Path, tmp_path: Path, option: str, value: float) -> None:
-    with pytest.raises(ConfigError, match=option):
-        export(run, tmp_path / "d.hdf5", "hdf5", **{option: value})
-
-
-def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "d.hdf5"
-    for arguments, code in (
-        (["hdf5", run, "--out", out, "--compression", "0", "--valid-share", "0.5"], 0),
-        (["hdf5", run, "--out", out], 2),
-        (["hdf6", run, "--out", out], 2),
-        (["--out", "lerobot", "hdf5", run], 2),
-    ):
-        with pytest.raises(SystemExit) as ended:
-            main(["export", *map(str, arguments)])
-        assert ended.value.code == code
-    printed = capsys.readouterr()
-    assert printed.out.splitlines()[:2] == [
-        f"3 episodes, 20 frames: {out}",
-        "1 failed attempt left out (taken with --include-failures).",
-    ]
-    assert "choose another name, or --overwrite" in printed.err
-    assert "Did you mean 'hdf5'?" in printed.err
-    assert "Name the format before everything else: demorec export hdf5" in printed.err
-    assert "Traceback" not in printed.err
 
 
 def test_robomimic_reads_it(run: Path, tmp_path: Path) -> None:

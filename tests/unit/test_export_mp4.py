@@ -15,7 +15,7 @@ from support.present import present
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.depth import code_values, depth_video, quantised
-from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer, parameter_sets
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.mcap import VideoPacket, VideoSettings
 from demorec.mcap.video import decode, is_keyframe, make_encoder
 
@@ -106,33 +106,6 @@ def test_pictures_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path
         assert list(aside.iterdir()) == []
 
 
-@pytest.mark.parametrize("codec", ["h264", "av1"])
-def test_the_same_pictures_give_the_same_file_without_a_date_or_a_version(tmp_path: Path, codec: str) -> None:
-    video, _ = coded(codec, 5)
-    for name in ("a.mp4", "b.mp4"):
-        writer = Mp4Writer(tmp_path / name, video, fps=30)
-        writer.add(video)
-        writer.close()
-    data = (tmp_path / "a.mp4").read_bytes()
-    assert data == (tmp_path / "b.mp4").read_bytes()
-    assert b"Lavf" not in data
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        assert "creation_time" not in container.metadata | container.streams.video[0].metadata
-
-
-def test_colours_are_described_as_in_the_recording(tmp_path: Path) -> None:
-    """H.273: primaries 1 are those of BT.709, transfer 13 that of sRGB, matrix 6 that of BT.601, range 1 is narrow."""
-    for codec in ("h264", "av1"):
-        video, _ = coded(codec, 3)
-        writer = Mp4Writer(tmp_path / f"{codec}.mp4", video, fps=30)
-        writer.add(video)
-        writer.close()
-        with av.open(str(tmp_path / f"{codec}.mp4")) as container:
-            context = container.streams.video[0].codec_context
-            found = (context.color_primaries, context.color_trc, context.colorspace, context.color_range)
-        assert found == (1, 13, 6, 1)
-
-
 def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
     _, units = encoded("av1", 3)
     for nothing in (b"", b"\x12\x00"):  # the second is a temporal delimiter alone
@@ -142,13 +115,6 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"cannot be written.*a\.mp4"):
         Mp4Writer(tmp_path / "a.mp4", garbage, fps=30)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_that_cannot_be_written_is_an_error_of_the_system(tmp_path: Path) -> None:
-    video, _ = coded("h264", 3)
-    (tmp_path / "a.unfinished").mkdir()
-    with pytest.raises(OSError, match="directory"):
-        Mp4Writer(tmp_path / "a.mp4", video, fps=30)
 
 
 def samples_of(video: EncodedVideo) -> list[bytes]:
@@ -223,22 +189,6 @@ def test_a_packet_without_its_start_code_is_refused(unit: bytes) -> None:
     for before in (SHORT + NAL["idr"], SHORT + NAL["idr"] + b"\0\0"):
         with pytest.raises(ExportError, match="start code"):
             video_of("h264", [before, unit])
-
-
-def test_parameter_sets_tell_settings_apart() -> None:
-    same, again, other = coded("h264", 2)[0], coded("h264", 2, seed=5)[0], coded("h264", 2, crf=40)[0]
-    assert same.parameter_sets() == again.parameter_sets() != other.parameter_sets()
-    av1, av1_again = coded("av1", 2)[0], coded("av1", 2, seed=5)[0]
-    assert av1.parameter_sets() == av1_again.parameter_sets()
-
-
-def test_a_video_that_does_not_start_with_a_keyframe_is_refused() -> None:
-    _, units = encoded("h264", 4)
-    cut = video_of("h264", units[1:])
-    with pytest.raises(ExportError, match="keyframe"):
-        cut.parameter_sets()
-    with pytest.raises(ExportError, match="start code"):
-        parameter_sets("h264", b"no video at all")
 
 
 def test_depth_codes_are_those_of_lerobots_formula_and_are_kept_without_loss(tmp_path: Path) -> None:

@@ -17,8 +17,6 @@ from demorec.datasets.lerobot.stats import (
     Statistics,
     colour_levels,
     data_statistics,
-    merge_statistics,
-    vector_statistics,
 )
 
 
@@ -82,15 +80,6 @@ def test_statistics_of_files_equal_those_of_numpy(tmp_path: Path, count: int) ->
         check(found[name], column)
 
 
-def test_statistics_of_an_episode_equal_those_of_numpy() -> None:
-    data = columns(np.random.default_rng(0), 221)
-    found = vector_statistics(data)
-    for name, column in data.items():
-        check(found[name], column)
-    assert np.asarray(found["state"].to_json()["q50"]).shape == (6,)
-    assert np.asarray(found["done"].to_json()["q50"]).shape == (1,)
-
-
 def test_statistics_of_pictures_equal_those_of_numpy() -> None:
     rng = np.random.default_rng(1)
     pictures = rng.integers(0, 256, (5, 20, 30, 3)).astype(np.uint8)
@@ -105,15 +94,3 @@ def test_statistics_of_pictures_equal_those_of_numpy() -> None:
     assert found.to_json()["count"] == [5]
     assert np.asarray(found.to_json()["mean"]).shape == (3, 1, 1)
     assert Statistics.from_json(found.to_json()) is not None
-
-
-def test_merged_means_and_deviations_are_exact() -> None:
-    rng = np.random.default_rng(2)
-    a, b = rng.normal(size=(70, 3)), rng.normal(loc=2, size=(30, 3))
-    merged = merge_statistics([vector_statistics({"x": part})["x"] for part in (a, b)])
-    both = np.concatenate([a, b])
-    assert merged.count == 100
-    assert np.allclose(merged.values["mean"], both.mean(axis=0))
-    assert np.allclose(merged.values["std"], both.std(axis=0))
-    assert np.array_equal(merged.values["min"], both.min(axis=0))
-    assert np.array_equal(merged.values["max"], both.max(axis=0))

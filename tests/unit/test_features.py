@@ -9,17 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.recording import HOME, PANDA, make_episode
+from support.recording import HOME, PANDA
 
 from demorec.core.geometry import Pose
 from demorec.episode.episode import SimulatedColumns, frame_time_ns
 from demorec.episode.features import (
-    ACTION,
     EE_POSE,
     ENVIRONMENT_STATE,
-    STATE,
-    VELOCITY,
-    action_names,
     action_vectors,
     joint_target_from_increment,
     observation_names,
@@ -96,18 +92,6 @@ def test_one_frame_has_the_same_bits_as_many() -> None:
             assert one[name].tobytes() == many[name][t].tobytes(), (name, t)
 
 
-def test_an_observation_and_its_recorded_columns_agree() -> None:
-    info, frames, _ = make_episode(num_frames=5, cameras=())
-    for frame in frames:
-        rows = ObservationRows.of_observation(frame.observation)
-        vectors = observation_vectors(rows, info.robot, info.scene)
-        observation = frame.observation
-        expected = np.array([*observation.joint_position[:7], observation.gripper_width], dtype=np.float32)
-        assert np.array_equal(vectors[STATE][0], expected)
-        speed = observation.joint_velocity
-        assert np.allclose(vectors[VELOCITY][0], [*speed[:7], speed[7] + speed[8]], rtol=1e-6)
-
-
 def test_environment_state_against_scipy() -> None:
     rng = np.random.default_rng(2)
     scene = make_scene(rng)
@@ -164,24 +148,6 @@ def test_environment_state_against_scipy() -> None:
                 assert f"{goal.object}.yaw.sin" not in found
         raw = matrix(values[t][-7:].astype(np.float64))
         assert np.allclose(raw, poses["ball"], atol=1e-5)  # the last movable body
-
-
-def test_a_symmetric_object_turned_by_its_symmetry_looks_the_same() -> None:
-    rng = np.random.default_rng(3)
-    scene = make_scene(rng)
-    rows = make_rows(rng, scene, 1)
-    turned = Pose(position=np.zeros(3), quat_xyzw=Rotation.from_euler("z", 90, degrees=True).as_quat())
-    upright = Pose.from_yaw((0.3, 0.2, 0.1), 0.4)
-    scene = replace(scene, robot=replace(scene.robot, world_from_base=Pose()))
-    seen = []
-    for pose in (upright, upright @ turned):
-        poses = {**rows.object_poses, "cube": pose.vector()[None]}
-        vectors = observation_vectors(replace(rows, object_poses=poses), PANDA, scene, privileged=True)
-        names = observation_names(PANDA, scene, privileged=True)[ENVIRONMENT_STATE]
-        row = dict(zip(names, vectors[ENVIRONMENT_STATE][0].tolist(), strict=True))
-        seen.append({key: value for key, value in row.items() if ".pose." not in key})
-    assert seen[0].keys() == seen[1].keys()
-    assert all(seen[0][key] == pytest.approx(seen[1][key], abs=1e-6) for key in seen[0])
 
 
 def test_the_tcp_quaternion_keeps_its_sign_through_a_turn_of_the_hand() -> None:
@@ -278,22 +244,3 @@ def test_increments_lead_back_from_noise_as_the_noise_lets_go(fps: int) -> None:
 
 def frame_times(frames: np.ndarray[Any, Any], fps: int) -> np.ndarray[Any, Any]:
     return np.array([frame_time_ns(int(frame), fps) for frame in frames])
-
-
-@pytest.mark.parametrize("kind", ["joint", "joint_increment", "ee", "ee_delta"])
-def test_every_component_of_an_action_has_a_name(kind: str) -> None:
-    rng = np.random.default_rng(7)
-    vectors = action_vectors(columns_of(rng, 3), make_scene(rng), kind)  # type: ignore[arg-type]
-    names = action_names(PANDA, kind)  # type: ignore[arg-type]
-    assert len(names) == len(set(names)) == vectors.shape[1]
-    assert names[-1] == "gripper.width"
-    assert vectors.dtype == np.float32
-
-
-def test_two_goals_for_one_object_have_names_of_their_own() -> None:
-    rng = np.random.default_rng(8)
-    scene = make_scene(rng)
-    scene = replace(scene, goals=(scene.goals[0], replace(scene.goals[0], onto="")))
-    names = observation_names(PANDA, scene, privileged=True)[ENVIRONMENT_STATE]
-    assert len(names) == len(set(names))
-    assert ACTION not in names

@@ -12,16 +12,6 @@ import pytest
 from demorec.core.files import open_regular, read_json_limited, read_text_limited
 
 
-def test_regular_files_and_links_to_them_are_read(tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.write_bytes("grün\r\n".encode())
-    (tmp_path / "link").symlink_to(file)
-    for path in (file, tmp_path / "link"):
-        with open_regular(path) as opened:
-            assert opened.read() == file.read_bytes()
-        assert read_text_limited(path, 7) == "grün\r\n"
-
-
 def make_fifo(path: Path) -> None:
     os.mkfifo(path)
 
@@ -99,8 +89,3 @@ def test_what_is_no_json_is_an_ordinary_error(tmp_path: Path, data: bytes) -> No
     (tmp_path / "file").write_bytes(data)
     with pytest.raises(ValueError):
         read_json_limited(tmp_path / "file", 10_000_000)
-
-
-def test_json_is_read(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text('{"a": [1, null]}')
-    assert read_json_limited(tmp_path / "file", 100) == {"a": [1, None]}

@@ -82,20 +82,6 @@ def test_with_autocast_half_as_much_is_kept_as_act_would_take() -> None:
     assert policy.model.backbone.given == 2 * 20
 
 
-def test_without_room_nothing_is_kept_but_it_is_frozen() -> None:
-    policy = frozen(0)
-    for _ in range(2):
-        assert not policy(batch(1, 2)).requires_grad
-    assert policy.model.backbone.given == 2 * 2 * 2
-
-
-def test_pictures_of_no_dataset_go_through() -> None:
-    policy = frozen(1 << 20)
-    policy(batch(1))
-    found = policy.model.backbone(torch.ones(2, 3, 2, 2))["feature_map"]
-    torch.testing.assert_close(found, torch.full((2, 1, 2, 2), 3.0))
-
-
 @pytest.mark.parametrize("policy", [Policy("diffusion"), Policy(cameras=())])
 def test_only_act_with_pictures_has_such_an_encoder(policy: Policy) -> None:
     from demorec.core.errors import ConfigError

@@ -61,15 +61,6 @@ def test_an_opening_becomes_joints_and_comes_back(gripper: ParallelGripper, widt
     np.testing.assert_allclose(gripper.width_velocity(joints, velocity), change / 2e-7, atol=1e-6)
 
 
-def test_two_fingers_open_by_half_each_and_the_weaker_one_grips() -> None:
-    assert GRIPPER.joint_position(0.05).tolist() == [0.025, 0.025]
-    assert GRIPPER.width(np.array([0.01, 0.03])) == 0.04
-    assert GRIPPER.grip_force([3.0, 2.0]) == 2.0
-    larger = GRIPPER.scaled(1.5)
-    assert larger.max_width == pytest.approx(0.12)
-    assert larger.force == GRIPPER.force
-
-
 @pytest.mark.parametrize("version", [1, 2])
 def test_files_of_every_version_hold_the_gripper_among_the_robots_keys(version: int) -> None:
     """What another reader finds in the file is what is written today, byte for byte."""

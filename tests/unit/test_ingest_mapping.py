@@ -14,7 +14,6 @@ from demorec.sources.bag_files import BagError
 from demorec.sources.fields import (
     FieldError,
     OtherPublisherError,
-    SourceReader,
     converted,
     follow,
     layout_of,
@@ -49,14 +48,6 @@ def test_a_wrong_mapping_is_refused(old: str, new: str, told: str, tmp_path: Pat
         read_mapping(path)
     assert str(caught.value).endswith(f": {path}")
     assert "\n" not in str(caught.value)
-
-
-def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
-    text = bag_mappings.SO101.replace("fps = 30", "fps = 0").replace("[cameras.front]", '[cameras."a b"]')
-    with pytest.raises(ConfigError, match=r"clock\.fps is 0.*|a camera cannot.*") as caught:
-        read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
-    assert "clock.fps" in str(caught.value)
-    assert "a camera" in str(caught.value)
 
 
 MISFITS = [
@@ -106,30 +97,6 @@ def test_paths_of_fields() -> None:
         parse_path("a[")
 
 
-def test_joints_are_found_by_name_in_whatever_order() -> None:
-    source = Source(topic="/j", field="position", joints=("b", "a"))
-    first = {"name": ["a", "b", "c"], "position": np.array([1.0, 2.0, 3.0])}
-    reader = SourceReader(source, layout_of(source, first))
-    assert reader.read(first).tolist() == [2.0, 1.0]
-    assert reader.read({"name": ["c", "b", "a"], "position": np.array([1.0, 2.0, 3.0])}).tolist() == [2.0, 3.0]
-    with pytest.raises(FieldError, match="'a' is missing"):
-        reader.read({"name": ["b"], "position": np.array([1.0])})
-    with pytest.raises(FieldError, match="1 values have 2 names"):
-        reader.read({"name": ["a", "b"], "position": np.array([1.0])})
-
-
-def test_joints_that_nobody_lists_are_those_of_the_first_message_by_name() -> None:
-    source = Source(topic="/j", field="position", prefix="left_")
-    first = {"name": ["a", "b"], "position": np.array([1.0, 2.0])}
-    layout = layout_of(source, first)
-    assert layout.names == ("left_a", "left_b")
-    reader = SourceReader(source, layout)
-    assert reader.read({"name": ["b", "a"], "position": np.array([3.0, 4.0])}).tolist() == [4.0, 3.0]
-    with pytest.raises(OtherPublisherError, match="none of the joints"):
-        reader.read({"name": ["c", "d"], "position": np.array([5.0, 6.0])})
-    assert list(reader.others) == ["c", "d"]
-
-
 def test_a_publisher_of_velocities_alone_is_another_one() -> None:
     """Wheels have no positions, and are no reason to refuse the arm whose messages come later."""
     source = Source(topic="/j", field="position", joints=("a",))
@@ -137,12 +104,6 @@ def test_a_publisher_of_velocities_alone_is_another_one() -> None:
         layout_of(source, {"name": ["wheel"], "position": np.empty(0), "velocity": np.array([1.0])})
     with pytest.raises(FieldError, match="have no names"):
         layout_of(source, {"position": np.array([1.0])})
-
-
-def test_names_that_are_not_unique_name_nothing() -> None:
-    source = Source(topic="/j", field="position")
-    first = {"name": ["", ""], "position": np.array([1.0, 2.0])}
-    assert SourceReader(source, layout_of(source, first)).read(first).tolist() == [1.0, 2.0]
 
 
 def test_a_source_without_a_list_is_refused_where_publishers_differ(tmp_path: Path) -> None:
@@ -169,11 +130,6 @@ def test_a_source_without_a_list_is_refused_where_publishers_differ(tmp_path: Pa
 def test_units(unit: str, to: str, given: list[float], expected: list[float]) -> None:
     source = Source(topic="/j", field="x", unit=unit, to=to, limits=((-1.0, 1.0), (-3.0, 3.0)))  # type: ignore[arg-type]
     assert np.allclose(converted(source, np.array([given])), expected)
-
-
-def test_without_a_conversion_no_bit_changes() -> None:
-    values = np.array([[0.1, np.nan]], dtype=np.float32)
-    assert converted(Source(topic="/j", field="x", unit="rad"), values) is values
 
 
 def test_digests_are_those_of_the_runs_that_may_be_continued(tmp_path: Path) -> None:

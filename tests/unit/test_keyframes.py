@@ -19,10 +19,6 @@ def test_the_next_changes_are_found_and_never_those_of_another_episode() -> None
     assert found[13:].tolist() == [[15, 15]] * 3
 
 
-def test_without_changes_the_last_frame_counts() -> None:
-    assert find_keyframes(np.full(4, 0.02), np.array([0, 0, 1, 1])).tolist() == [[1, 1], [1, 1], [3, 3], [3, 3]]
-
-
 def about_z(angle: float) -> list[float]:
     """Quaternion (x, y, z, w) of a turn about z."""
     return [0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)]
@@ -52,13 +48,3 @@ def test_targets_are_those_of_geometry() -> None:
     }
     assert {name: now[name] for name in expected} == pytest.approx(expected, abs=1e-6)
     assert [found.names[place] for place in found.offsets] == [f"keyframe_0.from_tcp.{axis}" for axis in "xyz"]
-
-
-def test_half_a_turn_of_the_hand_is_no_difference() -> None:
-    position = np.zeros((2, 3))
-    keyframes = np.array([[1, 1], [1, 1]])
-    one, other = (
-        keyframe_targets(position, np.array([about_z(0.0), about_z(turn)]), keyframes).values
-        for turn in (0.4, 0.4 + math.pi)
-    )
-    np.testing.assert_allclose(one, other, atol=1e-6)

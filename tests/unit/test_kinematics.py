@@ -17,7 +17,7 @@ from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.kinematics_kernels import forward
 from demorec.robots.robot import RobotSpec
-from demorec.robots.urdf import Urdf, quat_from_rpy
+from demorec.robots.urdf import Urdf
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.bodies import urdf_file
 from demorec.sim.client import connect
@@ -113,20 +113,6 @@ def test_inverse_kinematics_reaches_the_pose_in_the_simulator(robot: SimulatedRo
     assert solved >= 38
 
 
-def test_the_null_space_pull_changes_the_elbow_and_not_the_hand(robot: SimulatedRobot) -> None:
-    spec, *_ = robot
-    arm = arm_kinematics(spec)
-    home = np.array(spec.home_q)
-    start = home + 0.3
-    wanted = arm.forward(start)
-    pulled = arm.inverse(wanted, start=start, rest=home, null_gain=0.1)
-    still = arm.inverse(wanted, start=start)
-    assert pulled is not None
-    assert still is not None
-    assert np.array_equal(still, start)
-    assert np.linalg.norm(pulled - home) < np.linalg.norm(still - home)
-
-
 def test_out_of_reach_is_none_and_not_a_wrong_answer(robot: SimulatedRobot) -> None:
     spec, *_ = robot
     arm = arm_kinematics(spec)
@@ -160,13 +146,6 @@ def test_a_straight_path_is_straight_and_turns_evenly(robot: SimulatedRobot) -> 
         assert (Rotation.from_quat(pose.quat_xyzw) * slerp(u).inv()).magnitude() < 2e-3
 
 
-def test_roll_pitch_yaw_as_urdf_means_them() -> None:
-    rpy = [0.3, -1.1, 2.4]
-    expected = Rotation.from_euler("xyz", rpy).as_quat()
-    found = quat_from_rpy(rpy)
-    assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < 1e-12
-
-
 def test_a_chain_with_other_joints_is_refused() -> None:
     spec = ROBOTS.load("panda")
     with pytest.raises(ValueError, match="panda_joint7"):
@@ -177,10 +156,3 @@ def test_a_chain_with_other_joints_is_refused() -> None:
             lower=spec.position_lower[:6],
             upper=spec.position_upper[:6],
         )
-
-
-def test_scale_multiplies_lengths() -> None:
-    spec = ROBOTS.load("panda")
-    q = np.array(spec.home_q)
-    small, large = arm_kinematics(spec), arm_kinematics(spec, scale=1.3)
-    assert np.allclose(1.3 * small.forward(q).position, large.forward(q).position, atol=1e-12)

@@ -12,8 +12,8 @@ import pytest
 from support.recording import make_episode
 
 from demorec.annotate.narration import narrate
-from demorec.annotate.referring import phrase_for, phrases_for, references, resolve
-from demorec.annotate.situation import Surroundings, situation
+from demorec.annotate.referring import phrase_for, phrases_for, resolve
+from demorec.annotate.situation import situation
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot import files
@@ -78,14 +78,6 @@ def test_a_millimetre_makes_no_left_and_no_larger() -> None:
     assert phrase_for("red_cube_0", twins) == "a red cube"
 
 
-def test_texts_are_read_phrase_by_phrase() -> None:
-    things = situation(scene(("red", 0.4, 0.2, 0.05), ("red", 0.5, 0.02, 0.03), ("blue", 0.4, -0.2, 0.04)))
-    text = "Put the left red cube on the blue cube, then every red cube beside the red cube"
-    assert [(phrase, len(names)) for phrase, names in references(text, things)] == [
-        ("the left red cube", 1), ("the blue cube", 1), ("every red cube", 2), ("the red cube", 0),
-    ]  # fmt: skip
-
-
 PHASES = ("approach", "descend", "close", "lift", "transport", "lower", "release", "retreat")
 
 
@@ -139,26 +131,11 @@ def test_a_miss_and_a_drop_are_told_and_tried_again(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_bad_placement_is_no_placement(tmp_path: Path) -> None:
-    bad = ("misplaced_distance", "cube lies badly: distance")
-    script = [*steps(*PHASES, approach=GRASP), ("approach", *GRASP), *steps(*PHASES[1:])]
-    script[7] = ("retreat", *bad)
-    memories = [text for _, kind, text in told(tmp_path, script) if kind == "memory"]
-    assert memories[1] == "I put the red cube down in the wrong place."
-
-
 def test_phases_of_a_foreign_script_are_told_as_they_are(tmp_path: Path) -> None:
     found = told(tmp_path, [("wiggle_about", "", ""), ("", "", ""), ("close", "", "")])
     assert [(row, text) for row, kind, text in found if kind == "subtask"] == [
         (0, "wiggle about"), (2, "pick up the red cube and place it on the green target"), (4, "grasp the red cube"),
     ]  # fmt: skip
-
-
-def test_things_are_where_the_poses_say(tmp_path: Path) -> None:
-    things = scene(("red", 0.4, 0.2, 0.05), ("red", 0.5, -0.2, 0.03))
-    poses = {"red_cube_0": np.array([0.4, -0.4, 0.0, 0, 0, 0, 1.0])}
-    now: Surroundings = situation(things, poses)
-    assert resolve("the right red cube", now) == {"red_cube_0"}
 
 
 @pytest.mark.parametrize(("statements", "is_read"), [(200, True), (1000, False)])

@@ -61,10 +61,6 @@ def test_an_export_says_that_nothing_was_verified(
     assert "Verified:" not in out
 
 
-def test_an_unwanted_verification_is_not_missed(run: Path, tmp_path: Path) -> None:
-    assert export_lerobot([run], tmp_path / "d", ExportOptions(verify=False)).not_verified == ""
-
-
 @pytest.mark.usefixtures("light")
 def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tmp_path / "d"

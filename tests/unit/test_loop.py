@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import re
@@ -15,11 +14,9 @@ import pytest
 from support.sim import episode, run
 
 import demorec.loop
-from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_json, to_json
 from demorec.episode.episode import Frame, Outcome, SimulatedInfo
-from demorec.episode.features import NOISE_DECAY
-from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
+from demorec.loop import Episode, ScriptAgent, Session, make_world
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +37,6 @@ def test_an_episode_succeeds_strictly(ran: tuple[Episode, list[Frame], Outcome])
     goal = prepared.info.scene.goals[0].onto_from_goal
     assert np.hypot(*(last.position - goal.position)[:2]) < 0.02
     assert frames[-1].observation.contact_force == 0
-
-
-def test_phases_run_in_order(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    _, frames, _ = ran
-    phases = list(dict.fromkeys(frame.phase for frame in frames))
-    assert phases == ["approach", "descend", "close", "lift", "transport", "lower", "release", "retreat"]
-    assert [event.name for frame in frames for event in frame.events] == ["grasp", "place"]
-
-
-def test_time_stamps_are_exact_integers(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    _, frames, _ = ran
-    assert [frame.frame_index for frame in frames] == list(range(len(frames)))
-    assert [frame.time_ns for frame in frames[:4]] == [0, 33_333_333, 66_666_667, 100_000_000]
 
 
 def test_observation_comes_before_the_action(ran: tuple[Episode, list[Frame], Outcome]) -> None:
@@ -91,17 +75,6 @@ def test_noise_is_on_the_command_only_and_only_in_free_motion(ran: tuple[Episode
         assert max(noise[phase]) < 0.001, phase
 
 
-def test_labels_are_smooth(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    """The clean action keeps to the velocity limits; noise never enters it."""
-    prepared, frames, _ = ran
-    labels = np.array([frame.action.joint_target for frame in frames])
-    speed = np.abs(np.diff(labels, axis=0)) * prepared.info.fps
-    commands = np.array([frame.command.joint_target for frame in frames])
-    limit = np.array(prepared.info.robot.velocity_limit)
-    assert (speed < limit).all()
-    assert (np.abs(np.diff(commands, axis=0)) * prepared.info.fps <= limit * (1 + 1e-9)).all()
-
-
 def test_no_frame_is_idle(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
     # Neither the label nor what is executed moves.
@@ -111,31 +84,6 @@ def test_no_frame_is_idle(ran: tuple[Episode, list[Frame], Outcome]) -> None:
         s for s, frame in zip(still, frames, strict=False) if frame.phase not in ("close", "release")
     ]
     assert sum(outside_of_gripping) <= 0.06 * len(frames)
-
-
-def test_the_expert_goes_on_only_where_it_wanted_to_be(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    """Noise fades before the hand is lowered: a policy must not learn that nearly there is there."""
-    _, frames, _ = ran
-    for before, after in itertools.pairwise(frames):
-        if (before.phase, after.phase) in (("approach", "descend"), ("transport", "lower")):
-            reached = after.observation.joint_position[:7]
-            assert np.abs(reached - before.action.joint_target).max() < 0.006
-            assert np.abs(before.command.joint_target - before.action.joint_target).max() < 0.006
-
-
-def test_noise_lets_go_at_the_rate_that_increments_expect(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    """Once no noise is added, the exported increments are the executed ones."""
-    prepared, frames, _ = ran
-    actions = np.array([frame.action.joint_target for frame in frames])
-    commands = np.array([frame.command.joint_target for frame in frames])
-    noise = commands - actions
-    fading = [t for t in range(1, len(frames)) if np.allclose(noise[t], 0.7 * noise[t - 1], rtol=1e-6, atol=1e-12)]
-    moving = [t for t in fading if np.abs(noise[t]).max() > 1e-3]
-    assert len(moving) >= 5
-    executed = np.diff(commands, axis=0)
-    expected = np.diff(actions, axis=0) + NOISE_DECAY * (actions - commands)[:-1]
-    assert np.allclose(executed[np.array(fading) - 1], expected[np.array(fading) - 1], atol=1e-9)
-    assert prepared.behaviour.action_noise == 0.02
 
 
 def test_an_episode_depends_on_its_plan_alone() -> None:
@@ -198,29 +146,6 @@ def test_joint_samples_at_the_physics_rate() -> None:
     assert all(len(frame.joint_samples) == 7 for frame in frames[1:])
     times = [t for frame in frames[1:] for t in (*(s.time_ns for s in frame.joint_samples), frame.time_ns)]
     assert np.abs(np.diff(times) - 1e9 / 240).max() <= 1
-
-
-@pytest.mark.parametrize("fps", [10, 60])
-def test_other_frame_rates_work_too(fps: int) -> None:
-    frames, outcome = run(episode(0, fps=fps))
-    assert outcome.success
-    assert abs(frames[-1].time_ns / 1e9 - (len(frames) - 1) / fps) < 1e-9
-
-
-def test_info_is_plain_and_complete(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    prepared, _, _ = ran
-    info = prepared.info
-    assert from_json(to_json(info), SimulatedInfo) == info
-    assert info.config["seed"] == 0
-    assert info.behaviour["action_noise"] == 0.02
-    assert {"demorec", "pybullet", "numpy"} <= set(info.versions)
-    assert "cube" in info.instruction
-
-
-def test_attempts_draw_other_scenes() -> None:
-    config = GenerateConfig(cameras=())
-    first, second = (prepare(EpisodePlan(config=config, episode_index=0, attempt=a)).info.scene for a in (0, 1))
-    assert first != second
 
 
 def test_breaking_off_leaves_the_world_usable(ran: tuple[Episode, list[Frame], Outcome]) -> None:

@@ -10,25 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from scipy.spatial.transform import Rotation
 from support.recording import make_episode, write_episode
 
-from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.robots import assets
 from demorec.robots.assets import asset_path
-from demorec.robots.urdf import Urdf
 from demorec.view import bodies
-from demorec.view.bodies import joint_columns, robot_model
-from demorec.view.meshes import MAX_TRIANGLES, urdf_meshes
+from demorec.view.bodies import robot_model
 from demorec.view.programs import viewer_environment
 from demorec.view.save import save, save_comparison
-from demorec.view.scene import differences, entry, summary
+from demorec.view.scene import differences
 from demorec.view.sources import find_episodes, select
-from demorec.view.style import segment_colors
 
 
 @pytest.fixture(scope="module")
@@ -73,21 +68,6 @@ def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], 
     np.testing.assert_array_equal([value for _, value in rows], [s.joint_position[:joints] for s in samples])
 
 
-@pytest.mark.parametrize(("plot", "part"), [("hand_force", slice(0, 3)), ("hand_torque", slice(3, 6))])
-def test_the_wrench_is_plotted(saved: dict[str, list[Any]], recording: Path, plot: str, part: slice) -> None:
-    with SimulatedRecording(recording) as source:
-        wrench = source.columns().wrench
-    assert wrench is not None
-    rows = _column(saved[f"/plots/{plot}"], "Scalars:scalars")
-    np.testing.assert_array_equal([value for _, value in rows], wrench[:, part])
-
-
-def test_frames_are_on_both_time_lines(saved: dict[str, list[Any]]) -> None:
-    (chunk,) = [chunk for chunk in saved["/plots/gripper"] if not chunk.is_static]
-    assert sorted(chunk.timeline_names) == ["frame", "time"]
-    assert chunk.to_record_batch().column("frame").to_pylist() == list(range(20))
-
-
 @pytest.mark.parametrize("camera", ["front", "wrist"])
 def test_coded_pictures_are_passed_on_unchanged(saved: dict[str, list[Any]], recording: Path, camera: str) -> None:
     with SimulatedRecording(recording) as source:
@@ -107,16 +87,6 @@ def test_depth_and_segments_are_there(saved: dict[str, list[Any]], recording: Pa
     assert len(np.unique(np.frombuffer(bytes(labels[0]), dtype=np.uint16))) == 4  # nothing, table, cube, robot
 
 
-def test_segments_are_told_apart_by_their_colours() -> None:
-    names = ["table", "cube", *(f"panda/link{number}" for number in range(11))]
-    colors = segment_colors(names)
-    assert list(colors) == names
-    for number in range(10):
-        assert abs(colors[f"panda/link{number}"][0] - colors[f"panda/link{number + 1}"][0]) > 50
-    assert max(max(color) - min(color) for name, color in colors.items() if "/" in name) <= 15
-    assert all(max(colors[body]) - min(colors[body]) > 100 for body in ("table", "cube"))
-
-
 def test_robot_objects_path_and_goal_are_there(saved: dict[str, list[Any]]) -> None:
     links = [entity for entity in saved if "/world/robot/" in entity and _has(saved[entity], "Mesh3D:vertex_positions")]
     assert len(links) == 11  # links 0 to 7, hand, two fingers
@@ -127,49 +97,6 @@ def test_robot_objects_path_and_goal_are_there(saved: dict[str, list[Any]]) -> N
 
 def _has(chunks: list[Any], component: str) -> bool:
     return any(component in chunk.to_record_batch().schema.names for chunk in chunks)
-
-
-def test_phases_and_events_are_states_and_a_log(saved: dict[str, list[Any]]) -> None:
-    states = [value[0] for _, value in _column(saved["/phase"], "StateChange:state")]
-    assert states == ["approach", "descend", "grasp", "lift", "transport", "place", "retreat"]
-    texts = [value[0] for _, value in _column(saved["/events"], "TextLog:text")]
-    assert "both fingers touch the cube" in texts
-    assert texts[-1] == "success"
-
-
-def test_properties_tell_task_seed_outcome_and_length(saved: dict[str, list[Any]]) -> None:
-    batch = saved["/__properties/episode"][0].to_record_batch()
-    values = {name: batch.column(name).to_pylist()[0] for name in batch.schema.names}
-    assert values["task"] == ["pick_place"]
-    assert values["outcome"] == ["success"]
-    assert values["frames"] == [20]
-    assert values["seed"] == [0]
-
-
-def test_links_move_as_scipy_says() -> None:
-    urdf = Urdf.load(asset_path("franka_panda/panda.urdf"))
-    for name in ("panda_joint2", "panda_finger_joint1"):
-        joint = next(joint for joint in urdf.joints if joint.name == name)
-        position = np.linspace(-1.0, 1.0, 7, dtype=np.float64)
-        translation, quaternion = joint_columns(joint, position)
-        fixed = Rotation.from_quat(joint.parent_from_joint.quat_xyzw)
-        for row, q in enumerate(position):
-            slide = q * np.array(joint.axis) if joint.kind == "prismatic" else np.zeros(3)
-            turn = Rotation.from_rotvec(np.zeros(3) if joint.kind == "prismatic" else q * np.array(joint.axis))
-            np.testing.assert_allclose(
-                translation[row], joint.parent_from_joint.position + fixed.apply(slide), atol=1e-12
-            )
-            np.testing.assert_allclose(
-                Rotation.from_quat(quaternion[row]).as_matrix(), (fixed * turn).as_matrix(), atol=1e-12
-            )
-
-
-def test_meshes_are_small_and_have_their_size() -> None:
-    path = asset_path("franka_panda/panda.urdf")
-    meshes = urdf_meshes(path.read_text(), path.parent)
-    assert max(len(mesh.triangles) for mesh in meshes.values()) < 1.3 * MAX_TRIANGLES
-    hand = meshes["panda_hand"].vertices
-    np.testing.assert_allclose(hand.max(axis=0) - hand.min(axis=0), (0.063, 0.204, 0.092), atol=0.004)
 
 
 def test_the_recorded_description_stands_in_for_a_model_that_is_not_installed(recording: Path) -> None:
@@ -281,15 +208,6 @@ def test_a_model_of_another_size_is_not_taken_for_the_recorded_one(
     np.testing.assert_allclose(np.ptp(vertices, axis=0), DUCK.shape.size, atol=0.01)
 
 
-@pytest.mark.parametrize("codec", ["jpeg", "av1"])
-def test_other_codecs(tmp_path: Path, codec: str) -> None:
-    path = write_episode(tmp_path / "e.mcap", num_frames=6, video=VideoConfig(codec=codec))  # type: ignore[arg-type]
-    save(find_episodes([path])[0], tmp_path / "x.rrd")
-    chunks = _chunks(tmp_path / "x.rrd")["/world/cameras/front"]
-    component = "EncodedImage:blob" if codec == "jpeg" else "VideoStream:sample"
-    assert len(_column(chunks, component)) == 6
-
-
 def test_a_comparison_measures_the_distance(tmp_path: Path, recording: Path) -> None:
     other = write_episode(tmp_path / "b.mcap", num_frames=12, episode_index=3)
     first, second = find_episodes([recording, other])
@@ -328,38 +246,3 @@ def test_episodes_are_chosen_by_number(tmp_path: Path) -> None:
     for bad in ("5", "2:2", "-1", "x", "0:2,9"):
         with pytest.raises(ConfigError):
             select(sources, bad)
-
-
-def test_failures_are_shown_when_asked_for(tmp_path: Path) -> None:
-    (tmp_path / "failed").mkdir()
-    (tmp_path / "failed" / "a.mcap").touch()
-    with pytest.raises(ConfigError, match="--include-failures"):
-        find_episodes([tmp_path])
-    assert len(find_episodes([tmp_path], include_failures=True)) == 1
-
-
-@pytest.mark.parametrize(
-    ("name", "success", "expected"),
-    [
-        ("episode_000003.mcap", True, "3 ok"),
-        ("episode_000000.attempt_1.mcap", False, "0.1 FAIL place"),
-        ("replayed.mcap", True, "replayed ok"),
-    ],
-)
-def test_entries_of_the_list_are_short(tmp_path: Path, name: str, success: bool, expected: str) -> None:
-    write_episode(tmp_path / name, num_frames=3, cameras=(), success=success)
-    with find_episodes([tmp_path / name])[0].open() as episode:
-        assert episode.simulated is not None
-        assert entry(episode) == expected
-
-
-def test_failed_checks_come_first(tmp_path: Path) -> None:
-    write_episode(tmp_path / "e.mcap", num_frames=3, cameras=(), success=False)
-    with find_episodes([tmp_path / "e.mcap"])[0].open() as episode:
-        assert episode.simulated is not None
-        assert episode.outcome is not None
-        checks = episode.outcome.checks
-        shown = replace(episode, outcome=replace(episode.outcome, checks=(replace(checks[0], passed=True), *checks)))
-        marks = [line[2] for line in summary(shown).splitlines() if line.startswith(("| \u2713", "| **"))]
-    assert sorted(marks) == marks
-    assert len(set(marks)) == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -56,18 +55,6 @@ def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path
     with open_dataset_episode(tmp_path / "cubes", 0) as episode:
         assert episode.simulated is not None
         np.testing.assert_allclose(episode.object_poses["red_cube"], recorded, atol=1e-6)
-
-
-def test_an_end_is_drawn_where_the_object_ended(dataset: Path, recorded: Array, tmp_path: Path) -> None:
-    save(find_episodes([dataset])[0], tmp_path / "x.rrd")
-    positions: dict[str, Array] = {}
-    for chunk in RrdReader(tmp_path / "x.rrd").stream():
-        batch = chunk.to_record_batch()
-        if chunk.is_static and "Transform3D:translation" in batch.schema.names:
-            positions[chunk.entity_path] = np.array(batch.column("Transform3D:translation").to_pylist()[0][0])
-    (end,) = [entity for entity in positions if "/ends/" in entity or entity.endswith("/end")]
-    above = [parent for parent in positions if end.startswith(f"{parent}/")]
-    np.testing.assert_allclose(sum(positions[entity] for entity in [end, *above]), recorded[-1, :3], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -171,12 +158,3 @@ def test_an_episode_of_another_length_than_its_rows_is_one_sentence(
     pq.write_table(table.set_column(table.schema.get_field_index("length"), "length", column), path)
     with pytest.raises(ExportError, match=words), open_dataset_episode(tmp_path / "d", 1):
         pass
-
-
-def test_a_missing_video_is_one_sentence(dataset: Path, tmp_path: Path) -> None:
-    spoilt = tmp_path / "d"
-    shutil.copytree(dataset, spoilt)
-    video = next((spoilt / "videos").rglob("*.mp4"))
-    video.unlink()
-    with pytest.raises(ExportError, match=r"The video cannot be opened \(No such file.*mp4"):
-        save(find_episodes([spoilt])[0], tmp_path / "x.rrd")

@@ -15,7 +15,7 @@ from demorec.cli.view import View
 from demorec.core.errors import DemorecError, RecordingError
 from demorec.mcap import SimulatedWriter
 from demorec.robots.urdf import Urdf
-from demorec.view.glyphs import DRAWABLE, drawable, drawable_source
+from demorec.view.glyphs import DRAWABLE, drawable_source
 from demorec.view.layout import episode_layout
 from demorec.view.scene import log_episode, new_recording, summary
 from demorec.view.sources import find_episodes
@@ -97,13 +97,6 @@ def test_joints_of_a_robot_without_a_scene_still_belong_together(tmp_path: Path)
         assert "U+5173U+8282" in episode.joint_position
         assert "U+5173U+8282" in {found.name for found in Urdf.parse(str(episode.robot_description)).joints}
         log_episode(new_recording(episode), episode)
-
-
-def test_drawable_text_is_left_alone() -> None:
-    missing: set[str] = set()
-    for sentence in ("move the red cube", "Bewege den Würfel an das Ende · 3 °", "Передвинь куб", "e\u0301"):
-        assert drawable(sentence, missing) in (sentence, "é")
-    assert missing == set()
 
 
 @pytest.mark.slow

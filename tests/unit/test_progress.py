@@ -7,7 +7,6 @@ import time
 
 import pytest
 
-from demorec.cli.generate import RunProgress
 from demorec.cli.shared.progress import ProgressBar
 
 
@@ -42,13 +41,6 @@ def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys: pytest.Capt
     assert lines[0] == "generating: 2 of 40 episodes (5 %), 10 s passed, about 3.2 min left, 2 failed attempts"
     assert lines[1].startswith("generating: 4 of 40 episodes (10 %), 20 s passed, about 3.0 min left")
     assert "left" not in lines[-1]
-
-
-def test_what_was_done_before_does_not_count_for_the_time_that_is_left(capsys: pytest.CaptureFixture[str]) -> None:
-    assert lines_of(capsys, total=120, done=100, seconds_each=10.0)[:2] == [
-        "generating: 101 of 120 episodes (84 %), 10 s passed",
-        "generating: 102 of 120 episodes (85 %), 20 s passed, about 3.0 min left",
-    ]
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
@@ -89,21 +81,6 @@ def test_there_is_neither_a_flood_nor_a_silence(
     assert fewest <= len(lines_of(capsys, total=total, seconds_each=seconds_each)) <= most
 
 
-def test_a_total_may_be_known_only_later(capsys: pytest.CaptureFixture[str]) -> None:
-    clock = Clock()
-    with ProgressBar("exporting", is_terminal=False, clock=clock) as bar:
-        clock.now += 20
-        bar.write_line_if_due()
-        bar.set(1, 4)
-        clock.now += 10
-        bar.set(2, 4)
-        bar.write_line_if_due()
-    assert capsys.readouterr().err.splitlines() == [
-        "exporting: 0, 20 s passed",
-        "exporting: 2 of 4 episodes (50 %), 30 s passed, about 20 s left",
-    ]
-
-
 def test_lines_come_by_themselves_until_the_end(capsys: pytest.CaptureFixture[str]) -> None:
     told = ""
     with ProgressBar("generating", total=3, is_terminal=False, quiet=0.01):
@@ -114,29 +91,3 @@ def test_lines_come_by_themselves_until_the_end(capsys: pytest.CaptureFixture[st
     capsys.readouterr()
     time.sleep(0.05)
     assert capsys.readouterr().err == ""
-
-
-def test_a_terminal_gets_a_bar_and_no_lines(capsys: pytest.CaptureFixture[str]) -> None:
-    clock = Clock()
-    with ProgressBar("generating", total=3, is_terminal=True, clock=clock) as bar:
-        clock.now += 400
-        bar.advance()
-        bar.note("1 failed attempts")
-        bar.set(3)
-    told = capsys.readouterr().err
-    assert "3/3" in told
-    assert "1 failed attempts" in told
-    assert "passed" not in told
-
-
-def test_one_job_after_another_has_its_own_bar(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    with RunProgress() as progress:
-        progress.verifying(7, 7)
-        progress.exporting(1, 5)
-        progress.exporting(5, 5)
-        progress.checking(2, 6)
-    shown = re.findall(r"(\w+):[^\r\n]* (\d+/\d+) ", capsys.readouterr().err)
-    assert list(dict(shown).items()) == [("verifying", "7/7"), ("exporting", "5/5"), ("checking", "2/6")]

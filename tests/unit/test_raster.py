@@ -10,11 +10,10 @@ import pytest
 from support import render as scenes
 from support.present import present
 
-from demorec.core.errors import RenderError
 from demorec.core.geometry import Pose, look_at
 from demorec.episode.scene import Light, Texture
 from demorec.render.painter import Painter
-from demorec.render.raster import RasterRenderer, renderer
+from demorec.render.raster import RasterRenderer
 from demorec.render.raster.kernels import antialias, records, shade, still, triangles, vertices
 
 
@@ -57,22 +56,6 @@ def test_keeping_what_stands_still_changes_no_bit(client: Any, antialias: bool) 
         assert same(one, two)
         distinct.add(one.color.tobytes())
     assert len(distinct) == 25
-
-
-def test_other_scenes_before_change_no_bit(client: Any) -> None:
-    bodies = scenes.panda_scene(client)
-    setup = scenes.setup(client, *scenes.panda_cameras(96, 96), mounts=scenes.panda_mounts(bodies))
-    fresh = RasterRenderer()
-    fresh.setup(setup)
-    expected = scenes.draw(fresh, client)
-    used = RasterRenderer()
-    other = scenes.connect()
-    scenes.add(other, "sphere", (0.2,))
-    used.setup(scenes.setup(other, scenes.camera(64, 64)))
-    scenes.draw(used, other)
-    used.setup(setup)
-    assert all(same(images, scenes.draw(used, client)[name]) for name, images in expected.items())
-    other.disconnect()
 
 
 def test_the_rehearsal_compiles_all_that_scenes_need(client: Any) -> None:
@@ -181,50 +164,6 @@ def test_a_shadow_lies_where_the_light_puts_it(client: Any) -> None:
     assert images.color[free].std(0).max() < 2
 
 
-def test_light_changes_pictures_as_told(client: Any) -> None:
-    body = scenes.add(client, "box", (0.4, 0.4, 0.4), rgbaColor=[0.6, 0.6, 0.6, 1])
-    camera = scenes.camera(64, 64)
-    base = picture(client, camera)
-    seen = scenes.away_from_borders(base.segmentation, 1) & (base.segmentation == body)
-
-    def mean(**changes: Any) -> Any:
-        return picture(client, camera, light=Light(**changes)).color[seen].mean(0)
-
-    reference = mean()
-    assert (mean(ambient=0.2) < reference - 20).all()
-    assert (mean(diffuse=0.1) < reference - 10).all()
-    red = mean(color=(1.0, 0.2, 0.2))
-    assert red[0] == pytest.approx(reference[0], abs=1)
-    assert red[1] < reference[1] - 10
-    assert not np.allclose(mean(direction=(-0.5, 0.4, 0.6)), reference, atol=3)
-    with pytest.raises(RenderError, match="direction"):
-        mean(direction=(0.0, 0.0, 0.0))
-
-
-def test_white_is_not_overexposed(client: Any) -> None:
-    body = scenes.add(client, "sphere", (0.2,), rgbaColor=[1, 1, 1, 1])
-    images = picture(client, scenes.camera(128, 128))
-    lit = images.color[images.segmentation == body]
-    assert (lit == 255).mean() < 0.001
-    assert lit.max() > 215
-
-
-def test_antialiasing_softens_edges_and_moves_nothing(client: Any) -> None:
-    bodies = scenes.panda_scene(client)
-    front, _ = scenes.panda_cameras(224, 224)
-    mounts = scenes.panda_mounts(bodies)
-    soft = picture(client, front, mounts=mounts)
-    hard = picture(client, front, mounts=mounts, antialias=False)
-    assert (soft.segmentation == hard.segmentation).mean() > 0.998
-    both = (soft.depth > 0) & (hard.depth > 0) & (soft.segmentation == hard.segmentation)
-    assert np.quantile(np.abs(soft.depth - hard.depth)[both], 0.99) < 1e-3
-    # Colours differ at edges, hardly elsewhere.
-    difference = np.abs(soft.color.astype(int) - hard.color.astype(int)).max(-1)
-    inner = scenes.away_from_borders(hard.segmentation, 2)
-    assert (difference[~inner] > 12).mean() > 0.1
-    assert (difference[inner] > 12).mean() < 0.03
-
-
 def test_exact_draws_all_triangles_and_levels_stay_close(client: Any) -> None:
     bodies = scenes.panda_scene(client)
     cameras = scenes.panda_cameras(224, 224)
@@ -254,11 +193,6 @@ def test_a_camera_inside_a_mesh_clips_more_than_there_is_room_for(client: Any) -
                 assert np.isfinite(present(images.depth)).all()
 
 
-def test_invisible_shapes_are_left_out(client: Any) -> None:
-    scenes.add(client, "box", (0.3, 0.3, 0.3), rgbaColor=[1, 0, 0, 0])
-    assert (picture(client, scenes.camera(64, 64)).segmentation == -1).all()
-
-
 def test_planes_reach_the_horizon(client: Any) -> None:
     body = scenes.add(client, "plane", ())
     camera = scenes.camera(96, 96, far=50.0)
@@ -268,12 +202,3 @@ def test_planes_reach_the_horizon(client: Any) -> None:
     expected = (depth > 0) & (depth < 50)
     assert ((images.segmentation == body) == expected).mean() > 0.999
     assert np.abs(images.depth - depth)[expected & (depth < 5)].max() < 1e-3
-
-
-def test_an_empty_scene_is_sky(client: Any) -> None:
-    assert (picture(client, scenes.camera(32, 32)).segmentation == -1).all()
-
-
-def test_shadow_maps_suit_the_picture() -> None:
-    assert renderer.shadow_size(96) < renderer.shadow_size(224) < renderer.shadow_size(480)
-    assert all(renderer.shadow_size(height) % 8 == 0 for height in (1, 200, 4000))

@@ -30,19 +30,6 @@ def test_stl_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
         assert (mesh.normals * outward).sum(-1).min() > 0.98
 
 
-def test_obj_polygons_negative_numbers_and_materials(tmp_path: Path) -> None:
-    (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n")
-    path = tmp_path / "two.obj"
-    path.write_text(
-        "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nusemtl red\nf -5 -4 -3 -2\nusemtl blue\nf 1 2 5\n"
-    )
-    mesh = load_mesh(path)
-    assert mesh.num_faces == 3
-    assert mesh.points[mesh.faces[2]].tolist() == [[0, 0, 0], [1, 0, 0], [0, 0, 1]]
-    assert mesh.colors.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
-    assert np.allclose(mesh.normals[0], [0, 0, 1])
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [

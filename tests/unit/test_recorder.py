@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import sys
@@ -10,10 +9,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import foxglove
 import numpy as np
 import pytest
 from support.export import export
@@ -21,7 +18,7 @@ from support.external import URDF
 
 from demorec import Recorder
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.external import NO_PICTURE, Camera, Feature
 from demorec.mcap import Recording
 from demorec.mcap.external_writer import EpisodeWriter
@@ -112,16 +109,6 @@ def test_elements_are_named_by_what_is_known(
         assert found.info.urdf == (URDF if robot == URDF else found.info.urdf if robot is PANDA else "")
         values = list(observation.values()) if isinstance(observation, dict) else observation
         assert found.columns().features["observation.state"][0].tolist() == values
-
-
-def test_features_may_be_described(tmp_path: Path) -> None:
-    described = Feature(name="observation.state", names=("a", "b"), units=("deg", "m"))
-    with recorder(tmp_path / "run", features=[described]) as run, run.episode() as episode:
-        episode.write({"b": 2.0, "a": 1.0})  # in whatever order
-        episode.write(np.array([3, 4], dtype=np.float32))  # a wider type loses nothing
-    assert feature_of(tmp_path / "run", "observation.state") == described
-    with recording_of(tmp_path / "run") as found:
-        assert found.columns().features["observation.state"].tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
 def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
@@ -254,27 +241,6 @@ def test_odd_sizes_are_recorded_by_the_codec_that_is_advised(tmp_path: Path) -> 
     with pytest.raises(ConfigError, match=r"65x47 pixels cannot be h264 video.* of which no LeRobot dataset"):
         export(tmp_path / "run", tmp_path / "dataset")
     assert export(tmp_path / "run", tmp_path / "d.hdf5", "hdf5").num_frames == 1
-
-
-@pytest.mark.parametrize("features", [(), (Feature(name="observation.state", names=("a",)),)])
-def test_file_and_encoders_are_open_before_the_first_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: tuple[Feature, ...]
-) -> None:
-    with recorder(tmp_path / "run", cameras=TOP, features=features) as run, run.episode() as episode:
-        assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap.part"]
-
-        def opens(*arguments: object, **named: object) -> None:
-            raise AssertionError("opened by the first frame")
-
-        with monkeypatch.context() as patched:
-            patched.setattr("demorec.mcap.video.av.CodecContext", SimpleNamespace(create=opens))
-            patched.setattr(foxglove, "open_mcap", opens)
-            for index in range(3):
-                episode.write([float(index)], images={"top": PIXELS})
-            episode.finish()
-    with recording_of(tmp_path / "run") as found:
-        assert found.columns().features["observation.state"].tolist() == [[0.0], [1.0], [2.0]]
-        assert len(list(found.images("top"))) == 3
 
 
 OPENED = """
@@ -415,11 +381,3 @@ def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: si
         assert columns.features["observation.state"][:, 0].tolist() == list(range(first.num_frames))
         assert columns.pictures["top"].tolist() == list(range(first.num_frames))
         assert found.is_recovered == (number == signal.SIGKILL)
-
-
-def test_every_error_is_ours(tmp_path: Path) -> None:
-    """So that a program can tell what the recorder says from what else went wrong."""
-    assert issubclass(RecordingError, DemorecError)
-    with recorder(tmp_path / "run") as run, run.episode() as episode:
-        episode.write([0.0])
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["kind"] == "collected"

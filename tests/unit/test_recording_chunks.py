@@ -9,13 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
-from mcap.stream_reader import StreamReader
 from support.recording import write_episode
 
-from demorec.core.config import VideoConfig
-from demorec.mcap import SimulatedRecording
-from demorec.mcap.chunks import ChunkPlace, blocks_of
+from demorec.mcap.chunks import blocks_of
 from demorec.mcap.container import Container
 from demorec.mcap.limits import Limits
 from demorec.mcap.messages import PictureMessages, coded_pictures
@@ -40,23 +36,6 @@ def test_blocks_are_what_the_mcap_library_reads(path: Path) -> None:
         assert list(zip(block.time_ns.tolist(), block.messages(), strict=True)) == expected[topic], topic
 
 
-def test_places_are_what_the_mcap_library_reads(path: Path) -> None:
-    with path.open("rb") as file:
-        indexes = [record for record in StreamReader(file).records if isinstance(record, ChunkIndex)]
-    container = Container(path)
-    assert container._chunks == [
-        ChunkPlace(
-            start=index.chunk_start_offset,
-            length=index.chunk_length,
-            channels=frozenset(index.message_index_offsets),
-            uncompressed_size=index.uncompressed_size,
-        )
-        for index in sorted(indexes, key=lambda index: index.chunk_start_offset)
-    ]
-    assert len(indexes) > 2
-    container.close()
-
-
 LIMITS = Limits.of_file(1000)
 
 
@@ -64,14 +43,6 @@ def message(channel: int, time_ns: int, data: bytes) -> bytes:
     """A Message record (MCAP specification): channel, sequence, log time, publish time, data."""
     content = struct.pack("<HIQQ", channel, 0, time_ns, time_ns) + data
     return struct.pack("<BQ", 5, len(content)) + content
-
-
-def test_records_of_other_kinds_are_stepped_over() -> None:
-    other = struct.pack("<BQ", 3, 4) + b"\5\5\5\5"
-    contents = [other + message(1, 10, b"ab") + other, b"", message(2, 11, b"") + message(1, 12, b"cde")]
-    blocks = blocks_of(contents, {"/one": 1, "/two": 2, "/three": 3}, LIMITS)
-    assert [list(blocks[topic].messages()) for topic in ("/one", "/two", "/three")] == [[b"ab", b"cde"], [b""], []]
-    assert blocks["/one"].time_ns.tolist() == [10, 12]
 
 
 @pytest.mark.parametrize(
@@ -87,16 +58,6 @@ def test_records_of_other_kinds_are_stepped_over() -> None:
 def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> None:
     with pytest.raises((ValueError, struct.error)):
         blocks_of([content], {"/one": 1}, LIMITS)
-
-
-@pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
-def test_coded_pictures_are_the_packets(tmp_path: Path, codec: str) -> None:
-    path = write_episode(tmp_path / "e.mcap", num_frames=9, video=VideoConfig(codec=codec))  # type: ignore[arg-type]
-    with SimulatedRecording(path) as recording:
-        for camera, block in recording.coded_pictures(recording.cameras).items():
-            packets = list(recording.packets(camera))
-            assert list(block.messages()) == [packet.data for packet in packets]
-            assert block.joined() == b"".join(packet.data for packet in packets)
 
 
 def test_pictures_of_several_formats_and_cut_off_ones() -> None:

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import base64
 import io
-import sys
-from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 from support.docs import run_examples
 from support.present import present
 from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
-from demorec.core.errors import MissingDependencyError, RecordingError
 from demorec.episode.episode import Frame
-from demorec.mcap import SimulatedRecording, episode_file, video
-from demorec.mcap.video import VideoPacket, VideoSettings
+from demorec.mcap import SimulatedRecording
 
 NUM_FRAMES = 47
 
@@ -64,29 +59,6 @@ def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -
     assert count == NUM_FRAMES
 
 
-@pytest.mark.parametrize("index", [0, 1, 9, 10, 33, NUM_FRAMES - 1, -1, -NUM_FRAMES])
-def test_any_frame_can_be_picked(path: Path, truth: list[Frame], index: int) -> None:
-    with SimulatedRecording(path) as recording:
-        same_frame(recording[index], truth[index])
-
-
-def test_slices_are_those_of_a_list(path: Path, truth: list[Frame]) -> None:
-    with SimulatedRecording(str(path)) as recording:
-        for part in (slice(3, 9, 2), slice(None, None, -20), slice(-2, None), slice(40, 400), slice(9, 3)):
-            found = recording[part]
-            assert [frame.frame_index for frame in found] == [frame.frame_index for frame in truth[part]]
-        same_frame(recording[5:6][0], truth[5])
-
-
-@pytest.mark.parametrize("index", [NUM_FRAMES, -NUM_FRAMES - 1])
-def test_there_are_no_frames_beyond_the_ends(path: Path, index: int) -> None:
-    with SimulatedRecording(path) as recording:
-        with pytest.raises(IndexError):
-            recording[index]
-        with pytest.raises(IndexError):
-            recording.image("front", index)
-
-
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
 def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path: Path, codec: Codec) -> None:
     file = write_episode(tmp_path / "a.mcap", num_frames=12, video=VideoConfig(codec=codec, gop=5))
@@ -94,27 +66,6 @@ def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path: Path, codec: Cod
         whole = list(recording.images("wrist"))
         for index in (11, 0, 4, 5, -3):
             assert np.array_equal(recording.image("wrist", index), whole[index])
-
-
-def test_only_pictures_from_the_keyframe_on_are_decoded(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[VideoPacket] = []
-
-    def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[NDArray[np.uint8]]:
-        given.extend(packets)
-        return real(settings, iter(given))
-
-    real = video.decode
-    monkeypatch.setattr(episode_file, "decode", decode)
-    with SimulatedRecording(path) as recording:
-        recording.image("front", 33)
-    assert [packet.frame_index for packet in given] == [30, 31, 32, 33]  # a keyframe every ten
-
-
-def test_a_closed_recording_says_so(path: Path) -> None:
-    with SimulatedRecording(path) as recording:
-        pass
-    with pytest.raises(RecordingError, match="closed before it was read"):
-        recording[3]
 
 
 def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
@@ -138,12 +89,6 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
         assert row["world_from_camera.wrist.x"] == frame.images["wrist"].world_from_camera.position[0]
     numbers = 2 + 3 * 9 + 2 + 6 + 7 + 2 * (7 + 1 + 7) + 7 + 2 * 7 + 1
     assert table.shape == (NUM_FRAMES, numbers)
-
-
-def test_without_pandas_a_sentence_says_how_to_get_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with SimulatedRecording(path) as recording, pytest.raises(MissingDependencyError, match="pip install pandas"):
-        recording.to_pandas()
 
 
 class Page(HTMLParser):
@@ -184,13 +129,6 @@ def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Pat
     with SimulatedRecording(evil) as recording:
         assert Page(recording._repr_html_()).tags <= {"table", "tr", "th", "td", "img"}
         assert "\x1b" not in repr(recording) + recording._repr_html_()
-
-
-def test_recordings_without_pictures_or_frames_have_a_page_too(tmp_path: Path) -> None:
-    with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=3, cameras=())) as recording:
-        assert "cameras" in recording._repr_html_()
-        assert recording[2].images == {}
-        assert [dict(frame.images) for frame in recording] == [{}, {}, {}]
 
 
 def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from support.recording import frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import FORMAT_VERSION, Event, Frame, Outcome, SimulatedInfo
+from demorec.episode.episode import Event, Frame, Outcome, SimulatedInfo
 from demorec.mcap import SimulatedRecording, SimulatedWriter
 from demorec.mcap.container import Container
 
@@ -71,12 +70,6 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
         assert np.array_equal(columns.world_from_camera[name], poses)
 
 
-def test_actions_and_commands_are_kept_apart(tmp_path: Path) -> None:
-    with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=5, cameras=())) as recording:
-        columns = recording.columns()
-    assert not np.array_equal(columns.action_joint_target, columns.command_joint_target)
-
-
 @pytest.mark.parametrize("video", CODECS, ids=lambda video: f"{video.codec}-{video.gop}")
 def test_pictures(tmp_path: Path, video: VideoConfig) -> None:
     info, frames, outcome = make_episode(num_frames=64)
@@ -103,24 +96,6 @@ def test_pictures(tmp_path: Path, video: VideoConfig) -> None:
             assert (settings.codec, settings.width, settings.height, settings.fps) == (video.codec, 64, 48, 30)
 
 
-def test_what_the_settings_say_is_what_was_encoded(tmp_path: Path) -> None:
-    sizes = []
-    for crf in (18, 40):
-        video = VideoConfig(gop=5, crf=crf, preset="medium")
-        path = write_episode(tmp_path / f"{crf}.mcap", video=video, num_frames=20)
-        with SimulatedRecording(path) as recording:
-            settings = recording.video_settings("front")
-            assert (settings.gop, settings.crf, settings.preset) == (5, crf, "medium")
-            packets = list(recording.packets("front"))
-            # x264 writes its settings into the first packet.
-            assert f"crf={crf}.0".encode() in packets[0].data
-            assert b"keyint=5" in packets[0].data
-            assert b"bframes=0" in packets[0].data
-            assert b"threads=1" in packets[0].data
-            sizes.append(sum(len(packet.data) for packet in packets))
-    assert sizes[0] > 1.5 * sizes[1]
-
-
 def test_depth_and_segmentation(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=33, depth=True, segmentation=True)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
@@ -143,39 +118,6 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
     assert names[2 + (1 << 24)] == "panda/panda_link1"
 
 
-def test_segmentation_of_several_cameras_in_one_pass(tmp_path: Path) -> None:
-    path = write_episode(tmp_path / "a.mcap", num_frames=70, cameras=("front", "wrist"), segmentation=True)
-    chosen = {0, 31, 32, 69}
-    with SimulatedRecording(path) as recording:
-        assert len(list(recording._container.blocks_by_chunk(["/camera/front/segmentation"]))) > 1
-        found = list(recording.segmentation_at(["wrist", "front"], chosen))
-        for camera in ("front", "wrist"):
-            wanted = [labels for frame, labels in enumerate(recording.segmentation(camera)) if frame in chosen]
-            pictures = [(frame, labels) for name, frame, labels in found if name == camera]
-            assert [frame for frame, _ in pictures] == sorted(chosen)
-            for (_, labels), values in zip(pictures, wanted, strict=True):
-                body, link = np.divmod(labels.astype(np.int64), 256)  # 256 (body + 1) + link + 1, background 0
-                np.testing.assert_array_equal(np.where(labels > 0, body - 1 + (link << 24), -1), values)
-        assert len(found) == 2 * len(chosen)
-
-
-@pytest.mark.parametrize("cameras", [("front",), ("front", "wrist")])
-def test_labels_that_were_read_with_the_coded_pictures_are_not_unpacked_again(
-    cameras: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_episode(tmp_path / "a.mcap", num_frames=70, cameras=cameras, segmentation=True)
-    chosen = {0, 31, 69}
-    with SimulatedRecording(path) as recording:
-        expected = list(recording.segmentation_at(cameras, chosen))
-        recording.coded_pictures(cameras)
-        monkeypatch.setattr("demorec.mcap.container.chunk_content", lambda *_: pytest.fail("a chunk was unpacked"))
-        found = list(recording.segmentation_at(cameras, chosen))
-    for camera in cameras:
-        pictures, again = ([row for row in rows if row[0] == camera] for rows in (expected, found))
-        assert [row[1] for row in again] == [row[1] for row in pictures] == sorted(chosen)
-        assert all(np.array_equal(a[2], b[2]) for a, b in zip(again, pictures, strict=True))
-
-
 def test_without_depth_it_says_so(tmp_path: Path) -> None:
     with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
         assert not recording.has_depth("front")
@@ -186,37 +128,6 @@ def test_without_depth_it_says_so(tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match=r"no camera 'top', its cameras are front, wrist"):
             next(recording.images("top"))
         assert recording.segment_names() == {}
-
-
-def test_joint_samples_between_the_frames(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=40, cameras=(), physics_rate_joints=True)
-    path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with SimulatedRecording(path) as recording:
-        samples = list(recording.joint_samples())
-        columns = recording.columns()
-    assert len(samples) == 39 * 8 + 1
-    steps = np.diff([sample.time_ns for sample in samples])
-    assert steps.min() > 4_100_000
-    assert steps.max() < 4_200_000
-    inner = [sample for frame in frames for sample in frame.joint_samples]
-    read = [sample for sample in samples if sample.time_ns not in set(columns.time_ns.tolist())]
-    for written, found in zip(inner, read, strict=True):
-        assert found.time_ns == written.time_ns
-        assert np.array_equal(found.joint_position, written.joint_position)
-        assert np.array_equal(found.joint_velocity, written.joint_velocity)
-        assert np.array_equal(found.joint_effort, written.joint_effort)
-    assert np.array_equal(columns.joint_position, [frame.observation.joint_position for frame in frames])
-
-
-def test_events(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=40, cameras=())
-    path = record(tmp_path / "a.mcap", frames, info, outcome)
-    expected = [(frame.time_ns, event) for frame in frames for event in frame.events]
-    assert {event.level for _, event in expected} == {"info", "warning"}
-    with SimulatedRecording(path) as recording:
-        assert list(recording.events()) == expected
-        recording.columns()  # comes by them
-        assert list(recording.events()) == expected
 
 
 @pytest.mark.parametrize(("width", "height", "step"), [(64, 48, 1), (640, 480, 4)])
@@ -230,16 +141,6 @@ def test_statistics_are_of_every_other_picture(tmp_path: Path, width: int, heigh
     chosen = np.concatenate([picture[number % 4 :: 4].reshape(-1, 3) for number, picture in enumerate(thinned)])
     assert found.num_images == 4
     assert np.array_equal(found.counts, [np.bincount(chosen[:, channel], minlength=256) for channel in range(3)])
-
-
-def test_statistics_are_near_those_of_all_pixels(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=60)
-    path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with SimulatedRecording(path) as recording:
-        counts = recording.pixel_statistics("front").counts
-    everything = np.stack([frame.images["front"].color for frame in frames]).reshape(-1, 3).astype(float)
-    mean = (counts * np.arange(256)).sum(axis=1) / counts.sum(axis=1)
-    assert np.abs(mean - everything.mean(axis=0)).max() < 4.0  # the bar code shows even numbers
 
 
 def test_the_same_episode_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -301,16 +202,3 @@ def test_numbers_are_read_without_touching_the_pictures(tmp_path: Path, monkeypa
     assert opened < 0.1 * size
     assert numbers < 0.25 * size
     assert pictures > 0.6 * size
-
-
-def test_the_outcome_is_for_people_too(tmp_path: Path) -> None:
-    path = write_episode(tmp_path / "a.mcap", num_frames=3, cameras=(), success=False)
-    container = Container(path)
-    episode, outcome = container.metadata("demorec.episode"), container.metadata("demorec.outcome")
-    container.close()
-    assert episode is not None
-    assert outcome is not None
-    assert episode["instruction"] == "pick up the red cube and place it on the green target"
-    assert episode["format_version"] == str(FORMAT_VERSION)
-    assert json.loads(episode["info"])["config"]["task"] == "pick_place"
-    assert outcome["success"] == "false"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from support.recording import Codec, make_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.mcap.video import VideoPacket, decode, is_keyframe, make_encoder, ordinary_scheduling
+from demorec.mcap.video import VideoPacket, decode, is_keyframe, make_encoder
 
 ENCODE = """
 import hashlib, sys
@@ -155,16 +154,3 @@ def test_an_encoder_leaves_the_scheduling_alone(codec: Codec) -> None:
     encoder.encode(np.zeros((64, 96, 3), np.uint8))
     encoder.finish()
     assert os.sched_getscheduler(0) == policy
-
-
-def test_scheduling_is_given_back() -> None:
-    stop = threading.Event()
-    with ordinary_scheduling():
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        late = threading.Thread(target=stop.wait)
-        late.start()
-        assert os.sched_getscheduler(late.native_id or 0) == os.SCHED_BATCH
-    policies = [os.sched_getscheduler(0), os.sched_getscheduler(late.native_id or 0)]
-    stop.set()
-    late.join()
-    assert policies == [os.SCHED_OTHER, os.SCHED_OTHER]

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.recording import make_episode, write_episode
+from support.recording import make_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.episode.episode import Event, Frame, Outcome
+from demorec.episode.episode import Frame, Outcome
 from demorec.mcap import SimulatedRecording, SimulatedWriter, part_file, recover
 
 
@@ -58,16 +58,6 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> Non
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
     with SimulatedRecording(tmp_path / "b.mcap") as recording:
         assert recording.outcome == outcome
-
-
-def test_overwrite(tmp_path: Path) -> None:
-    path = write_episode(tmp_path / "a.mcap", num_frames=3, cameras=())
-    info, frames, outcome = make_episode(num_frames=5, cameras=())
-    with SimulatedWriter(path, info, overwrite=True) as writer:
-        write_all(writer, frames)
-        assert SimulatedRecording(path).num_frames == 3  # until the new one is complete
-        writer.finish(outcome)
-    assert SimulatedRecording(path).num_frames == 5
 
 
 def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
@@ -120,29 +110,6 @@ def test_pictures_are_complete(tmp_path: Path) -> None:
         small = replace(wrist, color=np.zeros((24, 32, 3), dtype=np.uint8))
         with pytest.raises(RecordingError, match=r"colour image .* has shape \(24, 32, 3\).* of 64x48 pixels"):
             writer.write(replace(frames[1], images={**frames[1].images, "wrist": small}))
-
-
-def test_the_outcome_has_the_same_length(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=2, cameras=())
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
-        writer.write(frames[0])
-        with pytest.raises(RecordingError, match="The outcome has 2 frames, the recording 1"):
-            writer.finish(outcome)
-
-
-def test_the_name_of_phase_events_is_reserved(tmp_path: Path) -> None:
-    info, frames, _ = make_episode(num_frames=1, cameras=())
-    with (
-        SimulatedWriter(tmp_path / "a.mcap", info) as writer,
-        pytest.raises(RecordingError, match="reserved"),
-    ):
-        writer.write(replace(frames[0], events=(Event(name="phase", message="mine"),)))
-
-
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
-    info, _, _ = make_episode(num_frames=1, cameras=())
-    with pytest.raises(RecordingError, match="No such file or directory"):
-        SimulatedWriter(tmp_path / "nowhere" / "a.mcap", info)
 
 
 def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:

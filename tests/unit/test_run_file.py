@@ -128,14 +128,6 @@ def test_numbers_that_no_run_has_are_damage(tmp_path: Path, change: Callable[[An
     assert words in str(error.value)
 
 
-def test_a_failed_attempt_may_have_no_recording(tmp_path: Path) -> None:
-    run = a_run()
-    failed = next(line for line in run.attempts if not line.success)
-    run = run.with_attempts([replace(line, file="") if line is failed else line for line in run.attempts])
-    save_run_file(run, tmp_path)
-    assert load_run_file(tmp_path) == run
-
-
 def make_nested(path: Path) -> None:
     path.write_text("[" * 100_000)
 
@@ -202,11 +194,6 @@ def test_a_newer_format_is_no_damage(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="format 2") as error:
         load_run_file(tmp_path)
     assert not isinstance(error.value, DamagedRunFileError)
-
-
-def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no run of generate-dataset"):
-        load_run_file(tmp_path)
 
 
 def test_the_digest_depends_on_content_and_on_nothing_else() -> None:

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tomllib
-from pathlib import Path
 
 import pytest
-
-import demorec.__main__
 
 INTERRUPTED_WHILE_LOADING = """
 import sys
@@ -30,14 +26,6 @@ def test_ctrl_c_while_it_loads(program: str) -> None:
     code = INTERRUPTED_WHILE_LOADING.format(program=program)
     process = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert (process.returncode, process.stdout, process.stderr) == (130, "", "")
-
-
-def test_the_programs_begin_there() -> None:
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
-    for place in project["project"]["scripts"].values():
-        module, function = place.split(":")
-        assert module == demorec.__main__.__name__
-        assert callable(getattr(demorec.__main__, function))
 
 
 def test_python_m_demorec() -> None:

@@ -7,36 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from support.export import export
 from support.recording import make_episode
 
 from demorec.core.errors import ConfigError
-from demorec.datasets import episode
-from demorec.learn.training.reader import INTERVENTION, Stretches
 from demorec.mcap import SimulatedWriter
-
-
-def stretches() -> Stretches:
-    """A demonstration of three frames, then a corrected episode: policy 2, expert 3, policy 1, expert 2."""
-    acts = [0, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1]
-    return Stretches(index=np.arange(11) + 100, episode_index=np.repeat([4, 5], [3, 8]), intervention=np.array(acts))
-
-
-def test_only_frames_of_the_expert_are_shown_each_about_as_often() -> None:
-    found = stretches()
-    expert = [0, 1, 2, 5, 6, 7, 9, 10]
-    assert found.shown[expert].tolist() == expert
-    shown_instead = found.shown[[3, 4, 8]].tolist()
-    assert set(shown_instead) <= set(expert)
-    assert len(set(shown_instead)) == 3
-    assert found.first.tolist() == [100] * 3 + [103] * 2 + [105] * 3 + [108] + [109] * 2
-    assert found.end.tolist() == [103] * 3 + [105] * 2 + [108] * 3 + [109] + [111] * 2
-
-
-def test_the_column_has_the_name_that_the_export_gives_it() -> None:
-    assert INTERVENTION == episode.INTERVENTION
 
 
 def write(path: Path, episode_index: int, phases: Sequence[str]) -> None:

@@ -14,49 +14,20 @@ from numpy.typing import NDArray
 from support.sim import body_index, episode, run
 
 from demorec.core.errors import SceneError
-from demorec.core.geometry import Pose, wrap_angle
+from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Frame
 from demorec.episode.scene import Body, Shape, ShapeKind
 from demorec.loop import Episode, make_world
 from demorec.robots.panda import PANDA
 from demorec.sim.world import World
-from demorec.tasks import skills
-from demorec.tasks.grasping import grasp_yaws, grasps_beside, hand_down, hand_yaw, raised, symmetric_yaws
-from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+from demorec.tasks.grasping import grasps_beside, hand_down, raised
+from demorec.tasks.sampling import Region, Sampler
 from demorec.tasks.script import Behaviour
-from demorec.tasks.things import words_for
-from demorec.tasks.waiting import lasting
 
 
 def sampler(seed: int = 0) -> Sampler:
     return Sampler(np.random.default_rng(seed))
-
-
-@pytest.mark.parametrize(
-    ("name", "color", "words"),
-    [("cube_2", "red", "red cube"), ("duck", "", "duck"), ("tea_pot_lid", "blue", "tea pot lid")],
-)
-def test_things_have_words_whatever_they_are_called(name: str, color: str, words: str) -> None:
-    body = Body(
-        name=name,
-        role="object",
-        shape=Shape(kind="box", size=(0.04, 0.04, 0.04)),
-        world_from_body=Pose(),
-        mass=0.1,
-        color_name=color,
-    )
-    assert words_for(body) == words
-
-
-def test_points_keep_their_distance_and_stay_inside() -> None:
-    draw = sampler()
-    for _ in range(300):
-        first = draw.point(WORKSPACE)
-        second = draw.point(WORKSPACE, away_from=[first], min_distance=0.2)
-        assert WORKSPACE.contains(first)
-        assert WORKSPACE.contains(second)
-        assert math.dist(first, second) >= 0.2
 
 
 def test_a_full_table_is_a_scene_error() -> None:
@@ -64,30 +35,6 @@ def test_a_full_table_is_a_scene_error() -> None:
         sampler().point(
             Region(x=(0.4, 0.5), y=(0.0, 0.1)), away_from=[(0.45, 0.05)], min_distance=0.2, what="the tenth cube"
         )
-
-
-def test_placements_follow_the_stratified_point_first() -> None:
-    draw = Sampler(np.random.default_rng(0), unit_point=(0.5, 0.25))
-    assert draw.point(WORKSPACE) == (0.5, -0.125)
-    assert draw.point(WORKSPACE) != (0.5, -0.125)
-
-
-def test_layouts_cover_the_promised_ranges() -> None:
-    scenes = [episode(index).info.scene for index in range(200)]
-    cubes = [scene.body("red_cube") for scene in scenes]
-    positions = np.array([cube.world_from_body.position for cube in cubes])
-    assert positions[:, 0].min() < 0.36
-    assert positions[:, 0].max() > 0.64
-    assert positions[:, 1].min() < -0.24
-    assert positions[:, 1].max() > 0.24
-    sides = np.array([cube.shape.size[0] for cube in cubes])
-    masses = np.array([cube.mass for cube in cubes])
-    frictions = np.array([cube.lateral_friction for cube in cubes])
-    for values, low, high in ((sides, 0.03, 0.06), (masses, 0.02, 0.2), (frictions, 0.4, 1.2)):
-        assert low <= values.min() < low + 0.05 * (high - low)
-        assert high - 0.05 * (high - low) < values.max() <= high
-    targets = np.array([scene.body("green_target").world_from_body.position for scene in scenes])
-    assert np.hypot(*(targets - positions)[:, :2].T).min() >= 0.12
 
 
 def body(size: tuple[float, ...], symmetry: int = 1, kind: ShapeKind = "box") -> Body:
@@ -103,30 +50,6 @@ def rolled(degrees: float) -> Pose:
 
 def shifted(pose: Pose, x: float = 0.0, z: float = 0.0) -> Pose:
     return Pose(position=pose.position + np.array([x, 0.0, z]), quat_xyzw=pose.quat_xyzw)
-
-
-def test_fingers_close_over_faces_that_fit() -> None:
-    flat = body((0.12, 0.03, 0.04))
-    yaws = grasp_yaws(flat, Pose.from_yaw([0.5, 0, 0.02], 0.3), 0.0, 0.08)
-    # The fingers move along the hand's y axis: over the 3 cm side (y of the box) the hand's x axis is the box's.
-    assert sorted(round(wrap_angle(yaw - 0.3) % math.pi, 9) for yaw in yaws) == pytest.approx([0, 0], abs=1e-6)
-    assert len(grasp_yaws(body((0.04, 0.04, 0.04)), Pose(), 0.0, 0.08)) == 4
-    assert grasp_yaws(body((0.2, 0.2, 0.04)), Pose(), 0.0, 0.08) == []
-    assert wrap_angle(grasp_yaws(body((0.02, 0.06), 0, "cylinder"), Pose(), 0.7, 0.08)[0]) == pytest.approx(0.7)
-
-
-def test_a_cube_on_its_side_is_grasped_squarely_too() -> None:
-    tipped = Pose.from_yaw([0.5, 0, 0.02], 0.4) @ rolled(90)
-    yaws = grasp_yaws(body((0.04, 0.04, 0.04)), tipped, 0.0, 0.08)
-    assert [math.remainder(yaw - 0.4, math.pi / 2) for yaw in yaws] == pytest.approx([0.0] * 4, abs=1e-9)
-
-
-def test_hand_poses() -> None:
-    pose = hand_down((0.4, 0.1, 0.2), 0.6)
-    assert hand_yaw(pose) == pytest.approx(0.6)
-    assert pose.rotation[:, 2] == pytest.approx([0, 0, -1])
-    assert raised(pose, 0.1).position == pytest.approx([0.4, 0.1, 0.3])
-    assert len(symmetric_yaws(0.1, 4)) == 4
 
 
 @pytest.fixture(scope="module")
@@ -235,20 +158,6 @@ def test_several_objects_are_missed_once() -> None:
     assert len({event.message for frame in frames for event in frame.events if event.name == "place"}) >= 2
 
 
-def test_where_there_is_no_free_side_nothing_is_missed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(skills, "grasps_beside", lambda *_, **__: [])
-    frames, outcome = run(behave(episode(5), miss_x=0.03))
-    assert outcome.success
-    assert outcome.num_retries == 0
-    assert not any(frame.is_deliberate_miss for frame in frames)
-
-
-def test_lasting_asks_for_a_row_without_a_gap() -> None:
-    answers = iter([True, True, False, True, True, True, True])
-    done = lasting(lambda: next(answers), steps=3)
-    assert [done() for _ in range(7)] == [False, False, False, False, False, True, True]
-
-
 def cube_at(x: float, y: float, *, side: float = 0.04, yaw: float = 0.0) -> tuple[Body, Pose]:
     return body((side, side, side)), Pose.from_yaw([x, y, side / 2], yaw)
 
@@ -270,24 +179,6 @@ def test_a_miss_goes_to_the_free_side() -> None:
     assert sides((body((0.3, 0.3, 0.02)), below)) == [-0.05, 0.05]  # ends under the finger tips
     assert sides((body((0.3, 0.3, 0.03)), below)) == []
     assert sides((dataclasses.replace(body((0.3, 0.3, 0.03)), collides=False), below)) == [-0.05, 0.05]
-
-
-@pytest.mark.parametrize(("side", "yaw", "half"), [(0.06, 0.0, 0.030), (0.03, 0.0, 0.015), (0.04, 0.6, 0.0278)])
-def test_a_miss_is_as_far_as_the_fingers_need(side: float, yaw: float, half: float) -> None:
-    """`half` is that of the cube along the hand's x axis: side / 2 (cos yaw + sin yaw); half a finger is 12 mm."""
-    cube, pose = cube_at(0.5, 0.1, side=side, yaw=yaw)
-    grasp = hand_down((0.49, 0.1, side / 2), 0.0)
-    for x in (0.02, 0.05):
-        ahead, behind = grasps_beside(grasp, cube, pose, x=x, y=0.004, others=(), robot=PANDA)
-        for miss, sign in ((ahead, 1), (behind, -1)):
-            distance = sign * (miss.position[0] - 0.5)
-            assert distance == pytest.approx(max(x, half + 0.012 + 0.005), abs=1e-4)
-            assert miss.position[1:].tolist() == pytest.approx([0.096, side / 2])  # the hand's y axis points to -y
-
-
-def test_without_a_miss_nothing_is_flagged() -> None:
-    frames, _ = run(episode(5))
-    assert not any(frame.is_deliberate_miss for frame in frames)
 
 
 def test_perception_error_shifts_the_grasp() -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-import logging
 import sys
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.cli.shared.output import OutputError, PrintableFormatter, aligned, say, tell
+from demorec.cli.shared.output import OutputError, aligned, say, tell
 from demorec.core.text import display_width, printable
 
 
@@ -19,11 +18,6 @@ def test_nothing_that_a_terminal_obeys_is_left(text: str) -> None:
     shown = printable(text)
     assert not any(ord(character) < 0x20 or 0x7F <= ord(character) < 0xA0 for character in shown)
     assert not set(shown) & set("\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
-
-
-@given(st.text(st.characters(whitelist_categories=("L", "N", "P"))))
-def test_ordinary_text_of_any_alphabet_stays_as_it_is(text: str) -> None:
-    assert printable(text) == text
 
 
 @pytest.mark.parametrize(
@@ -64,22 +58,8 @@ def test_a_full_disk_behind_the_output_is_told(monkeypatch: pytest.MonkeyPatch) 
             say("x" * 10)
 
 
-@pytest.mark.parametrize(
-    ("text", "width"),
-    [("abc", 3), ("把红色", 6), ("ｆ", 2), ("e\u0301", 1), ("Ωß", 2), ("", 0), ("✓", 1)],
-)
-def test_a_text_takes_the_columns_that_a_terminal_gives_it(text: str, width: int) -> None:
-    assert display_width(text) == width
-
-
 @given(st.lists(st.tuples(st.text(), st.text(min_size=1)), min_size=1))
 def test_columns_stand_below_each_other_whatever_is_in_them(cells: list[tuple[str, str]]) -> None:
     rows = aligned([("name", "|"), *((name, "|") for name, _ in cells)])
     assert len({display_width(row.rpartition("|")[0]) for row in rows}) == 1
     assert all(printable(row) == row for row in rows)
-
-
-@pytest.mark.parametrize(("name", "line"), [("demorec.render.raster", "Compiling."), ("numba", "WARNING: Compiling.")])
-def test_only_lines_of_other_libraries_begin_with_their_level(name: str, line: str) -> None:
-    record = logging.LogRecord(name, logging.WARNING, "", 0, "Compiling.", None, None)
-    assert PrintableFormatter().format(record) == line

@@ -35,32 +35,6 @@ def test_rows_are_taken_from_any_chunks(lengths: list[int], rows: list[int], joi
 
 
 @pytest.mark.parametrize(
-    ("kind", "rows"),
-    [
-        (pa.float32(), [0.1, -0.0, 3e-39]),
-        (pa.float64(), [0.1, 1e300, float("inf")]),
-        (pa.int32(), [1, -2, 3]),
-        (pa.uint8(), [255, 0, 7]),
-        (pa.bool_(), [True, False, True]),
-        (pa.list_(pa.float32(), 2), [[0.1, 2.0], [3.0, 4.0], [5.0, 6.0]]),
-        (pa.list_(pa.list_(pa.int64())), [[[1, 2], [3, 4]], [[5, 6], [7, 8]], [[9, 1], [2, 3]]]),
-        (pa.list_(pa.bool_()), [[True], [False], [True]]),
-    ],
-)
-def test_numbers_get_the_types_that_torch_gives_them(kind: pa.DataType, rows: list[object]) -> None:
-    import torch
-
-    from demorec.learn.training.columns import numbers
-
-    column = numbers(pa.chunked_array([pa.array(rows[:1], kind), pa.array([], kind), pa.array(rows[1:], kind)]))
-    assert column is not None
-    for found, row in zip(column.tensor(np.arange(3)), rows, strict=True):
-        wanted = torch.tensor(row)
-        assert (found.dtype, found.shape) == (wanted.dtype, wanted.shape)
-        assert torch.equal(found, wanted)
-
-
-@pytest.mark.parametrize(
     "array",
     [
         pa.array(["a", "b"]),
@@ -78,30 +52,6 @@ def test_what_is_no_array_of_numbers_is_left_to_lerobot(array: pa.Array) -> None
     from demorec.learn.training.columns import numbers
 
     assert numbers(pa.chunked_array([array])) is None
-
-
-def test_lists_that_differ_between_chunks_are_left_to_lerobot() -> None:
-    from demorec.learn.training.columns import numbers
-
-    kind = pa.list_(pa.float32())
-    assert numbers(pa.chunked_array([pa.array([[1.0]], kind), pa.array([[1.0, 2.0]], kind)])) is None
-
-
-@settings(deadline=None)  # the first example loads PyTorch
-@given(sizes=st.lists(st.integers(1, 40), max_size=30), limit=st.integers(0, 100))
-def test_the_cache_stays_within_its_limit_and_keeps_the_latest(sizes: list[int], limit: int) -> None:
-    import torch
-
-    from demorec.learn.training.pictures import DecodedFrame, FrameCache
-
-    cache = FrameCache(limit)
-    for number, size in enumerate(sizes):
-        frame = DecodedFrame(torch.zeros(size, dtype=torch.uint8), 0.0)
-        cache.put("a", number, frame)
-        assert (cache.get("a", number) is frame) is (size <= limit)
-        assert cache.get("b", number) is None
-        held = [size for n, size in enumerate(sizes[: number + 1]) if cache.get("a", n) is not None]
-        assert cache.num_bytes == sum(held) <= limit
 
 
 def test_what_was_wanted_lately_is_kept() -> None:
@@ -169,17 +119,3 @@ def test_frames_of_a_batch_are_decoded_once(tmp_path: Path, monkeypatch: pytest.
     # Each from its key frame on, or from where the one before has ended.
     assert passed == [*range(6), *range(10, 13), *range(30, 39)]
     file.close()
-
-
-def test_a_video_without_frames_is_refused(tmp_path: Path) -> None:
-    from lerobot.datasets.video_utils import FrameTimestampError
-
-    from demorec.learn.training.pictures import VideoFile
-
-    path = tmp_path / "v.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
-        container.mux(stream.encode())
-    with pytest.raises((FrameTimestampError, OSError)):
-        VideoFile(str(path), "rgb24")

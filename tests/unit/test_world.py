@@ -15,9 +15,8 @@ from support.sim import body_index, episode, run
 
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Pose
-from demorec.core.plain import from_json, to_json
 from demorec.episode.episode import Action
-from demorec.episode.scene import Body, Scene, Shape, Texture
+from demorec.episode.scene import Body, Scene, Shape
 from demorec.robots.panda import PANDA
 from demorec.sim.client import connect
 from demorec.sim.world import World
@@ -44,13 +43,6 @@ def with_bodies(scene: Scene, *bodies: Body) -> Scene:
     return dataclasses.replace(scene, bodies=(*scene.bodies, *bodies), goals=())
 
 
-def test_the_scene_alone_is_enough(world: World, scene: Scene) -> None:
-    world.reset(scene)
-    first = world.state_digest()
-    world.reset(from_json(to_json(scene), Scene))
-    assert world.state_digest() == first
-
-
 def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> None:
     world.reset(scene)
     hold(world, 3)
@@ -68,23 +60,6 @@ def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> No
     at_rest = world.client.calculateInverseDynamics(world.arm.body, seen.joint_position.tolist(), [0.0] * 9, [0.0] * 9)
     assert np.abs(seen.joint_effort[:7] - at_rest[:7]).max() < 0.01
     assert np.abs(at_rest[:7]).max() > 10
-
-
-def test_one_command_is_one_frame_of_physics(scene: Scene) -> None:
-    with World(PANDA, fps=30, sample_joints=True) as world:
-        world.reset(scene)
-        assert not world.joint_samples
-        q = world.arm.target + 0.02
-        command = Action(joint_target=q, gripper_target=0.08, base_from_tcp_target=world.arm.kinematics.forward(q))
-        before = world.observe().joint_position
-        world.apply(command)
-        samples = world.joint_samples
-        after = world.observe().joint_position
-        assert [sample.time_ns for sample in samples] == [round(1e9 * k / 240) for k in range(1, 8)]
-        rows = np.array([before, *[sample.joint_position for sample in samples], after])[:, :7]
-        assert (np.diff(rows, axis=0) > 0).all(), "the joints move steadily towards the target"
-        world.apply(command)
-        assert world.joint_samples[0].time_ns == round(1e9 * 9 / 240)
 
 
 def test_the_force_torque_sensor_does_not_touch_the_physics(world: World, scene: Scene) -> None:
@@ -114,27 +89,6 @@ def test_the_wrench_grows_by_the_weight_of_what_is_lifted() -> None:
     assert abs((free - held) - 9.81 * prepared.info.scene.body("red_cube").mass) < 0.15
 
 
-def test_set_state_places_everything_exactly(world: World, scene: Scene) -> None:
-    world.reset(scene)
-    q = np.concatenate([np.array(PANDA.home_q) + 0.1, [0.01, 0.01]])
-    pose = Pose.from_yaw([0.5, 0.1, 0.3], 0.4)
-    world.set_state(joint_position=q, object_poses={"red_cube": pose})
-    seen = world.observe()
-    assert np.array_equal(seen.joint_position, q)
-    assert np.allclose(seen.object_poses["red_cube"].vector(), pose.vector(), atol=1e-15)
-    assert not seen.joint_velocity.any()
-
-
-def test_set_state_takes_the_speed_away(world: World, scene: Scene) -> None:
-    world.reset(scene)
-    lifted = Pose(position=np.array([0.5, 0.1, 0.5]))
-    world.set_state(object_poses={"red_cube": lifted})
-    hold(world, 3)
-    assert world.velocity("red_cube")[0][2] < -0.5
-    world.set_state(object_poses={"red_cube": lifted})
-    assert not world.velocity("red_cube")[0].any()
-
-
 def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(world: World, scene: Scene) -> None:
     pose = Pose.from_yaw([0.5, 0.3, 0.4], 0.8)
     duck = Body(
@@ -150,44 +104,6 @@ def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(w
     assert world.client.getDynamicsInfo(body_index(world, "duck"), -1)[0] == 0.1
     world.set_state(object_poses={"duck": pose})
     assert np.allclose(world.pose("duck").vector(), pose.vector(), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("shape", "height"),
-    [
-        (Shape(kind="box", size=(0.04, 0.05, 0.06)), 0.06),
-        (Shape(kind="sphere", size=(0.03,)), 0.06),
-        (Shape(kind="cylinder", size=(0.02, 0.07)), 0.07),
-        (Shape(kind="capsule", size=(0.02, 0.05)), 0.09),
-    ],
-)
-def test_shapes_have_the_size_that_they_say(world: World, scene: Scene, shape: Shape, height: float) -> None:
-    body = Body(
-        name="thing", role="object", shape=shape, world_from_body=Pose(position=np.array([0.5, 0.4, 1.0])), mass=0.1
-    )
-    world.reset(with_bodies(scene, body))
-    low, high = world.client.getAABB(body_index(world, "thing"))
-    assert abs(high[2] - low[2] - height) < 0.005
-    assert abs(shape.extents[2] - height) < 1e-12
-
-
-def test_a_mark_is_seen_but_not_felt(world: World, scene: Scene) -> None:
-    world.reset(scene)
-    mark = scene.body("green_target")
-    above = Pose(position=mark.world_from_body.position + np.array([0.0, 0.0, 0.1]))
-    world.set_state(object_poses={"red_cube": above})
-    hold(world, 40)
-    side = scene.body("red_cube").shape.size[2]
-    assert abs(world.pose("red_cube").position[2] - side / 2) < 5e-4
-
-
-def test_digest_tells_one_bit(world: World, scene: Scene) -> None:
-    world.reset(scene)
-    first = world.state_digest()
-    pose = world.pose("red_cube")
-    nudged = Pose(position=np.nextafter(pose.position, 1.0), quat_xyzw=pose.quat_xyzw)
-    world.set_state(object_poses={"red_cube": nudged})
-    assert world.state_digest() != first
 
 
 def test_parameters_of_another_client_do_not_leak() -> None:
@@ -236,12 +152,6 @@ def test_broken_model_file_is_a_scene_error(
         world.reset(with_bodies(scene, body))
 
 
-def test_close_twice_is_harmless() -> None:
-    world = World(PANDA)
-    world.close()
-    world.close()
-
-
 def test_a_client_that_nobody_refers_to_is_freed() -> None:
     client = connect()
     is_connected = client.isConnected
@@ -272,28 +182,3 @@ os.kept = World(PANDA)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_connecting_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    connect().disconnect()
-    captured = capfd.readouterr()
-    assert captured.out == captured.err == ""
-
-
-def test_visuals_are_read_anew_when_a_colour_is_changed(world: World, scene: Scene) -> None:
-    world.reset(scene)
-    before = world.visuals()
-    assert world.visuals() is before
-    cube = body_index(world, "red_cube")
-    assert before[cube].name == "red_cube"
-    world.client.changeVisualShape(cube, -1, rgbaColor=[0.0, 0.0, 1.0, 1.0])
-    assert world.visuals()[cube].visuals[0].rgba == (0.0, 0.0, 1.0, 1.0)
-    world.reset(scene)
-    assert world.visuals() == before
-
-
-def test_textures_are_told_whether_or_not_the_scene_has_cameras(world: World, scene: Scene) -> None:
-    texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)))
-    covered = tuple(dataclasses.replace(body, texture=texture) for body in scene.bodies)
-    world.reset(dataclasses.replace(scene, bodies=covered, cameras=()))
-    assert [body.texture for body in world.visuals() if body.name != PANDA.name] == [texture] * len(covered)
