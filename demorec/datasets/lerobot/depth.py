@@ -116,11 +116,13 @@ def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
         context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
         context.width, context.height, context.pix_fmt = width, height, "gray12le"
         context.time_base, context.framerate = Fraction(1, fps), Fraction(fps, 1)
-        # No reordering and nothing said on the terminal; keyframes that stand alone.
+        # No reordering and nothing printed; keyframes that stand alone. One thread and no note of the encoder's
+        # settings in the stream: both depend on the machine, and the same images shall give the same bytes anywhere.
         context.options = {
             "g": str(_GOP),
             "crf": str(_CRF),
-            "x265-params": f"{_PARAMETERS}:bframes=0:repeat-headers=1:open-gop=0:log-level=none",
+            "x265-params": f"{_PARAMETERS}:bframes=0:repeat-headers=1:open-gop=0:info=0:pools=none:frame-threads=1"
+            ":log-level=none",
         }
         context.open()
     except (av.FFmpegError, ValueError) as error:
