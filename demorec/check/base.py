@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from demorec.check.limits import limit_table
 from demorec.core.errors import DemorecError, MissingDependencyError, NotAllowedError, resource_error
 from demorec.core.geometry import Array
+from demorec.episode.sensed import STREAMS
 
 Level = Literal["pass", "warn", "fail", "skip"]
 Form = Literal["simulated", "external", "run", "external run", "dataset"]
@@ -48,6 +49,7 @@ PICTURE_TOPICS = (*COLOR_TOPICS, "/camera/{camera}/depth", "/camera/{camera}/seg
 """The same with its other pictures."""
 MOTION_TOPICS = ("/joint_states", "/object/{body}/pose")
 """Where it is said how everything moves that a camera sees."""
+SENSED_TOPICS = tuple(stream.topic for _, stream in STREAMS.values())
 EE_TOPICS = ("/ee_pose", "/action/ee_pose", "/command/ee_pose")
 
 

@@ -17,6 +17,7 @@ from demorec.check.base import (
     EE_POSES,
     EFFORTS,
     GRIPPER,
+    SENSED_TOPICS,
     STATE_ALONE,
     URDF,
     VELOCITIES,
@@ -343,7 +344,7 @@ def elements_alive(subject: Moving) -> Found:
     fail=math.inf,
     simulated=(2, 4),
     needs=STATE_ALONE,
-    reads=(STATE, VELOCITY, EE_POSE, "/{feature}", "/joint_states", "/ee_pose", "/wrench"),
+    reads=(STATE, VELOCITY, EE_POSE, "/{feature}", "/joint_states", "/ee_pose", *SENSED_TOPICS),
 )
 def stuck_sensors(subject: Moving) -> Iterator[Found]:
     """What is measured changes, if ever so little, while the arm moves.

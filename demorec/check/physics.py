@@ -9,6 +9,7 @@ import numpy as np
 
 from demorec.check.base import (
     EE_TOPICS,
+    SENSED_TOPICS,
     Found,
     Lacking,
     Measurement,
@@ -32,7 +33,7 @@ from demorec.episode.features import EE_POSE, STATE
         "/action",
         "/command",
         *EE_TOPICS,
-        "/wrench",
+        *SENSED_TOPICS,
         "/object/{body}/pose",
         "/camera/{camera}/pose",
     ),
@@ -46,7 +47,7 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
         "joint_effort": c.joint_effort,
         "gripper_width": c.gripper_width,
         "contact_force": c.contact_force,
-        **({} if c.wrench is None else {"wrench": c.wrench}),
+        **c.sensed,
         "base_from_tcp": c.base_from_tcp,
         "action": np.column_stack([c.action_joint_target, c.action_gripper, c.action_base_from_tcp]),
         "command": np.column_stack([c.command_joint_target, c.command_gripper, c.command_base_from_tcp]),
@@ -186,10 +187,11 @@ def wrench_holds_the_hand(episode: CheckedEpisode) -> Measurement | None:
     """
     c, fps = episode.columns, episode.info.fps
     gravity = np.array(episode.info.scene.physics.gravity)
-    if c.wrench is None or c.num_frames < 3 or not gravity.any():
+    wrench = c.sensed.get("wrench")
+    if wrench is None or c.num_frames < 3 or not gravity.any():
         return None
     hand = episode.world_from_link(episode.info.robot.hand_link)
-    force = (hand[:, :3, :3] @ c.wrench[:, :3, None])[1:-1, :, 0]
+    force = (hand[:, :3, :3] @ wrench[:, :3, None])[1:-1, :, 0]
     steady = np.linalg.norm(np.diff(hand[:, :3, 3], 2, axis=0), axis=1) * fps**2 < 0.05 * np.linalg.norm(gravity)
     steady &= c.contact_force[1:-1] == 0
     if not steady.any():
@@ -254,7 +256,7 @@ def idle_frames(episode: CheckedEpisode) -> Measurement | None:
 )
 def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""
-    wrench = episode.columns.wrench
+    wrench = episode.columns.sensed.get("wrench")
     if wrench is None:
         return None
     dynamics = episode.dynamics

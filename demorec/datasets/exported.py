@@ -55,7 +55,6 @@ class _Simulated(ExportEpisode):
         info = recording.info
         self.fps = info.fps // frame_stride(info.fps, options.fps)
         self._state: StateKind = getattr(options, "state", "joint")
-        # Recordings of format version 1 have no wrench.
         self._sensed = [name for name in SENSED if name in options.features and self._has(name)]
         names = observation_names(
             info.robot, info.scene, privileged=options.privileged, state=self._state, sensed=self._sensed
@@ -76,7 +75,8 @@ class _Simulated(ExportEpisode):
         return (*(name for name in SENSED if self._has(name)), COMMAND)
 
     def _has(self, name: str) -> bool:
-        return name != "observation.wrench" or channels.WRENCH in self.simulated.recording.topics
+        stream = SENSED[name].stream
+        return stream is None or stream.topic in self.simulated.recording.topics
 
     @property
     def origin(self) -> str:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
-from support.present import present
 
 from demorec.check.rows import matrices
 from demorec.episode.episode import SuccessCheck
@@ -141,22 +140,22 @@ def not_a_number(s: Spoilt) -> None:
 
 
 def wrench_not_a_number(s: Spoilt) -> None:
-    wrench = present(s.columns.wrench).copy()
+    wrench = s.columns.sensed["wrench"].copy()
     wrench[40, 5] = np.nan
-    s.set(wrench=wrench)
+    s.set(sensed={"wrench": wrench})
 
 
 def wrench_of_the_load(s: Spoilt) -> None:
     # What the hand does to the arm, in place of what the arm does to the hand.
-    s.set(wrench=-present(s.columns.wrench))
+    s.set(sensed={"wrench": -s.columns.sensed["wrench"]})
 
 
 def torque_before_force(s: Spoilt) -> None:
-    s.set(wrench=present(s.columns.wrench)[:, [3, 4, 5, 0, 1, 2]])
+    s.set(sensed={"wrench": s.columns.sensed["wrench"][:, [3, 4, 5, 0, 1, 2]]})
 
 
 def wrench_along_other_axes(s: Spoilt) -> None:
-    s.set(wrench=present(s.columns.wrench)[:, [2, 0, 1, 5, 3, 4]])
+    s.set(sensed={"wrench": s.columns.sensed["wrench"][:, [2, 0, 1, 5, 3, 4]]})
 
 
 def a_jump_while_untouched(s: Spoilt) -> None:

@@ -39,6 +39,10 @@ def column(name: str, change: Callable[[Rows], Rows]) -> Fault:
     return lambda c: c.with_columns(**{name: change(getattr(c.columns, name))})
 
 
+def wrench(change: Callable[[Rows], Rows]) -> Fault:
+    return lambda c: c.with_columns(sensed={"wrench": change(c.columns.sensed["wrench"])})
+
+
 def phases(change: Callable[[list[str]], list[str]]) -> Fault:
     return lambda c: c.with_columns(phase=tuple(change(list(c.columns.phase))))
 
@@ -163,13 +167,13 @@ CASES: list[tuple[str, Fault, str]] = [
     ("efforts frozen", column("joint_effort", frozen), "stuck_sensors"),
     ("efforts frozen for a while", column("joint_effort", stuck(60, 70)), "stuck_sensors"),
     ("velocities frozen for a while", column("joint_velocity", stuck(60, 70)), "stuck_sensors"),
-    ("wrench frozen", column("wrench", frozen), "stuck_sensors"),
-    ("wrench halved", column("wrench", halved), "wrench_bears_the_hand"),
-    ("wrench doubled", column("wrench", doubled), "wrench_bears_the_hand"),
-    ("wrench in another unit", column("wrench", lambda rows: rows / 9.81), "wrench_bears_the_hand"),
-    ("wrench of zero", column("wrench", lambda rows: rows * 0), "wrench_bears_the_hand"),
-    ("wrench of exchanged axes", column("wrench", lambda r: r[:, [2, 1, 0, 5, 4, 3]]), "wrench_bears_the_hand"),
-    ("wrench in the world's axes", column("wrench", lambda r: r * [1, -1, -1, 1, -1, -1]), "wrench_bears_the_hand"),
+    ("wrench frozen", wrench(frozen), "stuck_sensors"),
+    ("wrench halved", wrench(halved), "wrench_bears_the_hand"),
+    ("wrench doubled", wrench(doubled), "wrench_bears_the_hand"),
+    ("wrench in another unit", wrench(lambda rows: rows / 9.81), "wrench_bears_the_hand"),
+    ("wrench of zero", wrench(lambda rows: rows * 0), "wrench_bears_the_hand"),
+    ("wrench of exchanged axes", wrench(lambda r: r[:, [2, 1, 0, 5, 4, 3]]), "wrench_bears_the_hand"),
+    ("wrench in the world's axes", wrench(lambda r: r * [1, -1, -1, 1, -1, -1]), "wrench_bears_the_hand"),
     ("noise doubled", lambda c: c.with_columns(
         command_joint_target=2 * c.columns.command_joint_target - c.columns.action_joint_target), "noise_as_said"),
     ("labels in place of commands", lambda c: c.with_columns(

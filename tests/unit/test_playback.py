@@ -77,8 +77,7 @@ def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], 
 @pytest.mark.parametrize(("plot", "part"), [("hand_force", slice(0, 3)), ("hand_torque", slice(3, 6))])
 def test_the_wrench_is_plotted(saved: dict[str, list[Any]], recording: Path, plot: str, part: slice) -> None:
     with SimulatedRecording(recording) as source:
-        wrench = source.columns().wrench
-    assert wrench is not None
+        wrench = source.columns().sensed["wrench"]
     rows = _column(saved[f"/plots/{plot}"], "Scalars:scalars")
     np.testing.assert_array_equal([value for _, value in rows], wrench[:, part])
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.check import checked, level_of, rewrite_messages
-from support.present import present
 from support.recording import make_episode, write_episode
 
 from demorec.core.errors import RecordingError
@@ -34,7 +33,7 @@ def record(path: Path, info: SimulatedInfo, frames: list[Frame], outcome: Outcom
 
 
 def without_wrench(frames: list[Frame]) -> list[Frame]:
-    return [replace(frame, observation=replace(frame.observation, wrench=None)) for frame in frames]
+    return [replace(frame, observation=replace(frame.observation, sensed={})) for frame in frames]
 
 
 def test_every_column_comes_from_one_stream() -> None:
@@ -76,8 +75,8 @@ def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
         SimulatedRecording(write_episode(tmp_path / "new.mcap", num_frames=5, cameras=())) as new,
     ):
         assert set(new.topics) - set(recording.topics) == LATER
-        assert recording.columns().wrench is None
-        assert recording[2].observation.wrench is None
+        assert not recording.columns().sensed
+        assert not recording[2].observation.sensed
         assert not [name for name in recording.to_pandas() if name.startswith("wrench")]
         assert recording.digest() != new.digest()
         digest = recording.digest()
@@ -107,9 +106,9 @@ def test_a_stream_that_the_version_must_have_is_missed(topic: str, tmp_path: Pat
 
 def test_one_bit_of_the_wrench_is_another_digest(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=5, cameras=())
-    wrench = present(frames[3].observation.wrench).copy()
+    wrench = frames[3].observation.sensed["wrench"].copy()
     wrench[4] = np.nextafter(wrench[4], 99.0)
-    changed = replace(frames[3], observation=replace(frames[3].observation, wrench=wrench))
+    changed = replace(frames[3], observation=replace(frames[3].observation, sensed={"wrench": wrench}))
     with (
         SimulatedRecording(record(tmp_path / "a.mcap", info, frames, outcome)) as one,
         SimulatedRecording(record(tmp_path / "b.mcap", info, [*frames[:3], changed, frames[4]], outcome)) as other,
