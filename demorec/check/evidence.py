@@ -103,9 +103,7 @@ def motion_of_simulated(info: SimulatedInfo, c: SimulatedColumns, urdf: Urdf) ->
     robot = info.robot
     n = len(robot.arm_joints)
     nothing, inf = np.full((c.num_frames, 1), np.nan), (math.inf,)
-    sensors = {"velocities": c.joint_velocity, "efforts": c.joint_effort[:, :n], "EE pose": c.base_from_tcp}
-    if c.wrench is not None:
-        sensors["wrench"] = c.wrench
+    sensors = {"velocities": c.joint_velocity, "efforts": c.joint_effort[:, :n], "EE pose": c.base_from_tcp, **c.sensed}
     return Motion(
         where="",
         fps=info.fps,

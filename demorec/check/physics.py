@@ -34,7 +34,7 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
         "joint_effort": c.joint_effort,
         "gripper_width": c.gripper_width,
         "contact_force": c.contact_force,
-        **({} if c.wrench is None else {"wrench": c.wrench}),
+        **c.sensed,
         "base_from_tcp": c.base_from_tcp,
         "action": np.column_stack([c.action_joint_target, c.action_gripper, c.action_base_from_tcp]),
         "command": np.column_stack([c.command_joint_target, c.command_gripper, c.command_base_from_tcp]),
@@ -177,7 +177,7 @@ def idle_frames(episode: CheckedEpisode) -> Measurement | None:
 )
 def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""
-    wrench = episode.columns.wrench
+    wrench = episode.columns.sensed.get("wrench")
     if wrench is None:
         return None
     dynamics = episode.dynamics

@@ -97,9 +97,8 @@ class ExportEpisode:
         if isinstance(recording, SimulatedRecording):
             self.simulated = recording
             self.fps = info.fps // _frame_stride(info.fps, options.fps)
-            # Recordings of format version 1 have no wrench.
-            has_wrench = channels.WRENCH in recording.topics
-            sensed = [name for name in SENSED if name != "observation.wrench" or has_wrench]
+            streams = {name: row.stream for name, row in SENSED.items()}
+            sensed = [name for name, stream in streams.items() if stream is None or stream.topic in recording.topics]
             on_request = (*sensed, COMMAND)
             self._sensed = [name for name in sensed if name in options.features]
             robot, scene = recording.info.robot, recording.info.scene

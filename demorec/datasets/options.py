@@ -33,8 +33,8 @@ class CommonOptions:
     """Add observation.environment_state: poses and sizes that no sensor of a real robot gives."""
     features: tuple[str, ...] = ()
     """Names of the features to have, the others are left out; all by default. observation.state, action and what the
-    format itself needs (times, indices) stay whatever is named. Fewer features make training faster. Only when named:
-    observation.effort, observation.contact_force, observation.wrench and command, of simulated episodes."""
+    format itself needs (times, indices) stay whatever is named. Fewer features make training faster. Only when named,
+    of simulated episodes: command, and what is sensed, as observation.effort (docs/dataset-format.md lists it)."""
     depth: bool = False
     """Add depth images of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None

@@ -45,9 +45,7 @@ class Observation:
         base_from_tcp: TCP pose in the base frame.
         object_poses: name -> world_from_object, of every movable body of the scene.
         contact_force: Sum of the normal forces on the fingers, N.
-        wrench: (6,) force (N) and torque (N m) with which the arm holds the hand, as a force-torque sensor at the
-            hand's mount feels them: about the origin of `RobotSpec.hand_link` and along its axes. Nothing is taken off:
-            the weight and the inertia of hand, fingers and what they hold are in it. None when there is no sensor.
+        sensed: What else is sensed: quantity -> (D,), by the rows of `demorec.episode.sensed`.
     """
 
     joint_position: Array
@@ -57,7 +55,7 @@ class Observation:
     base_from_tcp: Pose
     object_poses: Mapping[str, Pose]
     contact_force: float
-    wrench: Array | None = None
+    sensed: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -247,7 +245,7 @@ class SimulatedColumns:
     base_from_tcp: Array  # (T, 7)
     object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
     contact_force: Array  # (T,)
-    wrench: Array | None = None  # (T, 6); None in recordings of format version 1
+    sensed: Mapping[str, Array]  # quantity -> (T, D), of those that the format version has
     action_joint_target: Array  # (T, n_arm)
     action_gripper: Array  # (T,)
     action_base_from_tcp: Array  # (T, 7)

@@ -113,7 +113,7 @@ def observation_vectors(
     if privileged:
         features[ENVIRONMENT_STATE] = _environment_columns(rows, robot, scene)
     for name, feature in SENSED.items():
-        if name in sensed and (values := feature.values(rows, robot)) is not None:
+        if name in sensed and (values := feature.values(rows.sensed, robot)) is not None:
             features[name] = [values]
     return {name: _joined(columns, dtype) for name, columns in features.items()}
 

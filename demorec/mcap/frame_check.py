@@ -20,9 +20,8 @@ from demorec.core.geometry import Array, Pose
 from demorec.core.registry import nearest_match
 from demorec.episode.episode import Frame, SimulatedInfo
 from demorec.episode.external import Camera, EpisodeInfo, SampledFrame
-from demorec.mcap.channels import WRENCH
+from demorec.episode.sensed import STREAMS
 from demorec.mcap.lossless import DEPTH_TYPES
-from demorec.mcap.streams import frame_streams
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 
@@ -50,7 +49,11 @@ class FrameCheck:
         self._objects = {body.name for body in info.scene.movable}
         self._cameras = {camera.name for camera in info.scene.cameras}
         self._version = info.format_version
-        self._has_wrench = any(stream.topic == WRENCH for stream in frame_streams(info))
+        self._sensed = {
+            name: (len(row.names(info.robot)),)
+            for name, (row, stream) in STREAMS.items()
+            if stream.since <= info.format_version
+        }
 
     def __call__(self, frame: Frame) -> None:
         """Raise RecordingError for what is wrong with a frame; missing images are found by who codes them."""
@@ -61,11 +64,9 @@ class FrameCheck:
         targets = [action.joint_target, command.joint_target]
         if {vector.shape for vector in joints} != {self._joints} or {vector.shape for vector in targets} != {self._arm}:
             raise _wrong_shape(frame, self._joints, joints, self._arm, targets)
-        wrenches = []
-        if self._has_wrench:
-            if seen.wrench is None or seen.wrench.shape != (6,):
-                raise self._wrong_wrench(frame)
-            wrenches.append(seen.wrench)
+        sensed = [seen.sensed.get(name) for name in self._sensed]
+        if [None if vector is None else vector.shape for vector in sensed] != [*self._sensed.values()]:
+            raise self._wrong_sensed(frame)
         if seen.object_poses.keys() != self._objects:
             raise _other_names(frame, "poses of the objects", seen.object_poses, self._objects)
         if not frame.images.keys() <= self._cameras:
@@ -73,20 +74,22 @@ class FrameCheck:
         poses = [seen.base_from_tcp, action.base_from_tcp_target, command.base_from_tcp_target]
         poses += seen.object_poses.values()
         poses += [images.world_from_camera for images in frame.images.values()]
-        numbers = np.concatenate(
-            joints + targets + wrenches + [part for pose in poses for part in (pose.position, pose.quat_xyzw)]
-        )
+        parts = [part for pose in poses for part in (pose.position, pose.quat_xyzw)]
+        numbers = np.concatenate([*joints, *targets, *seen.sensed.values(), *parts])
         scalars = (seen.gripper_width, seen.contact_force, action.gripper_target, command.gripper_target)
         # One sum in place of sixty questions; it is finite unless a summand is not, or all are absurdly large.
         if not math.isfinite(numbers.sum() + sum(scalars)):
             _refuse_not_finite(frame)
 
-    def _wrong_wrench(self, frame: Frame) -> RecordingError:
-        wrench = frame.observation.wrench
-        found = "no wrench" if wrench is None else f"a wrench of shape {wrench.shape}"
+    def _wrong_sensed(self, frame: Frame) -> RecordingError:
+        sensed = frame.observation.sensed
+        name, shape = next(
+            (name, shape) for name, shape in self._sensed.items() if name not in sensed or sensed[name].shape != shape
+        )
+        found = f"a {name} of shape {sensed[name].shape}" if name in sensed else f"no {name}"
         return RecordingError(
             f"Frame {frame.frame_index} has {found}; recordings of format version {self._version} have one of shape "
-            "(6,) at each frame, zeros where there is no force-torque sensor."
+            f"{shape} at each frame, zeros where nothing senses it."
         )
 
 
@@ -115,9 +118,10 @@ def _refuse_not_finite(frame: Frame) -> None:
     owners |= {f"joint sample at {sample.time_ns} ns": sample for sample in frame.joint_samples}
     owners |= {f"image of {name}": images for name, images in frame.images.items()}
     for owner, value in owners.items():
-        for field in fields(value):
-            if not _is_finite(getattr(value, field.name)):
-                raise RecordingError(f"Frame {frame.frame_index} has a {field.name} in its {owner} that is not finite.")
+        numbers = {field.name: getattr(value, field.name) for field in fields(value)}
+        for name, found in {**numbers, **numbers.get("sensed", {})}.items():
+            if name != "sensed" and not _is_finite(found):
+                raise RecordingError(f"Frame {frame.frame_index} has a {name} in its {owner} that is not finite.")
 
 
 def _is_finite(value: Any) -> bool:

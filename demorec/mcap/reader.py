@@ -317,11 +317,9 @@ def _column_bytes(columns: SimulatedColumns) -> Iterator[tuple[str, bytes]]:
     """Name and bytes of every column that was recorded."""
     for field in dataclasses.fields(columns):
         value = getattr(columns, field.name)
-        if value is None:
-            continue
         if isinstance(value, Mapping):
             for key in sorted(value):
-                yield f"{field.name}/{key}", value[key].tobytes()
+                yield key if field.name == "sensed" else f"{field.name}/{key}", value[key].tobytes()
         else:
             yield field.name, value.tobytes() if isinstance(value, np.ndarray) else "\n".join(value).encode()
 

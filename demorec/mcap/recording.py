@@ -20,6 +20,7 @@ from PIL import Image
 from demorec.core.errors import MissingDependencyError, RecordingError
 from demorec.core.text import printable
 from demorec.episode.episode import CameraImages, Event, Frame, JointSample, SimulatedColumns
+from demorec.episode.sensed import STREAMS
 from demorec.mcap.external_reader import Recording
 from demorec.mcap.reader import NotSimulatedError, RecordingReader
 from demorec.mcap.streams import action_at, observation_at, pose_of
@@ -88,8 +89,8 @@ class SimulatedRecording(RecordingReader):
         for name in ("joint_position", "joint_velocity", "joint_effort"):
             table |= _components(name, getattr(columns, name), joints)
         table |= {"gripper_width": columns.gripper_width, "contact_force": columns.contact_force}
-        if columns.wrench is not None:
-            table |= _components("wrench", columns.wrench, _WRENCH)
+        for name, values in columns.sensed.items():
+            table |= _components(name, values, STREAMS[name][1].components(self.info.robot))
         table |= _components("base_from_tcp", columns.base_from_tcp, _POSE)
         for kind in ("action", "command"):
             table |= _components(f"{kind}_joint_target", getattr(columns, f"{kind}_joint_target"), arm)
@@ -192,7 +193,6 @@ def _images_at(recording: RecordingReader, columns: SimulatedColumns, frame: int
 
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 _MOMENTS, _PICTURE_HEIGHT = 5, 120
 
 

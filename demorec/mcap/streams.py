@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Frame, Observation, SimulatedColumns, SimulatedInfo
 from demorec.episode.external import EpisodeInfo, Feature
+from demorec.episode.sensed import STREAMS, Sensed, Stream
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
 from demorec.mcap.channels import (
@@ -33,7 +34,6 @@ from demorec.mcap.channels import (
     GRIPPER,
     JOINT_STATES,
     TF,
-    WRENCH,
     camera_topic,
     object_topic,
 )
@@ -42,8 +42,6 @@ from demorec.robots.robot import RobotSpec
 
 GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""
-
-_WRENCH_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
 
 ColumnArrays = dict[str, Array | dict[str, Array]]
 """Field of `SimulatedColumns` -> its rows, or name -> rows where the field is a mapping."""
@@ -119,14 +117,7 @@ def _every_stream(info: SimulatedInfo) -> Iterator[FrameStream]:
     yield _pose(EE_POSE, base, "observation.base_from_tcp", "base_from_tcp")
     yield _pose(ACTION + EE_POSE, base, "action.base_from_tcp_target", "action_base_from_tcp")
     yield _pose(COMMAND + EE_POSE, base, "command.base_from_tcp_target", "command_base_from_tcp")
-    yield FrameStream(
-        topic=WRENCH,
-        schema=messages.WRENCH,
-        layout=layout(messages.WRENCH, (Slot.TIME, robot.hand_link), _WRENCH_SLOTS),
-        parts=_wrench_parts,
-        columns=lambda values: {"wrench": values},
-        since=2,
-    )
+    yield from (_sensed(row, stream, robot) for row, stream in STREAMS.values())
     for body in scene.movable:
         yield _pose(object_topic(body.name), WORLD, "observation.object_poses", "object_poses", body.name)
     for camera in scene.cameras:
@@ -148,7 +139,7 @@ def tf_stream(frames: FrameTree) -> FrameStream:
 
 def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
     """The columns of several streams as arguments of `SimulatedColumns`; the mappings are there even when empty."""
-    merged: dict[str, Any] = {"object_poses": {}, "world_from_camera": {}}
+    merged: dict[str, Any] = {"sensed": {}, "object_poses": {}, "world_from_camera": {}}
     for columns in found:
         for name, rows in columns.items():
             if isinstance(rows, Mapping):
@@ -171,7 +162,7 @@ def observation_at(columns: SimulatedColumns, frame: int) -> Observation:
         base_from_tcp=pose_of(columns.base_from_tcp[frame]),
         object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
         contact_force=float(columns.contact_force[frame]),
-        wrench=None if columns.wrench is None else columns.wrench[frame].copy(),
+        sensed={name: values[frame].copy() for name, values in columns.sensed.items()},
     )
 
 
@@ -225,12 +216,6 @@ def _target_columns(kind: str, values: Array) -> ColumnArrays:
     return {f"{kind}_joint_target": values[:, :num_arm].copy(), f"{kind}_gripper": values[:, num_arm].copy()}
 
 
-def _wrench_parts(values: FrameValues) -> Sequence[Array]:
-    wrench = values.observation.wrench
-    assert wrench is not None, "FrameCheck lets no frame without it into a recording that has the stream"
-    return (wrench,)
-
-
 def _joints(
     topic: str,
     names: Sequence[str],
@@ -246,6 +231,23 @@ def _joints(
         parts=parts,
         columns=columns,
         arrange=arrange,
+    )
+
+
+def _sensed(row: Sensed, stream: Stream, robot: RobotSpec) -> FrameStream:
+    if stream.layout == "wrench":
+        schema, force_and_torque = messages.WRENCH, ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
+        messages_layout = layout(schema, (Slot.TIME, robot.hand_link), force_and_torque)
+    else:
+        schema = messages.FLOAT64_ARRAY
+        messages_layout = _array_layout(schema, row.names(robot))
+    return FrameStream(
+        topic=stream.topic,
+        schema=schema,
+        layout=messages_layout,
+        parts=lambda values: (values.observation.sensed[row.quantity],),
+        columns=lambda values: {"sensed": {row.quantity: values}},
+        since=stream.since,
     )
 
 

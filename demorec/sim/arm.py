@@ -147,10 +147,10 @@ class Arm:
         position, velocity, effort = (np.array([state[i] for state in states]) for i in (0, 1, 3))
         return position, velocity, effort
 
-    def wrench(self) -> Array:
-        """(6,) force (N) and torque (N m) on the hand in the last physics step, as `Observation.wrench`."""
+    def sensed(self) -> dict[str, Array]:
+        """Of the last physics step, as `Observation.sensed`."""
         wrench = np.array(self._client.getJointState(self.body, self._hand)[2])
-        return self._hand_from_inertia.apply(wrench.reshape(2, 3)).reshape(6)
+        return {"wrench": self._hand_from_inertia.apply(wrench.reshape(2, 3)).reshape(6)}
 
     def gripper_width(self) -> float:
         """Opening, metres."""

@@ -143,7 +143,7 @@ class World:
                 for link in self.arm.finger_links
                 for contact in self.client.getContactPoints(bodyA=self.arm.body, linkIndexA=link)
             ),
-            wrench=self.arm.wrench(),
+            sensed=self.arm.sensed(),
         )
 
     def body(self, name: str) -> Body:

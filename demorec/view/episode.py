@@ -12,6 +12,8 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event, Outcome, SimulatedInfo
 from demorec.episode.external import EpisodeInfo
 from demorec.episode.scene import Scene
+from demorec.episode.sensed import SENSED
+from demorec.robots.robot import RobotSpec
 
 Distances = NDArray[np.uint16] | NDArray[np.float32]
 """(H, W) millimetres or metres."""
@@ -54,9 +56,9 @@ class Video:
 class PlayedEpisode:
     """What is shown of an episode. What a source does not have is None or empty.
 
-    The curves of a simulated one are "position", "velocity", "effort" of the joints, "gripper" (m), "force" (N), "ee"
-    (m), "hand force" (N) and "hand torque" (N m) along the hand's axes; "target" and "gripper target" are what was
-    asked for. Those of any other are the elements of its features, by the features' names.
+    The curves of a simulated one are "position" and "velocity" of the joints, "gripper" (m), "ee" (m) and those of
+    `demorec.episode.sensed`; "target" and "gripper target" are what was asked for. Those of any other are the elements
+    of its features, by the features' names.
 
     Attributes:
         name: In the list of recordings.
@@ -149,6 +151,18 @@ class PlayedEpisode:
         if self.outcome is None or self.outcome.success is None:
             return "outcome unknown"
         return "success" if self.outcome.success else f"failure: {self.outcome.failure_reason or 'no reason given'}"
+
+
+def sensed_curves(sensed: Mapping[str, Array], robot: RobotSpec, time_ns: NDArray[np.int64]) -> dict[str, Curves]:
+    """The plots of sensed quantities (T, ...)."""
+    result = {}
+    for row in SENSED.values():
+        if (values := row.values(sensed, robot)) is not None:
+            for plot in row.plots:
+                names = plot.names or robot.arm_joints
+                result[plot.curves] = Curves(time_ns=time_ns, values=values[:, : len(names)], names=names)
+                values = values[:, len(names) :]
+    return result
 
 
 def timed[Picture](time_ns: NDArray[np.int64], read: Callable[[], Iterator[Picture]]) -> Iterator[tuple[int, Picture]]:

@@ -30,11 +30,12 @@ from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SimulatedInfo, SuccessCheck
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
 from demorec.episode.scene import Scene
+from demorec.episode.sensed import SENSED
 from demorec.episode.validity import read_episode_info
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.urdf import Urdf, check_primitives
-from demorec.view.episode import Box, Curves, PlayedEpisode, Statements, millimetres, timed
+from demorec.view.episode import Box, Curves, PlayedEpisode, Statements, millimetres, sensed_curves, timed
 from demorec.view.from_recording import external_episode, shown_at, video_of
 
 
@@ -225,7 +226,9 @@ def _curves(
     def curves(values: Array, names: tuple[str, ...]) -> Curves:
         return Curves(time_ns=time_ns, values=values, names=names)
 
+    sensed = {row.quantity: data[name] for name, row in SENSED.items() if name in data}
     result = {
+        **sensed_curves(sensed, info.robot, time_ns),
         "position": curves(state[:, :number], joints),
         "gripper": curves(state[:, number : number + 1], ("opening",)),
         "gripper target": curves(action[:, -1:], ("target",)),

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from demorec.datasets.lerobot.episodes import DatasetRecording
 from demorec.episode.episode import SimulatedColumns
 from demorec.episode.external import NO_PICTURE, Columns, EpisodeInfo
+from demorec.episode.sensed import ObservationRows
 from demorec.mcap import AnyRecording, Recording, SimulatedRecording, open_recording
 from demorec.mcap.channels import description_topic
 from demorec.mcap.transforms import JointPositions
 from demorec.runs.run_file import EPISODES, FAILED
-from demorec.view.episode import Curves, PlayedEpisode, Video, millimetres, timed
+from demorec.view.episode import Curves, PlayedEpisode, Video, millimetres, sensed_curves, timed
 
 
 @contextmanager
@@ -147,20 +148,13 @@ def _curves(recording: SimulatedRecording, columns: SimulatedColumns) -> dict[st
         effort = np.array([sample.joint_effort for sample in samples])
     num_arm = len(robot.arm_joints)
     frames = columns.time_ns
-    wrench = {}
-    if columns.wrench is not None:
-        wrench = {
-            "hand force": Curves(time_ns=frames, values=columns.wrench[:, :3], names=("x", "y", "z")),
-            "hand torque": Curves(time_ns=frames, values=columns.wrench[:, 3:], names=("x", "y", "z")),
-        }
     return {
+        **sensed_curves(ObservationRows.of_columns(columns).sensed, robot, frames),
         "position": Curves(time_ns=time_ns, values=position[:, :num_arm], names=robot.arm_joints),
         "velocity": Curves(time_ns=time_ns, values=velocity[:, :num_arm], names=robot.arm_joints),
         "effort": Curves(time_ns=time_ns, values=effort[:, :num_arm], names=robot.arm_joints),
         "target": Curves(time_ns=frames, values=columns.action_joint_target, names=robot.arm_joints),
         "gripper": Curves(time_ns=frames, values=columns.gripper_width[:, None], names=("opening",)),
         "gripper target": Curves(time_ns=frames, values=columns.action_gripper[:, None], names=("target",)),
-        "force": Curves(time_ns=frames, values=columns.contact_force[:, None], names=("contact force",)),
         "ee": Curves(time_ns=frames, values=columns.base_from_tcp[:, :3], names=("x", "y", "z")),
-        **wrench,
     }

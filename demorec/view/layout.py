@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import rerun as rr
 import rerun.blueprint as rrb
 
+from demorec.episode.sensed import SENSED
 from demorec.view.episode import PlayedEpisode
 from demorec.view.paths import FRAMES, SECONDS, Paths
 from demorec.view.scene import DIFFERENCES, A, B
@@ -17,12 +18,9 @@ _SIDE = ("gripper opening (m)", "contact force (N)")
 _PLOTS: Mapping[str, tuple[str, ...]] = {
     "joints and their targets (rad)": ("position", "target"),
     "joint velocity (rad/s)": ("velocity",),
-    "joint effort (N m)": ("effort",),
     "gripper position (m)": ("ee",),
-    "force on the hand (N)": ("hand force",),
-    "torque on the hand (N m)": ("hand torque",),
     "gripper opening (m)": ("gripper", "gripper target"),
-    "contact force (N)": ("force",),
+    **{plot.title: (plot.curves,) for row in SENSED.values() for plot in row.plots},
 }
 """Title -> curves of a simulated episode; those of `_SIDE` stand beside the tabs of the others. Any other curve, as of
 the features of other episodes, has a plot of its own."""

@@ -94,7 +94,7 @@ def test_mcap_decodes_what_was_written(path: Path, episode: tuple[SimulatedInfo,
         force, torque = content.wrench.force, content.wrench.torque
         assert (time, content.header.frame_id) == (frame.time_ns, "panda_hand")
         found = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
-        assert found == present(frame.observation.wrench).tolist()
+        assert found == frame.observation.sensed["wrench"].tolist()
     info = decoded["/camera/front/camera_info"][0][1]
     assert (info.width, info.height) == (64, 48)
     assert np.allclose(info.k, [49.68, 0, 32, 0, 49.68, 24, 0, 0, 1], atol=0.01)
@@ -133,7 +133,7 @@ def test_rosbags_deserialises_every_message(path: Path, episode: tuple[Simulated
                 wrenches.append([force.x, force.y, force.z, torque.x, torque.y, torque.z])
     assert count > 1000
     assert np.array_equal(positions, [frame.observation.base_from_tcp.position for frame in frames])
-    assert np.array_equal(wrenches, [present(frame.observation.wrench) for frame in frames])
+    assert np.array_equal(wrenches, [frame.observation.sensed["wrench"] for frame in frames])
 
 
 def test_definitions_are_those_of_ros(path: Path) -> None:

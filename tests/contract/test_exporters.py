@@ -54,7 +54,7 @@ def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run:
     expected = {
         "observation.effort": columns.joint_effort[:, :7],
         "observation.contact_force": columns.contact_force[:, np.newaxis],
-        "observation.wrench": columns.wrench,
+        "observation.wrench": columns.sensed["wrench"],
         "command": np.column_stack([columns.command_joint_target, columns.command_gripper]),
     }[name]
     assert expected is not None

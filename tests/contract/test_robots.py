@@ -67,7 +67,7 @@ def test_the_wrench_holds_the_weight_of_the_hand(
             wrenches = []
             for _ in range(150):
                 world.apply(command)
-                wrenches.append(present(world.observe().wrench))
+                wrenches.append(world.observe().sensed["wrench"])
             found[name] = np.mean(wrenches[-90:], axis=0), _weight(world)
     for wrench, expected in found.values():
         assert np.abs(expected[[0, 2]]).min() > 4.0, "the hand is tilted"

@@ -83,7 +83,8 @@ class Changed:
         """With other columns, which must differ."""
         for name, array in arrays.items():
             before = getattr(self.columns, name)
-            assert not np.array_equal(np.asarray(before), np.asarray(array)), f"{name} was not changed"
+            pairs = [(before[key], array[key]) for key in array] if isinstance(array, dict) else [(before, array)]
+            assert not all(np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs), f"{name} was not changed"
         return replace(self, columns=replace(self.columns, **arrays))
 
     def with_info(self, **fields: Any) -> Changed:

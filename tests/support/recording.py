@@ -240,7 +240,7 @@ def _frame(
             base_from_tcp=tcp,
             object_poses={"cube": Pose.from_yaw((0.45, -0.1 + 0.01 * seconds, 0.0225 + 0.02 * seconds), 0.3 + seconds)},
             contact_force=max(0.0, 5.0 * math.sin(seconds)),
-            wrench=np.array([math.sin((n + 1) * seconds) - n for n in range(6)]),
+            sensed={"wrench": np.array([math.sin((n + 1) * seconds) - n for n in range(6)])},
         ),
         action=action,
         command=command,

@@ -68,6 +68,7 @@ def make_rows(rng: np.random.Generator, scene: Scene, count: int) -> Observation
         gripper_width=rng.uniform(0, 0.08, size=count),
         base_from_tcp=np.array([random_pose(rng).vector() for _ in range(count)]),
         object_poses=poses,
+        sensed={},
     )
 
 
@@ -78,6 +79,7 @@ def one_row(rows: ObservationRows, t: int) -> ObservationRows:
         gripper_width=rows.gripper_width[t : t + 1].copy(),
         base_from_tcp=rows.base_from_tcp[t : t + 1].copy(),
         object_poses={name: poses[t : t + 1].copy() for name, poses in rows.object_poses.items()},
+        sensed={},
     )
 
 
@@ -171,7 +173,7 @@ def columns_of(rng: np.random.Generator, count: int) -> SimulatedColumns:
     return SimulatedColumns(
         time_ns=np.arange(count), joint_position=rng.normal(size=(count, 9)),
         joint_velocity=np.zeros((count, 9)), joint_effort=np.zeros((count, 9)), gripper_width=np.zeros(count),
-        base_from_tcp=poses(), object_poses={}, contact_force=np.zeros(count),
+        base_from_tcp=poses(), object_poses={}, contact_force=np.zeros(count), sensed={},
         action_joint_target=rng.normal(size=(count, 7)), action_gripper=rng.uniform(0, 0.08, count),
         action_base_from_tcp=poses(), command_joint_target=np.zeros((count, 7)), command_gripper=np.zeros(count),
         command_base_from_tcp=poses(), phase=("x",) * count, is_deliberate_miss=np.zeros(count, dtype=bool),

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.present import present
 from support.recording import make_episode
 
 from demorec.core.errors import RecordingError
@@ -65,12 +64,15 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         "images of the cameras front, top, the scene has front",
     ),
     "no wrench": (
-        lambda f: observed(f, wrench=None),
+        lambda f: observed(f, sensed={}),
         r"no wrench; recordings of format version 2 have one of shape \(6,\) at each frame",
     ),
-    "a force without a torque": (lambda f: observed(f, wrench=np.zeros(3)), r"a wrench of shape \(3,\); recordings"),
+    "a force without a torque": (
+        lambda f: observed(f, sensed={"wrench": np.zeros(3)}),
+        r"a wrench of shape \(3,\); recordings",
+    ),
     "a NaN in the wrench": (
-        lambda f: observed(f, wrench=with_nan(present(f.observation.wrench))),
+        lambda f: observed(f, sensed={"wrench": with_nan(f.observation.sensed["wrench"])}),
         "wrench in its observation that is not finite",
     ),
     "a NaN in a joint": (

@@ -49,7 +49,6 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
         "gripper_width": [o.gripper_width for o in observations],
         "base_from_tcp": [o.base_from_tcp.vector() for o in observations],
         "contact_force": [o.contact_force for o in observations],
-        "wrench": [o.wrench for o in observations],
         "action_joint_target": [frame.action.joint_target for frame in frames],
         "action_gripper": [frame.action.gripper_target for frame in frames],
         "action_base_from_tcp": [frame.action.base_from_tcp_target.vector() for frame in frames],
@@ -61,6 +60,7 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
     for name, values in expected.items():
         found = getattr(columns, name)
         assert found.tobytes() == np.array(values, dtype=found.dtype).tobytes(), name
+    assert np.array_equal(columns.sensed["wrench"], [o.sensed["wrench"] for o in observations])
     assert columns.phase == tuple(frame.phase for frame in frames)
     assert list(columns.object_poses) == ["cube"]
     assert np.array_equal(columns.object_poses["cube"], [o.object_poses["cube"].vector() for o in observations])

@@ -28,7 +28,7 @@ def record(path: Path, info: SimulatedInfo, frames: list[Frame], outcome: Outcom
 
 
 def without_wrench(frames: list[Frame]) -> list[Frame]:
-    return [replace(frame, observation=replace(frame.observation, wrench=None)) for frame in frames]
+    return [replace(frame, observation=replace(frame.observation, sensed={})) for frame in frames]
 
 
 def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
@@ -40,8 +40,8 @@ def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
         SimulatedRecording(write_episode(tmp_path / "new.mcap", num_frames=5, cameras=())) as new,
     ):
         assert set(new.topics) - set(recording.topics) == LATER
-        assert recording.columns().wrench is None
-        assert recording[2].observation.wrench is None
+        assert not recording.columns().sensed
+        assert not recording[2].observation.sensed
         assert not [name for name in recording.to_pandas() if name.startswith("wrench")]
         assert recording.digest() != new.digest()
         digest = recording.digest()

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.present import present
 from support.sim import body_index, episode, run
 
 from demorec.core.errors import ConfigError, SceneError
@@ -72,7 +71,7 @@ def test_the_force_torque_sensor_does_not_touch_the_physics(world: World, scene:
             world.apply(
                 Action(joint_target=q, gripper_target=0.01, base_from_tcp_target=world.arm.kinematics.forward(q))
             )
-        return world.state_digest(), bool(present(world.observe().wrench).any())
+        return world.state_digest(), bool(world.observe().sensed["wrench"].any())
 
     with_sensor, without = digest_after(True), digest_after(False)
     assert with_sensor[0] == without[0]
@@ -84,8 +83,8 @@ def test_the_wrench_grows_by_the_weight_of_what_is_lifted() -> None:
     frames, outcome = run(prepared)
     assert outcome.success
     lift = next(i for i, f in enumerate(frames) if f.observation.object_poses["red_cube"].position[2] > 0.06)
-    free = np.mean([present(f.observation.wrench)[2] for f in frames[: lift // 2]])
-    held = np.mean([present(f.observation.wrench)[2] for f in frames[lift + 10 : lift + 60]])
+    free = np.mean([f.observation.sensed["wrench"][2] for f in frames[: lift // 2]])
+    held = np.mean([f.observation.sensed["wrench"][2] for f in frames[lift + 10 : lift + 60]])
     assert abs((free - held) - 9.81 * prepared.info.scene.body("red_cube").mass) < 0.15
 
 

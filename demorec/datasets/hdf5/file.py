@@ -16,6 +16,7 @@ from demorec.core.errors import in_words
 from demorec.core.files import HDF5_MAGIC, open_regular
 from demorec.core.replacing import ReplaceableKind
 from demorec.datasets.hdf5 import trial
+from demorec.episode.sensed import SENSED
 
 ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "privileged"})
 """What `env_args` says of every environment of ours, by which our files are known."""
@@ -25,9 +26,11 @@ EXTERNAL_ENVIRONMENT = "demorec/collected"
 """What stands for an environment in files of external episodes, which have none."""
 EXTERNAL_ARGUMENTS = frozenset({"robot", "fps", "cameras", "observations"})
 """What `env_args` says beside it."""
-_OBSERVATIONS = (
-    r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|effort|contact_force|wrench|command"
-    r"|[^/]+_(image|depth)"
+_OBSERVATIONS = "|".join(
+    (
+        r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|command|[^/]+_(image|depth)",
+        *(re.escape(name.removeprefix("observation.")) for name in SENSED),
+    )
 )
 _PARTS = r"data|mask|mask/(train|valid)|data/demo_\d+(/(actions|states|rewards|dones|obs))?|data/demo_\d+/obs/({names})"
 _ATTRIBUTES = (
