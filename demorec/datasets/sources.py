@@ -53,9 +53,10 @@ def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
 def goes_in(recording: AnyRecording, options: CommonOptions) -> bool:
     """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out.
 
-    An external episode of which nobody said whether it succeeded is no failure.
+    An external episode of which nobody said whether it succeeded is no failure; whoever moved a recording into
+    `failed` wants it left out, whatever it says.
     """
-    return options.include_failures or not recording.has_failed
+    return options.include_failures or not (recording.has_failed or recording.path.parent.name == "failed")
 
 
 def places_of(files: Sequence[Path]) -> list[Path]:

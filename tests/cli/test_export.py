@@ -28,6 +28,17 @@ def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "# me/cubes" in (out / "README.md").read_text()
 
 
+def test_what_was_moved_into_failed_stays_out(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sorted_run = tmp_path / "run"
+    shutil.copytree(run, sorted_run)
+    good = min((sorted_run / "episodes").glob("*.mcap"))
+    good.rename(sorted_run / "failed" / good.name)
+    assert exit_code("export", "lerobot", sorted_run, "--out", tmp_path / "d", "--no-verify") == 0
+    printed = capsys.readouterr().out
+    assert "1 episode, 7 frames" in printed
+    assert "2 failed attempts left out" in printed
+
+
 def test_what_was_not_asked_for_is_counted(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--corrected-only", "--episodes", "0")
     assert exit_code(*words) == 0
