@@ -26,7 +26,7 @@ from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.mcap import SimulatedRecording
-from demorec.tasks.things import THINGS
+from demorec.tasks.furniture import THINGS
 
 RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"
 MISSING = ("pick_place", "stack", "sort_by_color")
