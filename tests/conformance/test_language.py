@@ -15,7 +15,7 @@ from support.check import simulate_run
 from support.export import data_table, episode_rows, export, files_of
 from support.language import active, language_of, meant, phrases
 
-from demorec.annotate.kinds import STATES
+from demorec.annotate import STATES
 from demorec.annotate.situation import nouns_of, place_of
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
