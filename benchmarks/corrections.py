@@ -30,8 +30,8 @@ import torch
 from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, command, statistics, train
 
 from demorec.core.config import GenerateConfig
+from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.improvement import corrected_episodes
-from demorec.learn.evaluate.moments import TakeOver
 from demorec.learn.evaluate.rollouts import Evaluation, evaluate, settings_for
 from demorec.learn.evaluate.statistics import Rate, cells
 

@@ -7,7 +7,7 @@ is visible: occluded parts are not in them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -57,11 +57,6 @@ class Seen:
         return int(self._labels[y, x]) == self._label
 
 
-def spoken_bodies(recording: SimulatedRecording) -> tuple[str, ...]:
-    """Names of the bodies that are spoken of in pictures: all but what only carries the scene."""
-    return tuple(body.name for body in recording.info.scene.bodies if body.role in ("object", "target", "distractor"))
-
-
 def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str, Seen]:
     """Name -> what a picture shows of it; things that no pixel shows are left out.
 
@@ -78,28 +73,23 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
 
 
 def body_labels(recording: SimulatedRecording) -> dict[str, int]:
-    """Name of each body that is spoken of -> its label in the segmentation pictures.
+    """Name of each body that is spoken of, all but what only carries the scene -> its label in segmentation pictures.
 
     Raises:
         RecordingError: The recording is damaged.
     """
-    spoken = set(spoken_bodies(recording))
+    spoken = {body.name for body in recording.info.scene.bodies if body.role in ("object", "target", "distractor")}
     return {name: label for label, name in recording.segment_labels().items() if name in spoken}
 
 
 def project(camera: SceneCamera, world_from_camera: Array, points: Array) -> Array:
-    """(N, 2) where points in the world, (N, 3) metres, are in a picture, px; NaN for those behind the camera.
+    """(T, N, 2) where points in the world are in the pictures of T moments, px; NaN for those behind the camera.
 
     Args:
         camera: With its intrinsics.
-        world_from_camera: (7,) pose at the moment of the picture.
-        points: In the world frame.
+        world_from_camera: (T, 7) poses at the moments of the pictures.
+        points: (T, N, 3) metres, in the world frame.
     """
-    return np.asarray(project_each(camera, world_from_camera[np.newaxis], points[np.newaxis])[0])
-
-
-def project_each(camera: SceneCamera, world_from_camera: Array, points: Array) -> Array:
-    """(T, N, 2) the same of T moments at once: poses (T, 7), points (T, N, 3)."""
     x, y, z, w = (world_from_camera[:, index, np.newaxis] for index in range(3, 7))
     # Of the conjugate quaternion; sums written out, as in demorec.core.geometry, and to the same bit.
     x, y, z = -x, -y, -z
@@ -218,10 +208,15 @@ def outline_area(camera: SceneCamera, world_from_camera: Array, shape: Shape, wo
     if points is None:
         return None
     pose = Pose(position=world_from_body[:3], quat_xyzw=world_from_body[3:])
-    seen = project(camera, world_from_camera, pose.apply(points))
+    seen = project(camera, world_from_camera[np.newaxis], pose.apply(points)[np.newaxis])[0]
     if not bool(np.isfinite(seen).all()):
         return None
-    return _area(_convex_hull([(float(x), float(y)) for x, y in seen]))
+    from scipy.spatial import ConvexHull, QhullError  # takes a while to load
+
+    try:
+        return float(ConvexHull(seen).volume)  # in the plane, that is its area
+    except QhullError:  # all points on one line
+        return 0.0
 
 
 def _rim(shape: Shape) -> Array | None:
@@ -240,28 +235,3 @@ def _rim(shape: Shape) -> Array | None:
         ends = [np.column_stack([rim, np.full(_ROUND, z)]) for z in (-half, half)]
         return np.asarray(np.concatenate(ends), dtype=np.float64)
     return None
-
-
-def _convex_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The corners of the convex hull in order (Andrew's monotone chain)."""
-    ordered = sorted(set(points))
-
-    def half(part: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        chain: list[tuple[float, float]] = []
-        for point in part:
-            while len(chain) >= 2 and _turn(chain[-2], chain[-1], point) <= 0:
-                chain.pop()
-            chain.append(point)
-        return chain[:-1]
-
-    return half(ordered) + half(ordered[::-1])
-
-
-def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-
-
-def _area(corners: Sequence[tuple[float, float]]) -> float:
-    """Of a polygon (shoelace formula)."""
-    following = [*corners[1:], *corners[:1]]
-    return abs(sum(x * v - u * y for (x, y), (u, v) in zip(corners, following, strict=True))) / 2

@@ -2,44 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.annotate.kinds import KINDS, LanguageKind
-from demorec.annotate.questions import asked_rows, questions, traces
+from demorec.annotate import KINDS, LanguageKind, Statement
+from demorec.annotate.questions import questions, traces
 from demorec.annotate.referring import phrase_for
-from demorec.annotate.situation import Situations, Surroundings
-from demorec.annotate.subtasks import GoalWords, goal_words, memories, plan, subtask, tcp_motion
-from demorec.annotate.tries import Story, interjection, story_of
+from demorec.annotate.situation import Surroundings, situation
+from demorec.annotate.subtasks import GoalWords, goal_words, memories, motion, plan, subtask
+from demorec.annotate.tries import Story, Stretch, interjection, story_of
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
 from demorec.episode.episode import MISTAKEN_PHASE, SimulatedColumns
 from demorec.episode.scene import Scene
 from demorec.mcap import SimulatedRecording
-
-
-@dataclass(frozen=True, kw_only=True)
-class Statement:
-    """One sentence, true from a row of the dataset on until the next one of its kind, or about this row alone.
-
-    Attributes:
-        row: Of the episode, from 0.
-        kind: What it tells; `task_aug` is another wording of the task.
-        role: Who says it: the user asks, the assistant does.
-        text: The sentence.
-        camera: Of the picture that it is about, None for all that is about no picture.
-    """
-
-    row: int
-    kind: LanguageKind
-    role: Literal["user", "assistant"]
-    text: str
-    camera: str | None = None
 
 
 def narrate(
@@ -64,17 +45,18 @@ def narrate(
     Raises:
         RecordingError: The recording is damaged.
     """
-    story = story_of(recording, columns)
-    told = _Told(recording, columns, rows, story)
-    asked = {row: turn for row, turn in told.asked().items() if about is None or row in about}
+    told = _Told(recording, columns, rows)
+    stride = int(rows[1] - rows[0]) if len(rows) > 1 else 1
+    a_second = range(0, len(rows), max(1, recording.info.fps // stride))
+    asked = {row: turn for turn, row in enumerate(a_second) if about is None or row in about}
     found: dict[LanguageKind, Callable[[], Iterator[Statement]]] = {
         "subtask": told.subtasks,
         "plan": told.plans,
         "memory": told.memories,
         "motion": told.motions,
         "task_aug": told.wordings,
-        "vqa": lambda: told.questions(cameras, asked),
-        "trace": lambda: told.traces(cameras, asked),
+        "vqa": lambda: questions(recording, columns, rows, cameras, asked),
+        "trace": lambda: traces(recording, columns, rows, cameras, asked),
         "interjection": told.interjections,
     }
     statements = [statement for kind in KINDS if kind in kinds for statement in found[kind]()]
@@ -84,38 +66,39 @@ def narrate(
 class _Told:
     """The sentences of one episode, kind by kind."""
 
-    def __init__(
-        self, recording: SimulatedRecording, columns: SimulatedColumns, rows: NDArray[np.intp], story: Story
-    ) -> None:
-        self._recording = recording
-        self._info, self._columns, self._rows, self._story = recording.info, columns, rows, story
+    def __init__(self, recording: SimulatedRecording, columns: SimulatedColumns, rows: NDArray[np.intp]) -> None:
+        self._info, self._columns, self._rows = recording.info, columns, rows
+        self._story: Story = story_of(recording, columns)
         self._scene: Scene = recording.info.scene
-        self._situations = Situations(self._scene)
         self._words = {
             attempt.first: goal_words(self._scene, attempt.goal, self._situation(attempt.first))
-            for attempt in story.tries
+            for attempt in self._story.tries
         }
 
     def _situation(self, frame: int) -> Surroundings:
         poses: dict[str, Array] = {name: values[frame] for name, values in self._columns.object_poses.items()}
-        return self._situations.at(poses)
+        return situation(self._scene, poses)
+
+    def _rng(self, purpose: Literal["language", "interjection"]) -> np.random.Generator:
+        info = self._info
+        return generator(
+            root_seed=info.root_seed, episode_index=info.episode_index, attempt=info.attempt, purpose=purpose
+        )
 
     def _row_of(self, frame: int) -> int:
         """The first row of the dataset that is not before a frame; T when there is none."""
         return int(np.searchsorted(self._rows, frame))
 
-    def _stretch_rows(self) -> list[tuple[int, int, int]]:
-        """(number of the stretch, first row, row after the last) of each stretch that any row is in."""
-        found = [
-            (number, self._row_of(stretch.first), self._row_of(stretch.end))
-            for number, stretch in enumerate(self._story.stretches)
-        ]
-        return [(number, first, end) for number, first, end in found if first < end]
+    def _stretch_rows(self) -> Iterator[tuple[Stretch, int, int]]:
+        """(stretch, first row, row after the last) of each stretch that any row is in."""
+        for stretch in self._story.stretches:
+            first, end = self._row_of(stretch.first), self._row_of(stretch.end)
+            if first < end:
+                yield stretch, first, end
 
     def subtasks(self) -> Iterator[Statement]:
         is_dropped = self._story.is_dropped
-        for number, first, _ in self._stretch_rows():
-            stretch = self._story.stretches[number]
+        for stretch, first, _ in self._stretch_rows():
             words = self._words[stretch.attempt.first]
             if stretch.phase == MISTAKEN_PHASE:
                 words = self._mistaken(words)
@@ -131,11 +114,7 @@ class _Told:
                 remaining = self._remaining(attempt.first, attempt.goal)
                 if row == 0:
                     remaining[0] = self._mistaken(remaining[0])
-                text = plan(
-                    remaining,
-                    is_dropped=self._story.is_dropped,
-                    is_retry=attempt.number > 0,
-                )
+                text = plan(remaining, is_dropped=self._story.is_dropped, is_retry=attempt.number > 0)
                 yield Statement(row=row, kind="plan", role="assistant", text=text)
 
         correction = self._story.correction
@@ -152,13 +131,10 @@ class _Told:
         return replace(words, object=phrase_for(correction.mistaken, self._situation(0)))
 
     def interjections(self) -> Iterator[Statement]:
-        correction, info = self._story.correction, self._info
+        correction = self._story.correction
         if correction is None or (row := self._row_of(correction.frame)) >= len(self._rows):
             return
-        rng = generator(
-            root_seed=info.root_seed, episode_index=info.episode_index, attempt=info.attempt, purpose="interjection"
-        )
-        told = interjection(correction, self._situation(correction.frame), rng)
+        told = interjection(correction, self._situation(correction.frame), self._rng("interjection"))
         if told is not None:
             yield Statement(row=row, kind="interjection", role="user", text=told[0])
             yield Statement(row=row, kind="interjection", role="assistant", text=told[1])
@@ -169,37 +145,20 @@ class _Told:
 
     def memories(self) -> Iterator[Statement]:
         latest: dict[int, Statement] = {}
-        for item in memories(self._story, self._words, is_dropped=self._story.is_dropped):
-            row = self._row_of(item.frame)
+        for frame, text in memories(self._story, self._words, is_dropped=self._story.is_dropped):
+            row = self._row_of(frame)
             if row < len(self._rows):  # of two that fall into one row, the later one holds
-                latest[row] = Statement(row=row, kind="memory", role="assistant", text=item.text)
+                latest[row] = Statement(row=row, kind="memory", role="assistant", text=text)
         yield from latest.values()
 
     def motions(self) -> Iterator[Statement]:
         columns, last = self._columns, self._rows[-1]
         for _, first, end in self._stretch_rows():
-            until = self._rows[end] if end < len(self._rows) else last
-            text = tcp_motion(columns.base_from_tcp, columns.gripper_width, int(self._rows[first]), int(until))
+            frames = [self._rows[first], self._rows[end] if end < len(self._rows) else last]
+            text = motion(columns.base_from_tcp[frames, :3], columns.gripper_width[frames])
             yield Statement(row=first, kind="motion", role="assistant", text=text)
 
     def wordings(self) -> Iterator[Statement]:
-        info = self._info
-        rng = generator(
-            root_seed=info.root_seed, episode_index=info.episode_index, attempt=info.attempt, purpose="language"
-        )
-        for text in task_wordings(self._scene, info.instruction, rng, is_dropped=self._story.is_dropped):
+        rng, is_dropped = self._rng("language"), self._story.is_dropped
+        for text in task_wordings(self._scene, self._info.instruction, rng, is_dropped=is_dropped):
             yield Statement(row=0, kind="task_aug", role="user", text=text)
-
-    def asked(self) -> dict[int, int]:
-        """Of all pictures that are spoken of: row -> turn."""
-        stride = int(self._rows[1] - self._rows[0]) if len(self._rows) > 1 else 1
-        return asked_rows(len(self._rows), self._info.fps // stride)
-
-    def questions(self, cameras: Sequence[str], asked: Mapping[int, int]) -> Iterator[Statement]:
-        for item in questions(self._recording, self._columns, self._rows, cameras, asked):
-            yield Statement(row=item.row, kind="vqa", role="user", text=item.text, camera=item.camera)
-            yield Statement(row=item.row, kind="vqa", role="assistant", text=item.answer, camera=item.camera)
-
-    def traces(self, cameras: Sequence[str], asked: Mapping[int, int]) -> Iterator[Statement]:
-        for item in traces(self._recording, self._columns, self._rows, cameras, asked):
-            yield Statement(row=item.row, kind="trace", role="assistant", text=item.answer, camera=item.camera)

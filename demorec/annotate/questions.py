@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.annotate.grounding import MIN_PIXELS, Seen, body_labels, pixels_of, project_each, seen_things
-from demorec.annotate.referring import each_phrase
-from demorec.annotate.situation import NamedThing, Situations, Surroundings
+from demorec.annotate import Statement
+from demorec.annotate.grounding import MIN_PIXELS, Seen, body_labels, pixels_of, project, seen_things
+from demorec.annotate.referring import phrases_for
+from demorec.annotate.situation import NamedThing, Surroundings, situations
 from demorec.core.geometry import Array
 from demorec.episode.episode import SimulatedColumns
 from demorec.episode.scene import SceneCamera
@@ -39,48 +40,15 @@ _TOUCHING = 0.01
 """Metres of air above a support below which a thing is on it or in it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Question:
-    """A question about one picture, and its answer.
-
-    Attributes:
-        row: Of the dataset's episode.
-        camera: Which picture.
-        text: The question.
-        answer: JSON.
-    """
-
-    row: int
-    camera: str
-    text: str
-    answer: str
+def _phrases(name: str, now: Surroundings) -> Iterator[str]:
+    """Phrases for a thing without the robot's left and right, which a camera may see the other way round."""
+    return (phrase for phrase in phrases_for(name, now) if not _SIDES & set(phrase.split()))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Trace:
-    """Where the TCP goes in one picture, as JSON; attributes as of `Question`."""
-
-    row: int
-    camera: str
-    answer: str
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Moment:
-    """All things at one moment, and what they are called, whatever camera looks at them."""
-
-    now: Surroundings
-    _plainest: dict[str, str] = field(default_factory=dict)
-
-    def phrases(self, name: str) -> Iterator[str]:
-        """Phrases for a thing without the robot's left and right, which a camera may see the other way round."""
-        return (phrase for phrase in each_phrase(name, self.now) if not _SIDES & set(phrase.split()))
-
-    def phrase(self, name: str) -> str:
-        """The plainest of them, "" where there is none."""
-        if name not in self._plainest:
-            self._plainest[name] = next(self.phrases(name), "")
-        return self._plainest[name]
+@lru_cache(maxsize=1024)  # several cameras look at one moment
+def _phrase(name: str, now: Surroundings) -> str:
+    """The plainest of them, "" where there is none."""
+    return next(_phrases(name, now), "")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,24 +57,14 @@ class _View:
 
     camera: SceneCamera
     seen: dict[str, Seen]
-    moment: _Moment
+    now: Surroundings
     middles: dict[str, Array]
-
-    @property
-    def now(self) -> Surroundings:
-        """All things as they are."""
-        return self.moment.now
 
     @cached_property
     def clear(self) -> dict[str, str]:
         """Name -> phrase of each thing that is visible enough to be spoken of, in words that mean it alone."""
         large = (name for name, thing in self.seen.items() if thing.num_pixels >= MIN_PIXELS)
-        return {name: phrase for name in large if (phrase := self.moment.phrase(name))}
-
-
-def asked_rows(num_rows: int, fps: int) -> dict[int, int]:
-    """The rows of the dataset at which questions are asked, one a second -> which question of a camera it is."""
-    return {row: turn for turn, row in enumerate(range(0, num_rows, max(1, fps)))}
+        return {name: phrase for name in large if (phrase := _phrase(name, self.now))}
 
 
 def questions(
@@ -115,14 +73,14 @@ def questions(
     rows: NDArray[np.intp],
     cameras: Sequence[str],
     asked: Mapping[int, int],
-) -> Iterator[Question]:
+) -> Iterator[Statement]:
     """A question a second about each camera that has segmentation, of another kind each time, in order by camera.
 
     Args:
         recording, columns: The episode.
         rows: (T,) which of its frames the dataset has.
         cameras: Those of the dataset.
-        asked: `asked_rows`, or some of them.
+        asked: Row -> which question of a camera it is, of the rows at which questions are asked.
 
     Raises:
         RecordingError: The recording is damaged.
@@ -136,28 +94,31 @@ def questions(
     if not chosen or not asked:
         return
     numbers, poses = body_labels(recording), {name: values[frames] for name, values in columns.object_poses.items()}
-    moments = [_Moment(now=now) for now in Situations(scene).at_each(poses, len(frames))]
+    moments = situations(scene, poses, len(frames))
     places = np.empty((len(frames), len(numbers), 3))
     for index, name in enumerate(numbers):
         places[:, index] = poses[name][:, :3] if name in poses else scene.body(name).world_from_body.position
     middles = {
-        name: project_each(camera, columns.world_from_camera[name][frames], places)
-        for name, (_, camera) in chosen.items()
+        name: project(camera, columns.world_from_camera[name][frames], places) for name, (_, camera) in chosen.items()
     }
     of_frame = {int(frame): index for index, frame in enumerate(frames)}
     in_order = list(asked.items())
-    found: dict[str, list[Question]] = {name: [] for name in chosen}
+    found: dict[str, list[Statement]] = {name: [] for name in chosen}
     for name, frame, labels in recording.segmentation_at(list(chosen), of_frame):
         (number, camera), index = chosen[name], of_frame[frame]
         row, turn = in_order[index]
         view = _View(
             camera=camera,
             seen=seen_things(labels, numbers),
-            moment=moments[index],
+            now=moments[index],
             middles=dict(zip(numbers, middles[name][index], strict=True)),
         )
         if (told := _ask(view, turn + number)) is not None:
-            found[name].append(Question(row=row, camera=name, text=told[0], answer=json.dumps(told[1])))
+            text, answer = told
+            found[name] += [
+                Statement(row=row, kind="vqa", role="user", text=text, camera=name),
+                Statement(row=row, kind="vqa", role="assistant", text=json.dumps(answer), camera=name),
+            ]
     for of_camera in found.values():
         yield from of_camera
 
@@ -210,7 +171,7 @@ def _attribute(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
     found = []
     for name in view.clear:
         thing = view.now.thing(name)
-        plain = (phrase for phrase in view.moment.phrases(name) if thing.color not in phrase.split())
+        plain = (phrase for phrase in _phrases(name, view.now) if thing.color not in phrase.split())
         if thing.color and (phrase := next(plain, "")):
             found.append((phrase, thing.color))
     if not found:
@@ -269,7 +230,7 @@ def traces(
     rows: NDArray[np.intp],
     cameras: Sequence[str],
     asked: Mapping[int, int],
-) -> Iterator[Trace]:
+) -> Iterator[Statement]:
     """The next second of the TCP in each camera's picture, once a second, in order by camera.
 
     Points are where the picture of that moment would show the TCP; the trace ends where it leaves the picture, and
@@ -282,7 +243,7 @@ def traces(
         if camera.name not in cameras or not asked:
             continue
         tcp = world_from_tcp[np.minimum(frames[:, np.newaxis] + steps, columns.num_frames - 1)]
-        projected = project_each(camera, columns.world_from_camera[camera.name][frames], tcp)
+        projected = project(camera, columns.world_from_camera[camera.name][frames], tcp)
         pixels, inside = pixels_of(camera, projected)
         counts = np.logical_and.accumulate(inside, axis=1).sum(axis=1).tolist()
         for row, points, count in zip(asked, pixels.tolist(), counts, strict=True):
@@ -293,4 +254,4 @@ def traces(
                     "points": points[:count],
                     "seconds": _TRACE_SECONDS,
                 }
-                yield Trace(row=row, camera=camera.name, answer=json.dumps(answer))
+                yield Statement(row=row, kind="trace", role="assistant", text=json.dumps(answer), camera=camera.name)

@@ -39,7 +39,7 @@ def references(text: str, situation: Surroundings) -> Iterator[tuple[str, frozen
         yield match[0], _resolved(match, situation)
 
 
-def each_phrase(name: str, situation: Surroundings) -> Iterator[str]:
+def phrases_for(name: str, situation: Surroundings) -> Iterator[str]:
     """Every phrase of the grammar that refers to this thing and nothing else; the plainest with a colour come first."""
     thing = situation.thing(name)
     for noun in thing.nouns:
@@ -55,14 +55,9 @@ def each_phrase(name: str, situation: Surroundings) -> Iterator[str]:
                     yield candidate
 
 
-def phrases_for(name: str, situation: Surroundings) -> list[str]:
-    """As `each_phrase`, all of them."""
-    return list(each_phrase(name, situation))
-
-
 def phrase_for(name: str, situation: Surroundings) -> str:
     """The plainest phrase for a thing; "a red cube" where none tells it from the others."""
-    for found in each_phrase(name, situation):
+    for found in phrases_for(name, situation):
         return found
     thing = situation.thing(name)
     words = f"{thing.color} {thing.noun}".strip()
@@ -88,56 +83,22 @@ def _resolved(match: re.Match[str], situation: Surroundings) -> frozenset[str]:
         return frozenset(thing.name for thing in fitting)
     for order in (match["order"], match["behind"]):
         if order is not None:
-            fitting = _ORDERS[order](fitting)
+            fitting = _ordered(order, fitting)
     return frozenset({fitting[0].name} if len(fitting) == 1 else ())
 
 
+def _ordered(order: str, things: Sequence[NamedThing]) -> list[NamedThing]:
+    """The one thing that is first in an order; none when it is not so by the margin, or when there are too few."""
+    if order == "middle":
+        return _middle(things)
+    at_least, at_most, value, margin = _ORDERS[order]
+    return _first(things, value, margin) if at_least <= len(things) <= at_most else []
+
+
 def _first(things: Sequence[NamedThing], value: Callable[[NamedThing], float], margin: float) -> list[NamedThing]:
-    """The one of the smallest value, or none when the next one is not larger by the margin; none of a single one."""
+    """The one of the smallest value, or none when the next one is not larger by the margin."""
     ordered = sorted(things, key=value)
-    if len(ordered) < 2 or value(ordered[1]) - value(ordered[0]) < margin:
-        return []
-    return ordered[:1]
-
-
-def _of_two(
-    choose: Callable[[Sequence[NamedThing]], list[NamedThing]],
-) -> Callable[[Sequence[NamedThing]], list[NamedThing]]:
-    return lambda things: choose(things) if len(things) == 2 else []
-
-
-def _of_more(
-    choose: Callable[[Sequence[NamedThing]], list[NamedThing]],
-) -> Callable[[Sequence[NamedThing]], list[NamedThing]]:
-    return lambda things: choose(things) if len(things) > 2 else []
-
-
-def _distance(thing: NamedThing) -> float:
-    return math.hypot(float(thing.position[0]), float(thing.position[1]))
-
-
-def _leftmost(things: Sequence[NamedThing]) -> list[NamedThing]:
-    return _first(things, lambda thing: -float(thing.position[1]), MIN_GAP)
-
-
-def _rightmost(things: Sequence[NamedThing]) -> list[NamedThing]:
-    return _first(things, lambda thing: float(thing.position[1]), MIN_GAP)
-
-
-def _smallest(things: Sequence[NamedThing]) -> list[NamedThing]:
-    return _first(things, lambda thing: math.log(thing.size), math.log(MIN_SIZE_RATIO))
-
-
-def _largest(things: Sequence[NamedThing]) -> list[NamedThing]:
-    return _first(things, lambda thing: -math.log(thing.size), math.log(MIN_SIZE_RATIO))
-
-
-def _nearest(things: Sequence[NamedThing]) -> list[NamedThing]:
-    return _first(things, _distance, MIN_GAP)
-
-
-def _farthest(things: Sequence[NamedThing]) -> list[NamedThing]:
-    return _first(things, lambda thing: -_distance(thing), MIN_GAP)
+    return ordered[:1] if value(ordered[1]) - value(ordered[0]) >= margin else []
 
 
 def _middle(things: Sequence[NamedThing]) -> list[NamedThing]:
@@ -155,16 +116,33 @@ def _middle(things: Sequence[NamedThing]) -> list[NamedThing]:
     return chosen if chosen and detour(chosen[0]) < MIN_GAP else []
 
 
-_ORDERS: dict[str, Callable[[Sequence[NamedThing]], list[NamedThing]]] = {
-    "left": _of_two(_leftmost),
-    "right": _of_two(_rightmost),
-    "leftmost": _of_more(_leftmost),
-    "rightmost": _of_more(_rightmost),
-    "middle": _middle,
-    "smaller": _of_two(_smallest),
-    "larger": _of_two(_largest),
-    "smallest": _of_more(_smallest),
-    "largest": _of_more(_largest),
-    "nearest to the robot": _nearest,
-    "farthest from the robot": _farthest,
+def _to_the_right(thing: NamedThing) -> float:
+    return float(thing.position[1])
+
+
+def _to_the_left(thing: NamedThing) -> float:
+    return -float(thing.position[1])
+
+
+def _size(thing: NamedThing) -> float:
+    return math.log(thing.size)
+
+
+def _distance(thing: NamedThing) -> float:
+    return math.hypot(float(thing.position[0]), float(thing.position[1]))
+
+
+_RATIO = math.log(MIN_SIZE_RATIO)
+_ORDERS: dict[str, tuple[int, float, Callable[[NamedThing], float], float]] = {
+    "left": (2, 2, _to_the_left, MIN_GAP),
+    "right": (2, 2, _to_the_right, MIN_GAP),
+    "leftmost": (3, math.inf, _to_the_left, MIN_GAP),
+    "rightmost": (3, math.inf, _to_the_right, MIN_GAP),
+    "smaller": (2, 2, _size, _RATIO),
+    "larger": (2, 2, lambda thing: -_size(thing), _RATIO),
+    "smallest": (3, math.inf, _size, _RATIO),
+    "largest": (3, math.inf, lambda thing: -_size(thing), _RATIO),
+    "nearest to the robot": (2, math.inf, _distance, MIN_GAP),
+    "farthest from the robot": (2, math.inf, lambda thing: -_distance(thing), MIN_GAP),
 }
+"""Word -> of how many things it is said, at least and at most; what the chosen one has least of; and by how much."""

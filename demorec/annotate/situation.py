@@ -72,55 +72,41 @@ class Surroundings:
         raise KeyError(name)
 
 
-class Situations:
-    """The things of a scene at any moment; what stays the same about them is found out once.
+def situations(scene: Scene, world_from_object: Mapping[str, Array], moments: int) -> list[Surroundings]:
+    """The things of a scene at T moments.
 
     Args:
         scene: At the episode's start.
+        world_from_object: Body -> (T, 7) poses (xyz, quaternion xyzw); the scene's own where left out.
+        moments: T.
     """
-
-    def __init__(self, scene: Scene) -> None:
-        self._base_from_world = scene.robot.world_from_base.inverse()
-        self._bodies = [body for body in scene.bodies if body.role != "fixture"]
-        self._traits: list[dict[str, Any]] = [
-            {
-                "name": body.name,
-                "nouns": nouns_of(body),
-                "color": body.color_name,
-                "size": max(body.shape.extents),
-                "height": body.shape.extents[2],
-                "can_be_held": body.movable,
-            }
-            for body in self._bodies
-        ]
-
-    def at(self, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
-        """The things where they are.
-
-        Args:
-            world_from_object: Body -> (7,) pose (xyz, quaternion xyzw) at the moment; the scene's own where left out.
-        """
-        return self.at_each({name: pose[np.newaxis] for name, pose in (world_from_object or {}).items()}, 1)[0]
-
-    def at_each(self, world_from_object: Mapping[str, Array], moments: int) -> list[Surroundings]:
-        """The same of T moments at once: body -> (T, 7) poses."""
-        places = np.empty((moments, len(self._bodies), 3))
-        for index, body in enumerate(self._bodies):
-            moved = world_from_object.get(body.name)
-            places[:, index] = body.world_from_body.position if moved is None else moved[:, :3]
-        return [
-            Surroundings(
-                things=tuple(
-                    NamedThing(position=place, **traits) for place, traits in zip(there, self._traits, strict=True)
-                )
-            )
-            for there in self._base_from_world.apply(places)
-        ]
+    bodies = [body for body in scene.bodies if body.role != "fixture"]
+    traits: list[dict[str, Any]] = [
+        {
+            "name": body.name,
+            "nouns": nouns_of(body),
+            "color": body.color_name,
+            "size": max(body.shape.extents),
+            "height": body.shape.extents[2],
+            "can_be_held": body.movable,
+        }
+        for body in bodies
+    ]
+    places = np.empty((moments, len(bodies), 3))
+    for index, body in enumerate(bodies):
+        moved = world_from_object.get(body.name)
+        places[:, index] = body.world_from_body.position if moved is None else moved[:, :3]
+    return [
+        Surroundings(
+            things=tuple(NamedThing(position=place, **same) for place, same in zip(there, traits, strict=True))
+        )
+        for there in scene.robot.world_from_base.inverse().apply(places)
+    ]
 
 
 def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
-    """The things of a scene at one moment; arguments as of `Situations`."""
-    return Situations(scene).at(world_from_object)
+    """The same of one moment: (7,) poses."""
+    return situations(scene, {name: pose[np.newaxis] for name, pose in (world_from_object or {}).items()}, 1)[0]
 
 
 def nouns_of(body: Body) -> tuple[str, ...]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from demorec.annotate.referring import phrase_for
 from demorec.annotate.situation import Surroundings, nouns_of, place_of
@@ -116,23 +114,14 @@ def plan(goals: Sequence[GoalWords], *, is_dropped: bool, is_retry: bool) -> str
     return "\n".join(f"{number}. {line}" for number, line in enumerate(lines, start=1))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recollection:
-    """What is remembered from a frame on."""
-
-    frame: int
-    text: str
-
-
-def memories(story: Story, words: dict[int, GoalWords], *, is_dropped: bool) -> list[Recollection]:
-    """What was done so far, in the first person, each from the frame on at which it is done.
+def memories(story: Story, words: dict[int, GoalWords], *, is_dropped: bool) -> Iterator[tuple[int, str]]:
+    """What was done so far, in the first person: (frame from which it is remembered, text).
 
     Args:
         story: Of the episode.
         words: First frame of a try -> how its things are called.
         is_dropped: Whether objects are let fall.
     """
-    found: list[Recollection] = []
     done: list[str] = []
     for before, stretch in zip((None, *story.stretches), story.stretches, strict=False):
         attempt = stretch.attempt
@@ -149,8 +138,7 @@ def memories(story: Story, words: dict[int, GoalWords], *, is_dropped: bool) -> 
                 present = _trouble(attempt, spoken)
             else:
                 continue
-            found.append(Recollection(frame=stretch.first, text=" ".join([*done, *([present] if present else [])])))
-    return found
+            yield stretch.first, " ".join([*done, *([present] if present else [])])
 
 
 def _placed(words: GoalWords, *, is_dropped: bool) -> str:
@@ -165,16 +153,16 @@ def _trouble(attempt: Try, words: GoalWords) -> str:
     return f"I {verb} {words.object}{' on purpose' if attempt.is_deliberate_miss else ''}."
 
 
-def motion(before: Array, after: Array, opening_before: float, opening_after: float) -> str:
-    """A displacement of the TCP in the robot's base frame and what the gripper does, to whole centimetres.
+def motion(position: Array, opening: Array) -> str:
+    """How the TCP is displaced and what the gripper does from one moment to another, to whole centimetres.
 
     Args:
-        before, after: (3,) positions in the base frame (x forward, y left, z up), metres.
-        opening_before, opening_after: Of the gripper, metres.
+        position: (2, 3) of the TCP before and after, base frame (x forward, y left, z up), metres.
+        opening: (2,) of the gripper, metres.
     """
     parts = []
     for change, positive, negative in zip(
-        (after - before).tolist(), ("forward", "left", "up"), ("backward", "right", "down"), strict=True
+        (position[1] - position[0]).tolist(), ("forward", "left", "up"), ("backward", "right", "down"), strict=True
     ):
         centimetres = round(abs(change) * 100)
         if abs(change) >= _SMALLEST_MOVE and centimetres:
@@ -182,7 +170,7 @@ def motion(before: Array, after: Array, opening_before: float, opening_after: fl
     parts.sort(key=lambda part: -part[0])
     said = [f"{centimetres} cm {direction}" for centimetres, direction in parts]
     sentences = [f"move {joined(said)}"] if said else []
-    change = opening_after - opening_before
+    change = float(opening[1]) - float(opening[0])
     if abs(change) >= _SMALLEST_OPENING:
         verb = "open" if change > 0 else "close"
         sentences.append(f"{verb} the gripper by {max(0.5, round(abs(change) * 200) / 2):g} cm")
@@ -192,13 +180,3 @@ def motion(before: Array, after: Array, opening_before: float, opening_after: fl
 def joined(parts: Sequence[str]) -> str:
     """ "a", "a and b", "a, b and c"."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
-def tcp_motion(base_from_tcp: Array, opening: Array, first: int, last: int) -> str:
-    """`motion` between two frames of (T, 7) TCP poses and (T,) openings of the gripper."""
-    return motion(
-        np.asarray(base_from_tcp[first, :3]),
-        np.asarray(base_from_tcp[last, :3]),
-        float(opening[first]),
-        float(opening[last]),
-    )

@@ -70,13 +70,12 @@ def correction_of(recording: SimulatedRecording, columns: SimulatedColumns) -> C
 
 def interjection(correction: Correction, now: Surroundings, rng: np.random.Generator) -> tuple[str, str] | None:
     """What the user says and what is answered; None where no words mean the wanted thing alone."""
-    wanted, mistaken = (phrases_for(name, now) for name in (correction.wanted, correction.mistaken))
+    wanted, mistaken = (next(phrases_for(name, now), "") for name in (correction.wanted, correction.mistaken))
     if not wanted:
         return None
     forms = (*_SAID, *_SAID_OF_BOTH) if mistaken else _SAID
     said, answered = forms[int(rng.integers(len(forms)))], _ANSWERED[int(rng.integers(len(_ANSWERED)))]
-    words = {"wanted": wanted[0], "mistaken": mistaken[0] if mistaken else ""}
-    return said.format_map(words), answered.format_map(words)
+    return said.format(wanted=wanted, mistaken=mistaken), answered.format(wanted=wanted)
 
 
 TryEnd = Literal["placed", "missed", "dropped", "misplaced", "unfinished"]

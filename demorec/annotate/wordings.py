@@ -139,17 +139,17 @@ def _one_by_one(
 
 
 def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: bool) -> Iterator[str]:
-    objects = phrases_for(clause.object, start)
-    places = phrases_for(clause.place, start) if clause.place else []
-    bases = phrases_for(clause.base, start)[:1] if clause.base else []
+    objects = list(phrases_for(clause.object, start))
+    places = list(phrases_for(clause.place, start)) if clause.place else []
+    base = next(phrases_for(clause.base, start), "") if clause.base else ""
     into, inside = prepositions(scene, clause.place)
     is_on_cube = bool(clause.place) and start.thing(clause.place).can_be_held
     templates = _DROP if is_dropped else (*_PUT, *_INTO)
-    if bases and not is_dropped:
+    if base and not is_dropped:
         templates = (*templates, *_OFF)
     for template, object_, place in product(templates, objects, places):
         text = template.replace("{o}", object_).replace("{i}", f"{into} {place}").replace("{p}", f"{inside} {place}")
-        yield text.replace("{b}", bases[0]) if bases else text
+        yield text.replace("{b}", base) if base else text
         if is_on_cube and "{p}" in template:
             yield template.replace("{o}", object_).replace("{p}", f"on top of {place}")
     if is_on_cube:
@@ -168,7 +168,7 @@ def _by_class(scene: Scene, clauses: Sequence[_Clause], start: Surroundings) -> 
         thing = start.thing(next(iter(members)))
         into, inside = prepositions(scene, place)
         words = f"every {thing.color} {thing.noun}"
-        if resolve(words, start) != members or not (names := phrases_for(place, start)):
+        if resolve(words, start) != members or not (names := list(phrases_for(place, start))):
             return
         options = [*((verb, inside) for verb in ("put", "place", "set")), *((verb, into) for verb in _CLASS_VERBS)]
         parts.append([f"{verb} {words} {where} {name}" for name in names for verb, where in options])

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.annotate.kinds import STATES
+from demorec.annotate import STATES
 from demorec.annotate.questions import ANSWERS
 from demorec.annotate.referring import references
 from demorec.annotate.situation import COLOR_WORDS, Surroundings, place_of, situation

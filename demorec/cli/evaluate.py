@@ -14,7 +14,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, VideoConfig
 from demorec.core.errors import ConfigError, check_option
-from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate import TakeOver
 
 if TYPE_CHECKING:
     from demorec.learn.evaluate.rollouts import Evaluation
@@ -242,7 +242,7 @@ class Correct(RolloutFlags):
 
 
 def _correction_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
-    from demorec.learn.evaluate.correction import read_takeover
+    from demorec.learn.evaluate.turns import read_takeover
 
     config = evaluation.settings.config
     found = [read_takeover(out / rollout.file) for rollout in evaluation.rollouts]

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.core.errors import check_option
-from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate import TakeOver
 
 
 @dataclass(frozen=True, kw_only=True)

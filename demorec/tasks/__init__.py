@@ -1,1 +1,1 @@
-"""What the robot does: one task per file, rows in `demorec.core.tables.TASKS`."""
+"""What the robot does: families of tasks, one file each, rows in `demorec.core.tables.TASKS`."""

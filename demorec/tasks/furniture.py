@@ -1,13 +1,14 @@
-"""What stands still in most scenes: table, floor and target marks, and the colours that have a name."""
+"""What is in a scene: table, floor and target marks, cubes and things of other shapes; the colours that have a name."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.scene import Body, Rgba, RobotPlacement, Shape, Vector3
+from demorec.episode.scene import Body, Rgba, RobotPlacement, Role, Shape, Vector3
 from demorec.robots.robot import RobotSpec
 from demorec.tasks.sampling import Sampler
 
@@ -99,3 +100,106 @@ def robot_at_origin(robot: RobotSpec, sampler: Sampler) -> RobotPlacement:
         joint_position=tuple(q + sampler.uniform(-spread, spread) for q in robot.home_q),
         gripper_width=robot.gripper.max_width,
     )
+
+
+WHITE = (1.0, 1.0, 1.0, 1.0)
+"""Leaves a mesh its own colours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thing:
+    """A kind of object.
+
+    Attributes:
+        noun: Its word in instructions.
+        shape: Draws its geometry.
+        yaw_symmetry: As `Body.yaw_symmetry`.
+        painted: Whether it gets a colour and the colour's word; a mesh keeps its own.
+    """
+
+    noun: str
+    shape: Callable[[Sampler], Shape]
+    yaw_symmetry: int
+    painted: bool = True
+
+
+def _box(sampler: Sampler) -> Shape:
+    size = (sampler.uniform(0.05, 0.09), sampler.uniform(0.025, 0.045), sampler.uniform(0.03, 0.045))
+    return Shape(kind="box", size=size)
+
+
+def _cube(sampler: Sampler) -> Shape:
+    side = sampler.uniform(0.03, 0.045)
+    return Shape(kind="box", size=(side, side, side))
+
+
+def _cylinder(sampler: Sampler) -> Shape:
+    return Shape(kind="cylinder", size=(sampler.uniform(0.015, 0.025), sampler.uniform(0.03, 0.045)))
+
+
+def _jenga(sampler: Sampler) -> Shape:
+    scale = sampler.uniform(0.7, 0.9)
+    return Shape(kind="urdf", file="jenga/jenga.urdf", scale=scale, size=(0.15 * scale, 0.05 * scale, 0.03 * scale))
+
+
+def _lego(sampler: Sampler) -> Shape:
+    scale = sampler.uniform(1.0, 1.4)
+    return Shape(kind="urdf", file="lego/lego.urdf", scale=scale, size=(0.032 * scale, 0.032 * scale, 0.023 * scale))
+
+
+def _duck(sampler: Sampler) -> Shape:
+    scale = 0.035 * sampler.uniform(0.9, 1.1)
+    return Shape(
+        kind="mesh",
+        file="duck.obj",
+        scale=scale,
+        size=(1.6548 * scale, 1.1525 * scale, 1.5404 * scale),
+        origin=(-0.1344, 0.8695, 0.0370),
+        y_up=True,
+    )
+
+
+def _mug(sampler: Sampler) -> Shape:
+    scale = sampler.uniform(0.52, 0.60)
+    # The origin lies on the mug's axis, so that the fingers close over its middle; the handle points along y.
+    size = (0.082 * scale, 0.1613 * scale, 0.1 * scale)
+    return Shape(kind="mesh", file="objects/mug.obj", scale=scale, size=size, origin=(0.0, 0.0, 0.05))
+
+
+THINGS: Mapping[str, Thing] = {
+    "cube": Thing(noun="cube", shape=_cube, yaw_symmetry=4),
+    "block": Thing(noun="block", shape=_box, yaw_symmetry=2),
+    "cylinder": Thing(noun="cylinder", shape=_cylinder, yaw_symmetry=0),
+    "jenga": Thing(noun="wooden plank", shape=_jenga, yaw_symmetry=2, painted=False),
+    "lego": Thing(noun="toy brick", shape=_lego, yaw_symmetry=4),
+    "duck": Thing(noun="duck", shape=_duck, yaw_symmetry=1, painted=False),
+    "mug": Thing(noun="mug", shape=_mug, yaw_symmetry=1),
+}
+"""Every kind that the tasks draw from."""
+
+
+def make_thing(
+    sampler: Sampler, kind: str, name: str, point: tuple[float, float], yaw: float, *, color_name: str, role: Role
+) -> Body:
+    """A thing on the table with drawn geometry, mass (20-150 g) and friction (0.5-1.2)."""
+    thing = THINGS[kind]
+    shape = thing.shape(sampler)
+    return Body(
+        name=name,
+        role=role,
+        shape=shape,
+        world_from_body=Pose.from_yaw((point[0], point[1], shape.extents[2] / 2 + 5e-4), yaw),
+        mass=sampler.uniform(0.02, 0.15),
+        lateral_friction=sampler.uniform(0.5, 1.2),
+        # What could roll away is slowed down as felt on a table would.
+        rolling_friction=0.001 if shape.kind == "cylinder" else 0.0,
+        rgba=COLORS[color_name] if thing.painted else WHITE,
+        color_name=color_name if thing.painted else "",
+        yaw_symmetry=thing.yaw_symmetry,
+    )
+
+
+def words_for(body: Body) -> str:
+    """What a thing is called: "red cube", "duck"; what is of no known kind by its own name."""
+    kinds = [THINGS[part].noun for part in body.name.split("_") if part in THINGS]
+    return f"{body.color_name} {kinds[0]}".strip() if kinds else body.name.replace("_", " ")

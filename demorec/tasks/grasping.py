@@ -1,4 +1,4 @@
-"""Where a hand that points down takes hold of a body."""
+"""Where a hand that points down takes hold of a body, beside it, and puts it down."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, wrap_angle
-from demorec.episode.scene import Body
+from demorec.episode.scene import Body, yaw_of
+from demorec.robots.motion import angle_between
 from demorec.robots.robot import RobotSpec
+from demorec.tasks.script import Behaviour
+from demorec.tasks.success import resting_half_height
 
 # Of the open hand, metres, from the TCP along its x and y axes; the larger of the Panda's and the iiwa's.
 _FINGERS = (0.012, 0.07)
@@ -17,6 +20,8 @@ _PALM = (0.035, 0.11)
 _UP = np.array([0.0, 0.0, 1.0])
 _GAP = 0.005
 """Air between the hand and what it shall not touch, metres."""
+ABOVE_M, ABOVE_RAD = 0.01, 0.35
+"""How far the hand may be beside where it is going to be lowered to, so that it need not rise and come again."""
 
 
 def hand_down(position: Sequence[float] | Array, yaw: float) -> Pose:
@@ -48,6 +53,18 @@ def nearest_first(yaws: Iterable[float], now: float) -> list[float]:
     return sorted(yaws, key=lambda yaw: abs(wrap_angle(yaw - now)))
 
 
+def is_above(here: Pose, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
+    """Whether the hand needs but to be lowered to get from one `world_from_tcp` to another.
+
+    Args:
+        here, wanted: Where it is, and where to.
+        beside: So far aside it may be, metres; beyond a centimetre no farther than it is above.
+    """
+    above = float(here.position[2] - wanted.position[2])
+    aside = math.dist(here.position[:2], wanted.position[:2])
+    return above >= 0 and angle_between(here, wanted) < ABOVE_RAD and aside < min(beside, max(ABOVE_M, above))
+
+
 def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[float]:
     """Hand yaws, rad, at which the fingers close over two opposite faces that fit between them.
 
@@ -68,6 +85,55 @@ def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[fl
         # The fingers move along the hand's y axis, a quarter turn from its x axis.
         yaws += symmetric_yaws(angle + math.pi / 2, 2)
     return yaws
+
+
+def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour: Behaviour) -> list[Pose]:
+    """`world_from_tcp` of grasps with the behaviour's offset and errors, the yaw nearest to the present one first.
+
+    Args:
+        body, pose: What is grasped, and its pose in the world.
+        now: Present hand yaw, rad.
+        robot: Whose hand it is.
+        behaviour: How it is done.
+    """
+    gripper, half = robot.gripper, resting_half_height(body, pose)
+    top, bottom = pose.position[2] + half, pose.position[2] - half
+    # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
+    above_support = gripper.finger_depth + 0.005 * robot.task_scale
+    z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + above_support)
+    found = []
+    for yaw in nearest_first(grasp_yaws(body, pose, now, gripper.max_width), now):
+        across = hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
+        x, y = pose.position[:2] - gripper.object_offset(2 * half_extent(body, pose, across)) * across[:2]
+        found.append(_perturbed(hand_down((x, y, z), yaw), behaviour))
+    return found
+
+
+def _perturbed(grasp: Pose, behaviour: Behaviour) -> Pose:
+    yaw = hand_yaw(grasp)
+    shift = np.array([behaviour.perception_x, behaviour.perception_y, 0.0])
+    # The hand's x axis runs along the fingers' faces: a shift that way still grasps.
+    shift = shift + behaviour.grasp_offset * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    return hand_down(grasp.position + shift, yaw + behaviour.perception_yaw)
+
+
+def places_of(body: Body, pose: Pose, wanted: Pose, *, hand: Pose, yaw_symmetry: int) -> list[Pose]:
+    """`world_from_tcp` that put a held body where it is wanted, with the offset in the hand compensated.
+
+    Args:
+        body, pose: What is held, and its pose in the world.
+        wanted: Its pose in the world, resting on the face that was meant.
+        hand: `world_from_tcp` now.
+        yaw_symmetry: How many yaws are as good; 0: the present one.
+    """
+    hand_from_object = (hand.inverse() @ pose).position
+    now = hand_yaw(hand)
+    height = wanted.position[2] - resting_half_height(body, wanted) + resting_half_height(body, pose)
+    centre = np.array([wanted.position[0], wanted.position[1], height])
+    yaws = [now]
+    if yaw_symmetry:
+        yaws = nearest_first(symmetric_yaws(yaw_of(wanted) + now - yaw_of(pose), yaw_symmetry), now)
+    return [hand_down(centre - hand_down((0.0, 0.0, 0.0), y).apply(hand_from_object), y) for y in yaws]
 
 
 def grasps_beside(

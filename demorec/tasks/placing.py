@@ -12,21 +12,18 @@ import numpy as np
 
 from demorec.core.geometry import Pose
 from demorec.episode.episode import SuccessCheck
-from demorec.episode.scene import Body, Goal, Rgba, Scene, Shape
+from demorec.episode.scene import Body, Goal, Scene
 from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.furniture import COLORS, cube, robot_at_origin, table_and_floor
+from demorec.tasks.furniture import cube, robot_at_origin, table_and_floor, words_for
 from demorec.tasks.recovery import finish, put_back
 from demorec.tasks.sampling import Sampler, wording
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import at_most, gripper_open_check, placement_checks
-from demorec.tasks.things import words_for
 
-TRAY_FLOOR = 0.004
-"""Height of a tray's floor above its lower face, metres (tray.urdf)."""
 MAX_DISTURBANCE = 0.02
 """How far an object that is not to be moved may end from where it was, metres."""
 TALLEST = 0.07
@@ -152,26 +149,6 @@ def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
         for body in world.scene.movable
         if body.name not in moved
     )
-
-
-def tray(name: str, point: tuple[float, float], yaw: float, *, color_name: str) -> Body:
-    """A shallow tray that stands still, its long side (0.27 m) along x at yaw 0."""
-    return Body(
-        name=name,
-        role="target",
-        shape=Shape(kind="urdf", file="demorec:tray.urdf", size=(0.27, 0.21, 0.019)),
-        world_from_body=Pose.from_yaw((point[0], point[1], 0.0005), yaw),
-        lateral_friction=0.6,
-        # Paler than the cubes, so that a cube shows on a tray of its own colour.
-        rgba=_paler(COLORS[color_name]),
-        color_name=color_name,
-        yaw_symmetry=2,
-    )
-
-
-def _paler(rgba: Rgba) -> Rgba:
-    red, green, blue = (0.55 * channel + 0.45 * 0.92 for channel in rgba[:3])
-    return (red, green, blue, rgba[3])
 
 
 def random_cube(

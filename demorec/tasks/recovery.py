@@ -16,7 +16,7 @@ from demorec.episode.episode import HALT_PHASE
 from demorec.episode.scene import Goal
 from demorec.robots.motion import PEAK_VELOCITY, quintic, slowdown
 from demorec.sim.world import World
-from demorec.tasks.grasping import hand_down, hand_yaw, nearest_first, symmetric_yaws
+from demorec.tasks.grasping import hand_down, hand_yaw, is_above, nearest_first, symmetric_yaws
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
 from demorec.tasks.success import placement_checks, resting_half_height
@@ -69,7 +69,11 @@ def _begun(expert: Expert, goals: Sequence[Goal]) -> Goal | None:
     Whoever halts there is shown the way on: to rise and to come again would contradict every demonstration.
     """
     goal = next((goal for goal in goals if not is_served(expert.world, goal)), None)
-    return goal if goal is not None and _is_open(expert) and expert.is_above_object(goal.object) else None
+    if goal is None or not _is_open(expert):
+        return None
+    above_by = expert.world.robot.task_scale * expert.behaviour.approach_height
+    grasp = expert.first_reachable(expert.grasps(goal.object), above_by)
+    return goal if grasp is not None and is_above(expert.tcp(), grasp) else None
 
 
 def begin_again(expert: Expert) -> Iterator[Step]:

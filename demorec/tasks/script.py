@@ -1,10 +1,13 @@
-"""What the expert is told about an episode, and the steps that its script is made of."""
+"""What the expert is told about an episode, the steps that its script is made of, and what these wait for."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 from demorec.episode.episode import Action, Event
+from demorec.sim.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,3 +63,28 @@ class Step:
     noise_allowed: bool = False
     events: tuple[Event, ...] = ()
     is_deliberate_miss: bool = False
+
+
+def lasting(condition: Callable[[], bool], *, steps: int) -> Callable[[], bool]:
+    """A condition that holds once another one has held for so many control steps in a row."""
+    count = 0
+
+    def done() -> bool:
+        nonlocal count
+        count = count + 1 if condition() else 0
+        return count >= steps
+
+    return done
+
+
+def steady_width(world: World, *, tolerance: float = 0.006, seconds: float = 0.06) -> Callable[[], bool]:
+    """A condition that holds once the opening has changed by less than `tolerance` (m/s) for some time."""
+    last = math.inf
+
+    def is_steady() -> bool:
+        nonlocal last
+        width = world.arm.gripper_width()
+        change, last = abs(width - last) * world.fps, width
+        return change < tolerance
+
+    return lasting(is_steady, steps=max(1, round(seconds * world.fps)))

@@ -15,23 +15,23 @@ import numpy as np
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
-from demorec.episode.scene import Goal, yaw_of
+from demorec.episode.scene import Goal
 from demorec.robots.kinematics import WHOLE_POSE
 from demorec.robots.motion import MotionLimits, plan_straight
 from demorec.sim.world import World
 from demorec.tasks.grasping import (
-    grasp_yaws,
     grasps_beside,
-    half_extent,
+    grasps_of,
     hand_down,
     hand_yaw,
+    is_above,
     nearest_first,
+    places_of,
     raised,
     symmetric_yaws,
 )
-from demorec.tasks.script import Behaviour, Step
-from demorec.tasks.success import goal_pose, on_support, placement_checks, resting_half_height
-from demorec.tasks.waiting import steady_width
+from demorec.tasks.script import Behaviour, Step, steady_width
+from demorec.tasks.success import goal_pose, on_support, placement_checks
 
 MAX_TRIES = 3
 FREE_SPEED, DESCEND_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.25, 0.3, 0.08
@@ -45,10 +45,8 @@ LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
 LEAST_ABOVE_GOAL = 0.10
 """Metres of the TCP above the goal on its way there; it stays at `lift_height` where that is higher."""
-ABOVE_M, ABOVE_RAD = 0.01, 0.35
-"""How far the hand may be beside where it is going to be lowered to, so that it need not rise and come again."""
 CARRIED_ABOVE_M = 0.04
-"""The same for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
+"""As `ABOVE_M` for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
 
 
 class GaveUp(Exception):
@@ -148,7 +146,7 @@ class Expert:
         goal = self._base_from_world @ world_from_tcp
         return self.arm.inverse(goal, start=self.joint_target, rest=self.rest_for(world_from_tcp)) is not None
 
-    def _first_reachable(self, grasps: Iterable[Pose], above_by: float) -> Pose | None:
+    def first_reachable(self, grasps: Iterable[Pose], above_by: float) -> Pose | None:
         """The first grasp that the arm reaches, there and `above_by` metres higher."""
         return next((g for g in grasps if self.reaches(g) and self.reaches(raised(g, above_by))), None)
 
@@ -249,20 +247,22 @@ class Expert:
         """
         found = None
         if self._missing:
-            grasps = self._grasps(name)
-            found = self._first_reachable((m for grasp in grasps for m in self._grasps_beside(name, grasp)), above_by)
+            world, x, y = self.world, self.behaviour.miss_x, self.behaviour.miss_y
+            body, pose = world.body(name), world.pose(name)
+            others = [(other, world.pose(other.name)) for other in world.scene.bodies if other.name != name]
+            beside = (
+                missed
+                for grasp in self.grasps(name)
+                for missed in grasps_beside(grasp, body, pose, x=x, y=y, others=others, robot=world.robot)
+            )
+            found = self.first_reachable(beside, above_by)
             self._missing = self._has_missed = found is not None
-        found = found or self._first_reachable(self._grasps(name), above_by)
+        found = found or self.first_reachable(self.grasps(name), above_by)
         if found is not None:
             self.note("grasp", f"grasp {name} at yaw {hand_yaw(found):.4f} rad")
             return found
         place = np.round(self.world.pose(name).position, 3).tolist()
-        raise self._out_of_reach(f"{name} at {place}", self._grasps(name))
-
-    def is_above_object(self, name: str) -> bool:
-        """Whether the hand needs but to be lowered to grasp an object."""
-        grasp = self._first_reachable(self._grasps(name), self._scale * self.behaviour.approach_height)
-        return grasp is not None and self.is_above(grasp)
+        raise self._out_of_reach(f"{name} at {place}", self.grasps(name))
 
     def reachable_place(self, position: tuple[float, float, float]) -> Pose:
         """`world_from_tcp` at a position, the hand pointing down at the reachable yaw nearest to the present one.
@@ -292,7 +292,7 @@ class Expert:
 
         self.phase = "approach"
         self.gripper_target = self.open_width
-        if not (is_begun and self.is_above(grasp)):
+        if not (is_begun and is_above(self.tcp(), grasp)):
             yield from self.move(raised(grasp, above_by), speed=FREE_SPEED, free=True)
         self.phase = "descend"
         yield from self.move(grasp, speed=DESCEND_SPEED, until=lambda: world.pressed_from_above(name))
@@ -317,19 +317,6 @@ class Expert:
         """Whether both fingers press on an object that keeps them apart."""
         return self.world.grip_force(name) > 0.5 and self._is_apart(0.01)
 
-    def is_above(self, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
-        """Whether the hand needs but to be lowered to get to `world_from_tcp`.
-
-        Args:
-            wanted: Where to.
-            beside: So far aside it may be, metres; beyond a centimetre no farther than it is above.
-        """
-        here = self.tcp()
-        above = float(here.position[2] - wanted.position[2])
-        turn = 2 * math.acos(min(1.0, abs(float(np.dot(here.quat_xyzw, wanted.quat_xyzw)))))
-        aside = math.dist(here.position[:2], wanted.position[:2])
-        return above >= 0 and turn < ABOVE_RAD and aside < min(beside, max(ABOVE_M, above))
-
     def place(self, goal: Goal, *, is_begun: bool = False) -> Generator[Step, None, bool]:
         """Carry the held object to its goal and let go; the generator returns whether it lies well.
 
@@ -341,18 +328,22 @@ class Expert:
         name = goal.object
         self.phase = "transport"
         wanted = self._place_pose(goal)
-        if is_begun and self.is_above(wanted, beside=CARRIED_ABOVE_M):
-            self._note_place(name, wanted)
-        else:
-            yield from self._carry(name, wanted)
-        if self._is_full():
+        is_there = is_begun and is_above(self.tcp(), wanted, beside=CARRIED_ABOVE_M)
+        here, height = self.tcp_target(), self._transport_height(wanted)
+        if not is_there and here.position[2] < height - 1e-3:
+            yield from self.move(raised(here, height - here.position[2]), speed=LIFT_SPEED)
+        self.note("place", f"place {name} at hand yaw {hand_yaw(wanted):.4f} rad")
+        if not is_there:
+            above = raised(wanted, height - wanted.position[2])
+            yield from self.move(above, speed=FREE_SPEED, free=True, until=lambda: not self._is_apart(LOST_WIDTH))
+        if self._is_apart(LOST_WIDTH):
             self.phase = "lower"
             wanted = self._place_pose(goal, keep_yaw=True)
             yield from self.move(raised(wanted, 0.015), speed=LIFT_SPEED, settle=False)
             # A faster behaviour does not hurry here: the target stops in one step, harder than the joints may.
             speed = TOUCH_DOWN_SPEED / max(1.0, self.behaviour.speed)
             yield from self.move(raised(wanted, -0.004), speed=speed, until=lambda: on_support(world, name, goal.onto))
-        if not self._is_full():
+        if not self._is_apart(LOST_WIDTH):
             self.note("drop", f"dropped {name}", trouble=True)
             here = self.tcp()
             yield from self._recover(raised(here, max(0.0, 0.2 * self._scale - here.position[2])))
@@ -371,26 +362,9 @@ class Expert:
             self.note(f"misplaced_{failed[0]}", f"{name} lies badly: {', '.join(failed)}", trouble=True)
         return not failed
 
-    def _note_place(self, name: str, wanted: Pose) -> None:
-        self.note("place", f"place {name} at hand yaw {hand_yaw(wanted):.4f} rad")
-
-    def _carry(self, name: str, wanted: Pose) -> Iterator[Step]:
-        """Rise with what is held, and bring it above where `world_from_tcp` will put it."""
-        height = self._transport_height(wanted)
-        if self.tcp_target().position[2] < height - 1e-3:
-            here = self.tcp_target()
-            yield from self.move(raised(here, height - here.position[2]), speed=LIFT_SPEED)
-        self._note_place(name, wanted)
-        yield from self.move(
-            raised(wanted, height - wanted.position[2]), speed=FREE_SPEED, free=True, until=lambda: not self._is_full()
-        )
-
     def _transport_height(self, place: Pose) -> float:
         """Height of the TCP, m, on the way to a place: never lower than now."""
         return float(max(self.tcp_target().position[2], place.position[2] + self._scale * LEAST_ABOVE_GOAL))
-
-    def _is_full(self) -> bool:
-        return self._is_apart(LOST_WIDTH)
 
     def _is_apart(self, by: float) -> bool:
         """Whether the fingers are more than so many metres (of an arm of task_scale 1) wider than when closed."""
@@ -404,37 +378,11 @@ class Expert:
         clear_height = float(self.tcp().position[2]) + 0.07 * self._scale
         yield from self.move(world_from_tcp, speed=0.4, free=True, clear_height=clear_height)
 
-    def _grasps(self, name: str) -> list[Pose]:
-        """Grasp poses `world_from_tcp` with the behaviour's errors, the yaw nearest to the hand's present one first."""
-        body, pose = self.world.body(name), self.world.pose(name)
-        gripper = self.world.robot.gripper
-        half = resting_half_height(body, pose)
-        top, bottom = pose.position[2] + half, pose.position[2] - half
-        # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
-        above_support = gripper.finger_depth + 0.005 * self._scale
-        z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + above_support)
-        now = hand_yaw(self.tcp())
-        grasps = []
-        for yaw in nearest_first(grasp_yaws(body, pose, now, self.open_width), now):
-            across = hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
-            x, y = pose.position[:2] - gripper.object_offset(2 * half_extent(body, pose, across)) * across[:2]
-            grasps.append(self._perturbed(hand_down((x, y, z), yaw)))
-        return grasps
-
-    def _grasps_beside(self, name: str, grasp: Pose) -> list[Pose]:
-        """Where the hand misses an object as the behaviour wants it."""
-        world, x, y = self.world, self.behaviour.miss_x, self.behaviour.miss_y
-        others = [(body, world.pose(body.name)) for body in world.scene.bodies if body.name != name]
-        return grasps_beside(grasp, world.body(name), world.pose(name), x=x, y=y, others=others, robot=world.robot)
-
-    def _perturbed(self, grasp: Pose) -> Pose:
-        """A grasp with the behaviour's offset and perception error."""
-        behaviour = self.behaviour
-        yaw = hand_yaw(grasp)
-        shift = np.array([behaviour.perception_x, behaviour.perception_y, 0.0])
-        # The hand's x axis runs along the fingers' faces: a shift that way still grasps.
-        shift = shift + behaviour.grasp_offset * np.array([math.cos(yaw), math.sin(yaw), 0.0])
-        return hand_down(grasp.position + shift, yaw + behaviour.perception_yaw)
+    def grasps(self, name: str) -> list[Pose]:
+        """Grasp poses `world_from_tcp` of an object with the behaviour's errors."""
+        world = self.world
+        body, pose = world.body(name), world.pose(name)
+        return grasps_of(body, pose, now=hand_yaw(self.tcp()), robot=world.robot, behaviour=self.behaviour)
 
     def _place_pose(self, goal: Goal, *, keep_yaw: bool = False) -> Pose:
         """`world_from_tcp` that puts the held object at its goal, with the offset in the hand compensated.
@@ -442,17 +390,9 @@ class Expert:
         Raises:
             GaveUp: Out of reach at every allowed yaw.
         """
-        body, pose, hand = self.world.body(goal.object), self.world.pose(goal.object), self.tcp()
-        wanted = goal_pose(self.world, goal)
-        hand_from_object = (hand.inverse() @ pose).position
-        now = hand_yaw(hand)
-        height = wanted.position[2] - resting_half_height(body, wanted) + resting_half_height(body, pose)
-        centre = np.array([wanted.position[0], wanted.position[1], height])
-        if keep_yaw or goal.yaw_symmetry == 0:
-            yaws = [now]
-        else:
-            yaws = nearest_first(symmetric_yaws(yaw_of(wanted) + now - yaw_of(pose), goal.yaw_symmetry), now)
-        places = [hand_down(centre - hand_down((0.0, 0.0, 0.0), y).apply(hand_from_object), y) for y in yaws]
+        body, pose = self.world.body(goal.object), self.world.pose(goal.object)
+        symmetry = 0 if keep_yaw else goal.yaw_symmetry
+        places = places_of(body, pose, goal_pose(self.world, goal), hand=self.tcp(), yaw_symmetry=symmetry)
         for place in places:
             if self.reaches(place) and self.reaches(raised(place, self._transport_height(place) - place.position[2])):
                 return place

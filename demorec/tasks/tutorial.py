@@ -19,7 +19,7 @@ from demorec.tasks.base import Task
 from demorec.tasks.furniture import COLORS, floor
 from demorec.tasks.grasping import raised
 from demorec.tasks.sampling import Sampler, wording
-from demorec.tasks.script import Step
+from demorec.tasks.script import Step, lasting, steady_width
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import (
     MAX_SPEED,
@@ -30,7 +30,6 @@ from demorec.tasks.success import (
     gripper_open_check,
     tilt_of,
 )
-from demorec.tasks.waiting import lasting, steady_width
 
 ROBOT_SCALE = 1.3
 BASE = (1.0, 0.0, 0.1)

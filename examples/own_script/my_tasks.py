@@ -20,10 +20,9 @@ from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor
 from demorec.tasks.grasping import hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.placing import on_table, random_cube
 from demorec.tasks.sampling import Region, Sampler, wording
-from demorec.tasks.script import Step
+from demorec.tasks.script import Step, steady_width
 from demorec.tasks.skills import Expert, GaveUp
 from demorec.tasks.success import placement_checks
-from demorec.tasks.waiting import steady_width
 
 STARTS = Region(x=(0.40, 0.48), y=(-0.12, 0.12))
 """Where the cube may start: metres in front of the robot's base and to its left."""

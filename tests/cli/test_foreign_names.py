@@ -24,7 +24,7 @@ SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap
 MODULE = "names_of_a_stranger"
 SOURCE = '''
 from pathlib import Path
-from demorec.tasks.pick_place import PickPlace
+from demorec.tasks.pick import PickPlace
 
 Path(__file__).with_name("marker").touch()
 

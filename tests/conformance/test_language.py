@@ -15,7 +15,7 @@ from support.check import simulate_run
 from support.export import data_table, episode_rows, export, files_of
 from support.language import active, language_of, meant, phrases
 
-from demorec.annotate.kinds import STATES
+from demorec.annotate import STATES
 from demorec.annotate.situation import nouns_of, place_of
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
@@ -26,7 +26,7 @@ from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.mcap import SimulatedRecording
-from demorec.tasks.things import THINGS
+from demorec.tasks.furniture import THINGS
 
 RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"
 MISSING = ("pick_place", "stack", "sort_by_color")

@@ -108,7 +108,7 @@ def test_lerobot_loads_the_policy_and_its_encoder_sees_as_taught(settings: Path,
     import torch
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-    from demorec.learn.training.encoder import KeyframeEncoder
+    from demorec.learn.training.keyframes import KeyframeEncoder
 
     policy = ACTPolicy.from_pretrained(taught)
     network = KeyframeEncoder(policy.config, num_cameras=2, state_dim=15, num_targets=5)

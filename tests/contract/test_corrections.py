@@ -22,11 +22,9 @@ from demorec.episode.features import ActionKind
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.gym_env import DemorecEnv, Situation
-from demorec.learn.evaluate import rollouts
-from demorec.learn.evaluate.correction import read_takeover
-from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate import TakeOver, rollouts
 from demorec.learn.evaluate.rollouts import Evaluation, Settings, make_rollout
-from demorec.learn.evaluate.turns import Turns
+from demorec.learn.evaluate.turns import Turns, read_takeover
 from demorec.learn.evaluate.watch import Watch
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.mcap import SimulatedRecording

@@ -24,7 +24,7 @@ from demorec.robots.motion import MotionLimits, plan_straight
 from demorec.robots.robot import JawGripper, RobotSpec
 from demorec.robots.urdf import Urdf
 from demorec.tasks.grasping import hand_down
-from demorec.tasks.pick_place import PickPlace
+from demorec.tasks.pick import PickPlace
 from demorec.tasks.sampling import Sampler
 from demorec.testing import RobotContract
 

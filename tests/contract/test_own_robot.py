@@ -152,7 +152,7 @@ def test_a_link_without_a_mass_is_refused_before_anything_is_made(
 
 
 def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
-    source = "from demorec.tasks.pick_place import PickPlace\n\n\nclass Mine(PickPlace):\n    speed = 1.0\n"
+    source = "from demorec.tasks.pick import PickPlace\n\n\nclass Mine(PickPlace):\n    speed = 1.0\n"
     (folder / "my_tasks.py").write_text(source)
     config = GenerateConfig(task="my_tasks:Mine", cameras=())
 

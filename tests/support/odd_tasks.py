@@ -12,7 +12,7 @@ from demorec.core.geometry import Pose
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
 from demorec.tasks.grasping import raised
-from demorec.tasks.pick_place import PickPlace
+from demorec.tasks.pick import PickPlace
 from demorec.tasks.sampling import Sampler
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert

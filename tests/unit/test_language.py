@@ -74,7 +74,7 @@ def test_a_millimetre_makes_no_left_and_no_larger() -> None:
         assert resolve(phrase, things) == frozenset()
     assert phrase_for("red_cube_0", things) == "the red cube nearest to the robot"
     twins = situation(scene(("red", 0.4, 0.1, 0.05), ("red", 0.401, 0.101, 0.05)))
-    assert phrases_for("red_cube_0", twins) == []
+    assert list(phrases_for("red_cube_0", twins)) == []
     assert phrase_for("red_cube_0", twins) == "a red cube"
 
 

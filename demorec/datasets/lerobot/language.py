@@ -18,12 +18,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.annotate.kinds import STATES
+from demorec.annotate import STATES
 from demorec.core.errors import ExportError, in_words
 from demorec.episode.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
-    from demorec.annotate.narration import Statement
+    from demorec.annotate import Statement
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 COLUMNS = (PERSISTENT, EVENTS)

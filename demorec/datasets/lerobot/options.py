@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-from demorec.annotate.kinds import KINDS, LanguageKind
+from demorec.annotate import KINDS, LanguageKind
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, OptionError
 from demorec.datasets.options import CommonOptions, Exporter

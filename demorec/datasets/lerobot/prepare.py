@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from demorec.annotate import Statement
 from demorec.annotate.grounding import seen_objects
-from demorec.annotate.narration import Statement, narrate
+from demorec.annotate.narration import narrate
 from demorec.annotate.progress import dense_runs
 from demorec.annotate.tries import story_of
 from demorec.core.config import VideoConfig

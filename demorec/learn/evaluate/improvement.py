@@ -29,11 +29,11 @@ from demorec.core.processes import start_program
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.features import ActionKind, StateKind
-from demorec.learn.evaluate.correction import read_takeover
-from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.policy import TRAIN_CONFIG_NAME, find_checkpoint, policy_summary
 from demorec.learn.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
 from demorec.learn.evaluate.statistics import Rate
+from demorec.learn.evaluate.turns import read_takeover
 from demorec.runs.run_file import free_name, load_run_file
 
 SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"

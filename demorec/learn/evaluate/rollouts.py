@@ -41,12 +41,11 @@ from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Lost, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.gym_env import DemorecEnv
-from demorec.learn.evaluate.correction import correcting_behaviour
-from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
-from demorec.learn.evaluate.progress import EvaluationObserver, factors_of
-from demorec.learn.evaluate.statistics import Rate
+from demorec.learn.evaluate.statistics import Rate, factors_of
 from demorec.learn.evaluate.turns import Turns
+from demorec.learn.evaluate.watch import correcting_behaviour
 from demorec.loop import make_world, prepare
 from demorec.mcap import SimulatedWriter
 from demorec.robots.robot import RobotSpec
@@ -243,17 +242,13 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
         behaviour = {**info.behaviour, **correcting_behaviour(env.episode, noise=settings.takeover.noise).as_mapping()}
         info = replace(info, origin=info.origin.replace("rollout", "correction", 1), behaviour=behaviour)
     turns = Turns(env, policy, observation, seed=plan.episode_index, rules=settings.takeover, rehearsal_world=world)
-    progress = EvaluationObserver(info.scene)
     name = f"episode_{plan.episode_index:06d}.mcap"
     path = folder / name
     with SimulatedWriter(path, info, video=plan.config.video, overwrite=True) as recording:
         for frame in turns.frames():
             recording.write(frame)
-            progress.watch(env.world)
         after = env.situation
-        phase, reason = ("", "") if turns.success else progress.failure(after)
-        if not turns.success and turns.gave_up[1]:
-            phase, reason = turns.gave_up
+        phase, reason = turns.failure()
         outcome = Outcome(
             success=turns.success,
             checks=after.checks,

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from demorec.episode.scene import Scene
+
 Z95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 
@@ -118,3 +120,21 @@ def cells(factors: Sequence[Mapping[str, float]], successes: Sequence[bool], *, 
             rate = Rate(successes=sum(inside), trials=len(inside))
             found.append(Cell(factor=name, low=edges[i], high=edges[i + 1], rate=rate))
     return tuple(found)
+
+
+def factors_of(scene: Scene) -> dict[str, float]:
+    """What was randomised in a scene, as numbers: places, sizes, yaws and physics of the objects to be moved."""
+    values: dict[str, float] = {}
+    for number, goal in enumerate(scene.goals):
+        prefix = "" if len(scene.goals) == 1 else f"{number}."
+        body = scene.body(goal.object)
+        place = body.world_from_body
+        values[f"{prefix}object.x"], values[f"{prefix}object.y"] = (float(v) for v in place.position[:2])
+        values[f"{prefix}object.radius"] = math.hypot(*place.position[:2].tolist())
+        values[f"{prefix}object.size"] = max(body.shape.extents)
+        values[f"{prefix}object.mass"] = body.mass
+        values[f"{prefix}object.friction"] = body.lateral_friction
+        wanted = scene.world_from_goal(goal).position
+        values[f"{prefix}goal.x"], values[f"{prefix}goal.y"] = (float(v) for v in wanted[:2])
+        values[f"{prefix}distance"] = math.dist(place.position[:2], wanted[:2])
+    return values

@@ -1,25 +1,42 @@
-"""Who acts in a rollout, frame by frame: the policy, and where it is corrected the expert."""
+"""Who acts in a rollout, frame by frame: the policy, and where it is corrected the expert.
+
+Where a policy goes wrong it is in states that no demonstration has. What the expert does from there is what the policy
+lacks (DAgger, Ross et al. 2011, https://arxiv.org/abs/1011.0686). Frames in which the policy acted have the phase
+"policy", all others are the expert's.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from demorec.episode.episode import HALT_PHASE, POLICY_PHASE, Action, Event, Frame
+from demorec.episode.episode import HALT_PHASE, POLICY_PHASE, Action, Event, Frame, interventions
+from demorec.episode.scene import Goal
 from demorec.gym_env import SUCCESS_FRAMES, DemorecEnv
-from demorec.learn.evaluate.correction import begin_correction, correcting_behaviour
-from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.policy import Policy
-from demorec.learn.evaluate.watch import Watch
+from demorec.learn.evaluate.watch import Watch, correcting_behaviour
 from demorec.loop.agents import ActionNoise, Decision
+from demorec.mcap import SimulatedRecording
 from demorec.sim.world import World
 from demorec.tasks.recovery import TAKE_OVER
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.success import goal_pose
 
-HAND_BACK_EVENT = "hand_back"
+TAKE_OVER_EVENT, HAND_BACK_EVENT, _MESSAGE = "take_over", "hand_back", "the expert takes over: "
 _RECOVERY = (HALT_PHASE, TAKE_OVER, "recover", "perceive")
 """Phases in which the expert is not yet back where demonstrations go."""
+PHASES = ("reach", "lift", "transport", "place")
+"""reach: nothing was grasped; lift: grasped, never lifted; transport: lifted, never brought near its goal; place:
+brought there, but the conditions did not hold in the end."""
+
+GRASP_FORCE = 0.5
+LIFTED = 0.03
+NEAR_GOAL = 0.05
 
 
 class Turns:
@@ -35,7 +52,6 @@ class Turns:
 
     Attributes:
         success: Whether the task was done.
-        gave_up: (phase, reason), once the expert has given up; else ("", "").
         num_retries: How often the expert tried something again.
     """
 
@@ -50,7 +66,7 @@ class Turns:
         rehearsal_world: World | None = None,
     ) -> None:
         self.success = False
-        self.gave_up = self._trouble = "", ""
+        self._gave_up = self._trouble = "", ""
         self.num_retries = 0
         self._env, self._policy, self._observation, self._seed = env, policy, observation, seed
         self._hands_back = rules is not None and rules.hand_back
@@ -61,6 +77,7 @@ class Turns:
             self._watch = Watch(rules, env.episode, max_frames=env.max_episode_steps, world=rehearsal_world)
         self._commands: list[Action] = []
         self._is_out_of_time = False
+        self._stages = [0] * len(env.info.scene.goals)
 
     def frames(self) -> Iterator[Frame]:
         """Each frame, once its command has been carried out."""
@@ -90,7 +107,8 @@ class Turns:
     def _expert_acts(self, reason: str) -> Generator[Frame, None, bool]:
         """Returns whether the policy shall act again."""
         world, behaviour, retries = self._env.world, self._behaviour, self.num_retries
-        expert = begin_correction(world, behaviour, reason)
+        expert = Expert(world, behaviour)
+        expert.note(TAKE_OVER_EVENT, f"{_MESSAGE}{reason}")
         noise = ActionNoise(world, sigma=behaviour.action_noise, rng=self._noise_rng, fps=world.fps)
         for step in self._steps(expert):
             command = noise.command(step)
@@ -101,7 +119,7 @@ class Turns:
             self.num_retries = retries + expert.num_retries
             if self.success:
                 return False
-        self.gave_up = self._trouble
+        self._gave_up = self._trouble
         return False
 
     def _steps(self, expert: Expert) -> Iterator[Step]:
@@ -119,6 +137,61 @@ class Turns:
     def _step(self, decision: Decision) -> Frame:
         self._observation, _, self.success, self._is_out_of_time, _ = self._env.act(decision)
         self._commands.append(decision.command)
+        goals = self._env.info.scene.goals
+        self._stages = [max(stage, self._reached(goal, stage)) for goal, stage in zip(goals, self._stages, strict=True)]
         frame = self._env.situation.last_frame
         assert frame is not None  # since there was a step
         return frame
+
+    def _reached(self, goal: Goal, stage: int) -> int:
+        """How many of `PHASES` an object has behind it, one more than before at most."""
+        world = self._env.world
+        held = world.grip_force(goal.object) > GRASP_FORCE
+        position = world.pose(goal.object).position
+        if stage == 0:
+            return 1 if held else 0
+        start = self._env.info.scene.body(goal.object).world_from_body.position
+        if stage == 1:
+            return 2 if held and position[2] - start[2] > LIFTED else 1
+        return 3 if math.dist(position[:2], goal_pose(world, goal).position[:2]) < NEAR_GOAL else 2
+
+    def failure(self) -> tuple[str, str]:
+        """(phase, reason) of a rollout that failed, ("", "") of others: why the expert gave up; else the phase of the
+        object that came least far, and the name of the first condition that does not hold, or "time_limit"."""
+        if self.success or self._gave_up[1]:
+            return ("", "") if self.success else self._gave_up
+        reason = next((check.name for check in self._env.situation.checks if not check.passed), "time_limit")
+        return PHASES[min(self._stages, default=0)], reason
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakenOver:
+    """What a recording tells of its corrections.
+
+    Attributes:
+        reasons: Why the expert took over, each time.
+        num_frames: How many the expert acted in.
+        has_interventions: Whether it did more than stop the arm (`interventions`).
+    """
+
+    reasons: tuple[str, ...]
+    num_frames: int
+    has_interventions: bool
+
+
+def read_takeover(path: Path) -> TakenOver | None:
+    """Of the recording of a rollout; None where the policy acted to the end.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    with SimulatedRecording(path) as recording:
+        messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
+        if not messages:
+            return None
+        phases = recording.columns().phase
+    return TakenOver(
+        reasons=tuple(message.removeprefix(_MESSAGE) for message in messages),
+        num_frames=sum(phase != POLICY_PHASE for phase in phases),
+        has_interventions=bool(interventions(phases).any()),
+    )

@@ -8,24 +8,30 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from demorec.core.geometry import Array
 from demorec.episode.episode import Action, Observation
 from demorec.gym_env import Situation
-from demorec.learn.evaluate.correction import correcting_behaviour
-from demorec.learn.evaluate.moments import TakeOver
+from demorec.learn.evaluate import TakeOver
 from demorec.loop import Episode, Session
 from demorec.robots.motion import angle_between
 from demorec.sim.world import World
-from demorec.tasks.script import Step
+from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert, GaveUp
 
 _AHEAD_SECONDS = 1.0
 """How far ahead on the expert's way a policy may be from one frame to the next."""
 _SAME_PLACE = 0.001
 """Metres within which two places of the way are one; the later one counts, since the expert also waits."""
+
+
+def correcting_behaviour(episode: Episode, *, noise: bool) -> Behaviour:
+    """How the expert does it in an episode that it takes over: without a miss on purpose, with `noise` or without."""
+    behaviour = replace(episode.behaviour, miss_x=0.0, miss_y=0.0)
+    return behaviour if noise else replace(behaviour, action_noise=0.0)
 
 
 class Rehearsal:
@@ -134,7 +140,7 @@ class Watch:
     def reason(self, situation: Situation, command: Action) -> str:
         """Why the expert takes over instead of this command; "" while the policy goes on. To be asked once a frame."""
         observation = situation.observation
-        self._past.append(np.array([*observation.base_from_tcp.position, observation.gripper_width]))
+        self._past.append(_place(observation))
         if self.is_over(situation):
             return "the policy has had its time"
         if situation.frame_index >= self._moment:

@@ -2,6 +2,10 @@
 
 A table of LeRobot is a memory-mapped Arrow file in chunks. Long columns stay where they are, and several processes
 share them; short ones are joined, so that one index is enough to take rows from them.
+
+Language columns hold a list of statements in each row, the same in most rows of an episode. The package datasets walks
+through every value of every statement, since one of their fields may hold JSON. Here only the rows in which one does
+are left to it, and what is equal is read once.
 """
 
 from __future__ import annotations
@@ -90,3 +94,88 @@ def _array(chunk: pa.Array) -> NDArray[Any] | None:
         return None
     values: NDArray[Any] = chunk.to_numpy(zero_copy_only=False)
     return values.reshape(shape)
+
+
+Statement = dict[str, Any]
+_MOST_KEPT = 1024
+"""Lists of statements, of some 40 each, that are kept: one an episode, as a rule."""
+_BITS = {pa.float32(): pa.int32(), pa.float64(): pa.int64()}
+
+
+class Statements:
+    """Rows of one language column, as LeRobot gives them, in memory of their own.
+
+    Args:
+        table: Of the package datasets, with this column alone.
+    """
+
+    def __init__(self, table: Any) -> None:
+        (self._name,) = table.column_names
+        self._table = table
+        self._lists: pa.ChunkedArray = table.with_format("arrow")[:].column(self._name)
+        self._bits = pa.chunked_array(map(_as_bits, self._lists.chunks or [self._lists.combine_chunks()]))
+        self._places = np.full(len(self._lists), -1, np.int32)
+        self._kept: list[list[Statement]] = []
+        self._known: dict[tuple[pa.Scalar, pa.Scalar], int] = {}
+
+    def take(self, rows: NDArray[np.int64]) -> list[list[Statement] | None]:
+        """What stands in the given rows (B,)."""
+        return [self._at(row) for row in rows.tolist()]
+
+    def _at(self, row: int) -> list[Statement] | None:
+        place = self._places[row]
+        if place < 0:
+            bits = self._bits[row]
+            said = bits.values
+            if said is None or not len(said):
+                return None if said is None else []
+            key = said[len(said) - 1], bits  # Arrow's hash of a list is that of its length
+            if key not in self._known:
+                found = self._read(row)
+                if found is None:
+                    of_table: list[Statement] = self._table[row][self._name]
+                    return of_table
+                if len(self._kept) >= _MOST_KEPT:
+                    self._places.fill(-1)
+                    self._kept.clear()
+                    self._known.clear()
+                self._known[key] = len(self._kept)
+                self._kept.append(found)
+            place = self._places[row] = self._known[key]
+        return [dict(statement) for statement in self._kept[place]]  # whoever gets it may change it
+
+    def _read(self, row: int) -> list[Statement] | None:
+        """None where a value is more than text or a number."""
+        said = self._lists[row].values
+        values = said.flatten()
+        if said.null_count or not all(map(_is_plain, values)):
+            return None
+        columns = [
+            [None] * len(said) if array.null_count == len(said) else array.to_numpy(zero_copy_only=False).tolist()
+            for array in values
+        ]
+        fields = [field.name for field in said.type]
+        return [dict(zip(fields, statement, strict=True)) for statement in zip(*columns, strict=True)]
+
+
+def _is_plain(values: pa.Array) -> bool:
+    """Whether NumPy makes of these values what Python would."""
+    if values.null_count == len(values) or pa.types.is_string(values.type):
+        return True
+    return bool(pa.types.is_floating(values.type)) and not values.null_count
+
+
+def _as_bits(lists: pa.ListArray) -> pa.ListArray:
+    """The same with the bits of its numbers, so that 0.0 is not -0.0 and NaN is NaN."""
+    if lists.null_count:  # Arrow takes no mask beside offsets that begin within an array
+        lists = lists.take(pa.array(range(len(lists))))
+    said = lists.values
+    values = [array.view(_BITS[array.type]) if array.type in _BITS else array for array in said.flatten()]
+    names = [field.name for field in said.type]
+    alike = pa.StructArray.from_arrays(values, names, mask=said.is_null() if said.null_count else None)
+    return pa.ListArray.from_arrays(lists.offsets, alike, mask=lists.is_null() if lists.null_count else None)
+
+
+def is_statements(column: pa.ChunkedArray) -> bool:
+    """Whether this is a language column."""
+    return bool(pa.types.is_list(column.type)) and bool(pa.types.is_struct(column.type.value_type))

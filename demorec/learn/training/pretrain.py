@@ -28,8 +28,13 @@ from torch.utils.data import default_collate
 from demorec.core.errors import ConfigError, DemorecError, in_words
 from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
 from demorec.learn.training.columns import numbers
-from demorec.learn.training.encoder import KeyframeEncoder, loss_of
-from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
+from demorec.learn.training.keyframes import (
+    KeyframeEncoder,
+    KeyframeTargets,
+    find_keyframes,
+    keyframe_targets,
+    loss_of,
+)
 from demorec.learn.training.reader import FastDataset
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"

@@ -20,9 +20,8 @@ from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
-from demorec.learn.training.columns import Column, numbers
+from demorec.learn.training.columns import Column, Statements, is_statements, numbers
 from demorec.learn.training.pictures import PictureReader
-from demorec.learn.training.statements import Statements, is_statements
 
 INTERVENTION = "intervention"
 """Column of LeRobot's DAgger: true where the expert acts in an episode that a policy began."""

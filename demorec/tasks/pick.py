@@ -1,0 +1,112 @@
+"""One thing goes to a target mark on the table: a cube, the named cube among others, a thing of any shape."""
+
+from __future__ import annotations
+
+from demorec.episode.scene import Body
+from demorec.tasks.furniture import COLORS, THINGS, make_thing, mark
+from demorec.tasks.placing import Layout, TableTask, on_table, random_cube
+from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+
+CLUTTER = Region(x=(0.33, 0.68), y=(-0.30, 0.30))
+OTHER_KINDS = ("block", "cylinder", "cube", "cube")
+GAP = 0.115
+"""Between the centres of neighbours, metres: the open hand must fit between them."""
+KINDS = tuple(kind for kind in THINGS if kind != "cube")
+
+
+class PickPlace(TableTask):
+    """Pick up the cube and place it on the mark.
+
+    Task: one cube, one square mark on the table.
+    Randomised: the cube's place (0.30 x 0.50 m), yaw, size (3-6 cm), mass (20-200 g) and friction (0.4-1.2); the
+        mark's place and yaw, 12 cm from the cube or more; the arm's initial joints (0.05 rad).
+    Success: the cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest
+        (1 cm/s, 0.1 rad/s), not touched, the gripper open; what else stands there (a variation) has stayed.
+    """
+
+    summary = "a cube to a target mark on the table"
+    wordings = (
+        "pick up the {moved[0]} cube and place it on the {targets[0]} target",
+        "put the {moved[0]} cube on the {targets[0]} target",
+        "move the {moved[0]} cube to the {targets[0]} target",
+    )
+
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
+        start = sampler.point(WORKSPACE, what="the cube")
+        cube_yaw = sampler.yaw()
+        place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.12, what="the target")
+        place_yaw = sampler.yaw()
+        body = random_cube(sampler, "red", start, cube_yaw, sides=(0.03, 0.06))
+        target = mark("green_target", place, place_yaw, side=0.08, color_name="green")
+        return [target, body], [on_table(body, place, place_yaw)]
+
+
+class PickFromClutter(TableTask):
+    """Pick the cube of the named colour out of a clutter and place it on the mark.
+
+    Task: three to five things of other colours and shapes around the wanted cube, a square mark.
+    Randomised: how many things, which, their places, yaws, sizes, masses and frictions; the wanted colour; the
+        mark's place and yaw; the arm's initial joints.
+    Success: the wanted cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest,
+        not touched; everything else within 2 cm of where it was; the gripper open.
+    """
+
+    summary = "the cube of the named colour out of a clutter"
+    wordings = (
+        "pick the {thing} out of the clutter and place it on the green target",
+        "find the {thing} and put it on the green target",
+        "move only the {thing} to the green target",
+    )
+
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
+        colors = [name for name in COLORS if name != "green"]
+        order = sampler.rng.permutation(len(colors))
+        colors = [colors[i] for i in order]
+        start = sampler.point(WORKSPACE, what="the wanted cube")
+        yaw = sampler.yaw()
+        place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.14, what="the target")
+        place_yaw = sampler.yaw()
+        wanted = make_thing(sampler, "cube", f"{colors[0]}_cube", start, yaw, color_name=colors[0], role="object")
+        taken, others = [start, place], list[Body]()
+        for index in range(int(sampler.rng.integers(3, 6))):
+            kind = OTHER_KINDS[index % len(OTHER_KINDS)]
+            point = sampler.point(CLUTTER, away_from=taken, min_distance=GAP, what="the clutter")
+            taken.append(point)
+            color = colors[1 + index % (len(colors) - 1)]
+            name = f"{color}_{kind}" if index < len(OTHER_KINDS) else f"other_{color}_{kind}"
+            others.append(make_thing(sampler, kind, name, point, sampler.yaw(), color_name=color, role="distractor"))
+        target = mark("green_target", place, place_yaw, side=0.08, color_name="green")
+        return [target, wanted, *others], [on_table(wanted, place, place_yaw)]
+
+
+class PickShapes(TableTask):
+    """Pick up a thing of any shape and place it on the mark.
+
+    Task: one of a block, a cylinder, a wooden plank, a toy brick, a duck or a mug; a square mark on the table.
+    Randomised: which thing, its size, place, yaw, mass (20-150 g), friction (0.5-1.2) and colour where it has
+        none of its own; the mark's place and yaw; the arm's initial joints.
+    Success: the thing's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest, not
+        touched, the gripper open.
+    """
+
+    summary = "blocks, cylinders and small household things to a mark"
+    wordings = (
+        "pick up the {thing} and place it on the green target",
+        "put the {thing} on the green target",
+        "move the {thing} to the green target",
+    )
+
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
+        kind = sampler.choice(KINDS)
+        color = sampler.choice([name for name in COLORS if name != "green"])
+        start = sampler.point(WORKSPACE, what="the thing")
+        yaw = sampler.yaw()
+        place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.14, what="the target")
+        place_yaw = sampler.yaw()
+        name = f"{color}_{kind}" if THINGS[kind].painted else kind
+        thing = make_thing(sampler, kind, name, start, yaw, color_name=color, role="object")
+        target = mark("green_target", place, place_yaw, side=0.10, color_name="green")
+        return [target, thing], [on_table(thing, place, place_yaw, yaw_symmetry=0)]

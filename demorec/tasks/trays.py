@@ -1,0 +1,125 @@
+"""Cubes go into trays: one into the only tray, several into those of their colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from demorec.core.geometry import Pose
+from demorec.episode.scene import Body, Goal, Rgba, Shape
+from demorec.tasks.furniture import COLORS
+from demorec.tasks.placing import Layout, TableTask, random_cube
+from demorec.tasks.sampling import Region, Sampler
+
+TRAY_FLOOR = 0.004
+"""Height of a tray's floor above its lower face, metres (tray.urdf)."""
+CUBES = Region(x=(0.35, 0.65), y=(-0.25, 0.15))
+TRAYS = Region(x=(0.40, 0.50), y=(0.36, 0.40))
+"""Of the tray's middle: its far corner must be within the reach of a hand that points down."""
+SORTED_CUBES = Region(x=(0.36, 0.65), y=(-0.19, 0.19))
+TRAY_Y = 0.37
+SLOTS = (-0.065, 0.065)
+"""Along a tray's long side, metres: the open fingers must fit between a cube and its neighbour."""
+COLOR_PAIRS = (("red", "blue"), ("green", "yellow"), ("red", "yellow"), ("blue", "green"))
+
+
+def tray(name: str, point: tuple[float, float], yaw: float, *, color_name: str) -> Body:
+    """A shallow tray that stands still, its long side (0.27 m) along x at yaw 0."""
+    return Body(
+        name=name,
+        role="target",
+        shape=Shape(kind="urdf", file="demorec:tray.urdf", size=(0.27, 0.21, 0.019)),
+        world_from_body=Pose.from_yaw((point[0], point[1], 0.0005), yaw),
+        lateral_friction=0.6,
+        # Paler than the cubes, so that a cube shows on a tray of its own colour.
+        rgba=_paler(COLORS[color_name]),
+        color_name=color_name,
+        yaw_symmetry=2,
+    )
+
+
+def _paler(rgba: Rgba) -> Rgba:
+    red, green, blue = (0.55 * channel + 0.45 * 0.92 for channel in rgba[:3])
+    return (red, green, blue, rgba[3])
+
+
+class PlaceInTray(TableTask):
+    """Pick up the cube and put it into the tray.
+
+    Task: one cube on the table, one shallow tray at the robot's left.
+    Randomised: the cube's place (0.30 x 0.40 m), yaw, size (3-6 cm), mass (20-200 g), friction (0.4-1.2) and the
+        tray's place and yaw (within 0.25 rad); where in the tray (3 cm about its middle); the arm's initial joints.
+    Success: the cube's centre within 2 cm of the place, on the tray's floor, upright within 5 degrees, at rest, not
+        touched, the gripper open.
+    """
+
+    summary = "a cube into a tray"
+    wordings = (
+        "pick up the {moved[0]} cube and put it into the {bases[0]} tray",
+        "put the {moved[0]} cube in the {bases[0]} tray",
+        "place the {moved[0]} cube inside the {bases[0]} tray",
+    )
+
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
+        point = sampler.point(CUBES, what="the cube")
+        yaw = sampler.yaw()
+        body = random_cube(sampler, "red", point, yaw, sides=(0.03, 0.06))
+        target = tray(
+            "blue_tray",
+            sampler.point(TRAYS, what="the tray"),
+            sampler.uniform(-0.25, 0.25),
+            color_name="blue",
+        )
+        offset = (sampler.uniform(-0.03, 0.03), sampler.uniform(-0.02, 0.02))
+        height = TRAY_FLOOR + body.shape.size[2] / 2
+        goal = Goal(
+            object=body.name,
+            onto=target.name,
+            onto_from_goal=Pose.from_yaw((*offset, height), sampler.uniform(-np.pi, np.pi)),
+        )
+        return [target, body], [goal]
+
+
+class SortByColor(TableTask):
+    """Put every cube into the tray of its colour.
+
+    Task: two to four cubes of two colours, two trays, one on either side.
+    Randomised: how many cubes, which colours, which tray is left; places, yaws, sizes (3-4.5 cm), masses
+        (20-200 g), frictions (0.4-1.2); the trays' places along the table; the arm's initial joints.
+    Success: each cube within 2 cm of its place in the tray of its colour, on the floor of the tray, upright within
+        5 degrees, at rest, not touched; the gripper open.
+    """
+
+    summary = "two to four cubes into the trays of their colours"
+    wordings = (
+        "sort the cubes into the trays of their colors",
+        "put every {targets[0]} cube into the {targets[0]} tray and every {targets[1]} cube into the {targets[1]} tray",
+        "sort the {targets[0]} and {targets[1]} cubes by color",
+    )
+
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
+        colors = sampler.choice(COLOR_PAIRS)
+        if sampler.uniform(0.0, 1.0) < 0.5:
+            colors = (colors[1], colors[0])
+        counts = sampler.choice([(1, 1), (2, 1), (1, 2), (2, 2)])
+        trays = [
+            tray(f"{color}_tray", (sampler.uniform(0.36, 0.44), side * TRAY_Y), 0.0, color_name=color)
+            for color, side in zip(colors, (1, -1), strict=True)
+        ]
+        cubes: list[Body] = []
+        goals: list[Goal] = []
+        points: list[tuple[float, float]] = []
+        for color, count, target in zip(colors, counts, trays, strict=True):
+            for slot in range(count):
+                point = sampler.point(SORTED_CUBES, away_from=points, min_distance=0.12, what="a cube")
+                points.append(point)
+                body = random_cube(sampler, color, point, sampler.yaw(), sides=(0.03, 0.045))
+                body = replace(body, name=f"{color}_cube_{slot + 1}")
+                offset = SLOTS[slot] if count > 1 else sampler.uniform(-0.05, 0.05)
+                place = (offset, sampler.uniform(-0.01, 0.01), TRAY_FLOOR + body.shape.size[2] / 2)
+                cubes.append(body)
+                goals.append(Goal(object=body.name, onto=target.name, onto_from_goal=Pose.from_yaw(place)))
+        return [*trays, *cubes], goals
