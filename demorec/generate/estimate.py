@@ -12,10 +12,9 @@ from itertools import chain
 from pathlib import Path
 
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.core.errors import GenerationError
 from demorec.core.processes import available_cores
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.generate.executor import MAKE_EPISODE, Lost, Made, Raised
+from demorec.generate.executor import MAKE_EPISODE, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED
@@ -109,8 +108,6 @@ def _make(maker: str, folder: Path, config: GenerateConfig, count: int, *, worke
         for report in chain.from_iterable(executor.carry_out(partial(next, plans, None))):
             if isinstance(report, Raised):
                 raise report.error(f"The pilot episode cannot be made: {report.message}")
-            if isinstance(report, Lost):
-                raise GenerationError(f"The pilot episode cannot be made: {report.reason}.")
             made.append(report)
     return made
 

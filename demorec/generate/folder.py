@@ -46,23 +46,6 @@ from demorec.runs.run_file import (
 )
 
 
-class AnotherRunError(ConfigError):
-    """The folder holds another run than the one that is asked for.
-
-    Args:
-        differences: Between the two, in words.
-        advice: What to do.
-        path: Of the folder.
-    """
-
-    def __init__(self, differences: str, advice: str, path: Path) -> None:
-        super().__init__(differences, advice, path)
-
-    def __str__(self) -> str:
-        differences, advice, path = self.args
-        return f"The output folder holds another run ({differences}): {advice}: {path}"
-
-
 class RunFolder:
     """An opened run. Lines are saved at intervals: one that a crash loses is read back from its recording.
 
@@ -248,7 +231,7 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     Only reads. A run without any episode claims nothing: the one that is asked for takes its place.
 
     Raises:
-        AnotherRunError: The folder holds another run.
+        ConfigError: The folder holds another run.
     """
     run, damage = asked, ""
     try:
@@ -264,10 +247,11 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     if different and not recordings and not any(line.file for line in run.known):
         return asked, damage
     if different:
-        advice = "choose another --out or ask for the same"
-        if not obstacle(path, RUN):
-            advice = "choose another --out, ask for the same, or give --overwrite to delete it"
-        raise AnotherRunError("; ".join(different), advice, path)
+        delete = "" if obstacle(path, RUN) else ", or let it delete this one with --overwrite"
+        raise ConfigError(
+            f"The output folder holds another run ({'; '.join(different)}): choose another --out, or ask "
+            f"generate-dataset for the same{delete}: {path}"
+        )
     return run, damage
 
 

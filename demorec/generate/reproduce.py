@@ -24,7 +24,6 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
-from demorec.generate.folder import AnotherRunError
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.mcap import SimulatedRecording
@@ -99,11 +98,7 @@ def reproduce(
     different = dict.fromkeys(line for there in original.versions for line in version_differences(there, here))
     if different:
         progress.says(f"Note: {'; '.join(different)}.")
-    try:
-        result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
-    except AnotherRunError as error:
-        differences, _, path = error.args
-        raise AnotherRunError(differences, "choose another --out", path) from error
+    result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
     if result.interrupted:
         return result
     if original.export is None:
