@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
@@ -26,7 +25,6 @@ from demorec.core.replacing import (
     obstacle,
     replaced_parts,
     settle_parts,
-    shown,
 )
 from demorec.generate.contents import PARTS, RUN, Inspector, check_dataset_place, recordings_of, survey
 from demorec.generate.executor import peak_memory
@@ -42,7 +40,9 @@ from demorec.runs.run_file import (
     RunSession,
     free_name,
     load_run_file,
+    refuse_strangers,
     save_run_file,
+    utc_now,
 )
 
 
@@ -63,7 +63,7 @@ class RunFolder:
         self._made: list[Attempt] = []
         self._peak_worker_bytes = 0
         self._earlier = run.sessions
-        self._session = RunSession(started=_now(), machine=machine())
+        self._session = RunSession(started=utc_now(), machine=machine())
         self._has_session = False
         self._started = time.monotonic()
         self._saved_at = -1e9
@@ -91,7 +91,7 @@ class RunFolder:
 
     def end_session(self, state: str) -> None:
         """Work has ended, for whatever reason."""
-        self._session = replace(self._session, ended=_now(), state=state)
+        self._session = replace(self._session, ended=utc_now(), state=state)
         try:
             self.save()
         except GenerationError:
@@ -175,7 +175,8 @@ def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: 
     if options.overwrite and _would_replace(path):
         check_replaceable(path, RUN, overwrite=True)
         return True
-    _refuse_strangers(path)
+    if path.is_dir() and not (path / RUN_NAME).exists() and not recordings_of(path):
+        refuse_strangers(path, (*PARTS, LOCK_NAME))
     run, _ = _known_run(path, asked, inspect=inspect)
     if options.export:
         check_dataset_place(path, run)
@@ -277,20 +278,6 @@ def _told_as_unusable(path: Path) -> Iterator[None]:
     except OSError as error:
         unusable = ConfigError(f"The output folder cannot be used ({error.strerror}): choose another --out: {path}")
         raise resource_error(error) or unusable from error
-
-
-def _refuse_strangers(path: Path) -> None:
-    if not path.is_dir() or (path / RUN_NAME).exists() or recordings_of(path):
-        return
-    strangers = sorted(p.name for p in path.iterdir() if p.name not in (*PARTS, LOCK_NAME, f"{RUN_NAME}.part"))
-    if strangers:
-        raise ConfigError(
-            f"The output folder holds files that are of no run ({shown(strangers)}): choose another --out: {path}"
-        )
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def _processor() -> str:
