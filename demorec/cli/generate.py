@@ -81,7 +81,7 @@ class Generate:
             from demorec.cli.generate_report import print_estimate
             from demorec.generate.estimate import estimate
 
-            print_estimate(estimate(self.episodes, options), options)
+            print_estimate(*estimate(self.episodes, options), options)
             return 0
 
         from demorec.cli.generate_report import check_run, print_result
