@@ -90,9 +90,10 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
     if seconds := _seconds(attempts, export):
         rows.append(("CPU seconds", seconds))
     if result.made:
-        wall = result.session.wall_seconds
+        session = run.sessions[-1]
+        wall = session.wall_seconds
         rate = sum(a.success for a in result.made) / wall * 60
-        made = f"{wall:.1f} s for making episodes with {counted(result.session.workers, 'worker')}, {rate:.1f} a minute"
+        made = f"{wall:.1f} s for making episodes with {counted(session.workers, 'worker')}, {rate:.1f} a minute"
         rows.append(("wall time", f"{made}; export and checks are extra"))
     if aside := set_aside(folder):
         rows.append(("set aside", f"{', '.join(aside)}: {folder / UNFINISHED}"))

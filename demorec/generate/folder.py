@@ -134,7 +134,6 @@ class RunFolder:
         return RunResult(
             folder=self.path,
             run=self.run,
-            session=self._session,
             made=tuple(self._made),
             interrupted=interrupted,
         )
