@@ -32,7 +32,8 @@ from tyro.constructors import (
 )
 
 from demorec.cli.shared.output import say, tell
-from demorec.core.registry import check_allowed
+from demorec.core.errors import ConfigError
+from demorec.core.registry import is_module_name, split_name
 
 FLAG_TYPES = ConstructorRegistry()
 
@@ -189,7 +190,11 @@ Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_b
 """One module or package each time, since paths may follow."""
 
 
-def allowed_modules(names: Sequence[str]) -> tuple[str, ...]:
+def allowed_modules(names: tuple[str, ...]) -> tuple[str, ...]:
     """What --allow names; ConfigError where that can be no module."""
-    check_allowed(names)
-    return tuple(names)
+    for name in names:
+        if not is_module_name(name):
+            parts = split_name(name)
+            advice = f" Did you mean {parts[0]!r}?" if parts else ""
+            raise ConfigError(f"--allow names a module or package, for example my_tasks, found {name!r}.{advice}")
+    return names
