@@ -98,7 +98,8 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
     try:
-        return parse_command(command, args, prog=prog).run()
+        code: int = parse(command, args, prog=prog).run()
+        return code
     except DemorecError as error:
         tell(f"{prog}: {_shortened(error.of_flag() if isinstance(error, OptionError) else str(error))}")
         return error.exit_code
@@ -120,13 +121,6 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
 def _shortened(text: str) -> str:
     """A sentence without its middle where it quotes a file at great length."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST * 3 // 4]} ... {text[-_LONGEST // 4 :]}"
-
-
-def parse_command(command: type[Command], args: Sequence[str], *, prog: str) -> Command:
-    """The command with its flags; SystemExit for --help and for flags that it does not have."""
-    find_defaults = getattr(command, "defaults", None)
-    parsed: Command = parse(command, args, prog=prog, defaults=None if find_defaults is None else find_defaults(args))
-    return parsed
 
 
 def _keep_traceback() -> str:

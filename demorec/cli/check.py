@@ -14,9 +14,8 @@ from tyro.conf import Positional
 from demorec.cli.replay import demonstrations, told
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import need_paths, places_read, refuse_inside, tell_unfinished
+from demorec.cli.shared.paths import need_paths, places_read, reading, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError, OptionError, in_words
 from demorec.core.replacing import PICTURE, check_replaceable
 

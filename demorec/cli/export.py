@@ -11,9 +11,8 @@ from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
 from demorec.cli.shared.output import counted, say
-from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.paths import reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.options import CommonOptions, ExportReport

@@ -81,7 +81,7 @@ class Generate:
             from demorec.cli.generate_report import print_estimate
             from demorec.generate.estimate import estimate
 
-            print_estimate(estimate(self.episodes, options), options)
+            print_estimate(*estimate(self.episodes, options), options)
             return 0
 
         from demorec.cli.generate_report import check_run, print_result
@@ -256,7 +256,7 @@ class Reproduce:
     def run(self) -> int:
         """Generate again, compare, report."""
         from demorec.generate.options import RunOptions
-        from demorec.generate.reproduce import Reproduction, reproduce
+        from demorec.generate.reproduce import reproduce
 
         options = RunOptions(
             out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
@@ -264,21 +264,23 @@ class Reproduce:
         options.validate()
         refuse_inside([self.out])
         with RunProgress() as progress:
-            found = reproduce(self.source, options, progress=progress, allowed=allowed_modules(self.allow))
-        if not isinstance(found, Reproduction):
+            result, same, faults = reproduce(
+                self.source, options, progress=progress, allowed=allowed_modules(self.allow)
+            )
+        if result.interrupted:
             tell(f"Interrupted; run the same command again to continue: {self.out}")
             return 130
-        total = len(found.same) + len(found.different)
-        say(f"{len(found.same)} of {total} episodes are bit-exact: {self.source} and {found.result.folder}")
-        before = total - len(found.result.made)
+        say(f"{sum(same.values())} of {len(same)} episodes are bit-exact: {self.source} and {result.folder}")
+        before = len(same) - len(result.made)
         if before > 0:
             tell(
                 f"Note: {before} of them were in {self.out} already and were not made again: use a new --out to check "
                 "them too."
             )
-        tell(*found.faults[:10])
-        if found.different:
-            shown = ", ".join(f"{episode} (attempt {attempt})" for episode, attempt in found.different[:10])
-            tell(f"Different: {shown}{', ...' if len(found.different) > 10 else ''}")
+        tell(*faults[:10])
+        if different := [
+            f"{episode} (attempt {attempt})" for (episode, attempt), is_same in same.items() if not is_same
+        ]:
+            tell(f"Different: {', '.join(different[:10])}{', ...' if len(different) > 10 else ''}")
             return 1
         return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import shutil
 import sys
@@ -14,7 +15,7 @@ from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.progress import duration
 from demorec.core.processes import available_cores
 from demorec.generate.contents import set_aside
-from demorec.generate.estimate import Estimate
+from demorec.generate.executor import Made
 from demorec.generate.options import RunOptions, RunResult
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
@@ -89,9 +90,10 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
     if seconds := _seconds(attempts, export):
         rows.append(("CPU seconds", seconds))
     if result.made:
-        wall = result.session.wall_seconds
+        session = run.sessions[-1]
+        wall = session.wall_seconds
         rate = sum(a.success for a in result.made) / wall * 60
-        made = f"{wall:.1f} s for making episodes with {counted(result.session.workers, 'worker')}, {rate:.1f} a minute"
+        made = f"{wall:.1f} s for making episodes with {counted(session.workers, 'worker')}, {rate:.1f} a minute"
         rows.append(("wall time", f"{made}; export and checks are extra"))
     if aside := set_aside(folder):
         rows.append(("set aside", f"{', '.join(aside)}: {folder / UNFINISHED}"))
@@ -154,29 +156,34 @@ def _seconds(attempts: tuple[Attempt, ...], export: ExportRecord | None) -> str:
     return ", ".join(shown)
 
 
-def print_estimate(estimate: Estimate, options: RunOptions) -> None:
-    """The table of a dry run."""
-    each = sum(estimate.cpu_seconds.values())
-    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in estimate.cpu_seconds.items())
-    cores = available_cores()
-    workers = counted(estimate.workers, "worker")
-    if options.executor == "local" and estimate.workers > cores:
-        workers += f" on {cores} cores: at least {duration(estimate.seconds * estimate.workers / cores)}"
-    sizes = f"recording {size_in_words(estimate.num_bytes)}"
-    if estimate.dataset_bytes:
-        sizes += f" and dataset {size_in_words(estimate.dataset_bytes)}"
+def print_estimate(measured: Sequence[Made], tried: Sequence[Made], dataset_bytes: int, options: RunOptions) -> None:
+    """The table of a dry run, from what `estimate` returned."""
+    assert options.out is not None
+    last, cores = measured[-1].attempt, available_cores()
+    num_workers, successes = options.workers or cores, sum(report.attempt.success for report in tried)
+    each = sum(last.seconds.values())
+    attempts = options.num_episodes * len(tried) / max(successes, 1)
+    # Wall-clock time with a core for each worker, without the export.
+    seconds = measured[0].attempt.seconds.get(STARTING, 0.0) + each * math.ceil(attempts / num_workers)
+    stages = ", ".join(f"{stage} {value:.2f}" for stage, value in last.seconds.items())
+    workers = counted(num_workers, "worker")
+    if options.executor == "local" and num_workers > cores:
+        workers += f" on {cores} cores: at least {duration(seconds * num_workers / cores)}"
+    total_bytes = (last.num_bytes + dataset_bytes) * options.num_episodes
+    sizes = f"recording {size_in_words(last.num_bytes)}"
+    if dataset_bytes:
+        sizes += f" and dataset {size_in_words(dataset_bytes)}"
+    out = options.out.absolute()
+    free_bytes = shutil.disk_usage(next(place for place in (out, *out.parents) if place.exists())).free
     rows = [
-        ("success", f"{estimate.successes} of {estimate.attempts} at the first try"),
-        ("CPU s/episode", f"{each:.2f} ({stages}), {estimate.num_frames} frames"),
-        (
-            "time",
-            f"{duration(estimate.seconds)} for {estimate.num_episodes} episodes with {workers}; the export is extra",
-        ),
-        ("size", f"{size_in_words(estimate.total_bytes)} ({sizes} an episode)"),
-        ("memory", f"{size_in_words(estimate.peak_worker_bytes)} a worker"),
-        ("free disk", f"{size_in_words(estimate.free_bytes)} at {options.out}"),
+        ("success", f"{successes} of {len(tried)} at the first try"),
+        ("CPU s/episode", f"{each:.2f} ({stages}), {last.num_frames} frames"),
+        ("time", f"{duration(seconds)} for {options.num_episodes} episodes with {workers}; the export is extra"),
+        ("size", f"{size_in_words(total_bytes)} ({sizes} an episode)"),
+        ("memory", f"{size_in_words(max(report.peak_bytes for report in measured))} a worker"),
+        ("free disk", f"{size_in_words(free_bytes)} at {options.out}"),
     ]
     say(*aligned(rows))
-    if estimate.total_bytes > estimate.free_bytes:
+    if total_bytes > free_bytes:
         tell("The disk is too small for this run.")
     say("Nothing was kept; leave --dry-run out to generate.")

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
-from demorec.cli.shared.paths import need_paths
-from demorec.cli.shared.reading import reading
+from demorec.cli.shared.paths import need_paths, reading
 from demorec.core.errors import ExportError, RecordingError, in_words, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX

@@ -9,9 +9,8 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, size_in_words
-from demorec.cli.shared.paths import places_read, refuse_inside
+from demorec.cli.shared.paths import places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.reading import reading
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import REPORT, check_replaceable
 from demorec.runs.find import EPISODE_FOLDERS, expect

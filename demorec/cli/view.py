@@ -12,8 +12,7 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
-from demorec.cli.shared.paths import places_read, refuse_inside, tell_unfinished
-from demorec.cli.shared.reading import reading
+from demorec.cli.shared.paths import places_read, reading, refuse_inside, tell_unfinished
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import PICTURE, RERUN_FILE, check_replaceable
 from demorec.robots.assets import allow_models

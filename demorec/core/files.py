@@ -69,6 +69,10 @@ def read_text_limited(path: Path, limit: int) -> str:
     return data.decode()
 
 
+MAX_JSON_BYTES = 2 << 30
+"""Above this no JSON file is read: of a run.json some million episodes, which take ten times as much memory."""
+
+
 def read_json_limited(path: Path, limit: int) -> Any:
     """The content of a regular JSON file of at most `limit` bytes.
 

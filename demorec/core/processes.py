@@ -190,10 +190,6 @@ def _main_hidden() -> Iterator[None]:
             vars(main).update(held)
 
 
-if __name__ == "__main__":
-    sys.exit(_stand_between(sys.argv[1:]))
-
-
 def terminate_as_interrupt() -> AbstractContextManager[None]:
     """Inside, SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that every `finally` runs."""
     return handled(signal.default_int_handler, signal.SIGTERM)
@@ -211,3 +207,7 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.S
     finally:
         for number, usual in before.items():
             signal.signal(number, usual)
+
+
+if __name__ == "__main__":
+    sys.exit(_stand_between(sys.argv[1:]))

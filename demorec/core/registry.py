@@ -16,7 +16,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -138,15 +138,6 @@ def modules_of(names: Iterable[str]) -> tuple[str, ...]:
 def is_allowed(module: str, allowed: Iterable[str]) -> bool:
     """Whether a module is one of those named, or lies in a package that is."""
     return any(module == name or module.startswith(f"{name}.") for name in allowed)
-
-
-def check_allowed(names: Sequence[str]) -> None:
-    """Raise ConfigError unless every name can be that of a module or package."""
-    for name in names:
-        if not is_module_name(name):
-            parts = split_name(name)
-            advice = f" Did you mean {parts[0]!r}?" if parts else ""
-            raise ConfigError(f"--allow names a module or package, for example my_tasks, found {name!r}.{advice}")
 
 
 def import_object(kind: str, name: str) -> object:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError
-from demorec.core.files import MCAP_MAGIC, RERUN_MAGICS, open_locked, read_json_limited
+from demorec.core.files import MAX_JSON_BYTES, MCAP_MAGIC, RERUN_MAGICS, open_locked, read_json_limited
 
 _SHOWN = 5
 """How many foreign files a refusal names."""
@@ -162,9 +161,9 @@ def files_below(folder: Path) -> Iterator[str]:
 
 
 def json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a regular file; {} when there is none."""
+    """The JSON object in a regular file; {} when there is none, or a larger one than any of ours."""
     try:
-        found = read_json_limited(path, sys.maxsize)
+        found = read_json_limited(path, MAX_JSON_BYTES)
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

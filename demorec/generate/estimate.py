@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import math
-import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
 
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.core.errors import GenerationError
 from demorec.core.processes import available_cores
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.generate.executor import MAKE_EPISODE, Lost, Made, Raised
+from demorec.generate.executor import MAKE_EPISODE, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions
-from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED
+from demorec.runs.run_file import EPISODES, FAILED, UNFINISHED
 
 _MEASURED = 2
 """Attempts with images: the first of a worker compiles, loads and fills caches, the second is what counts."""
@@ -26,91 +23,38 @@ _TRIED = 20
 """Episodes made without images, to see how often they succeed: images do not touch the physics."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """What is expected of a run.
+def estimate(config: GenerateConfig, options: RunOptions) -> tuple[list[Made], list[Made], int]:
+    """Make pilot episodes in a temporary folder.
 
-    Attributes:
-        attempts: Episodes that were tried.
-        successes: How many of them succeeded.
-        num_frames: Of the measured attempt.
-        cpu_seconds: stage -> CPU seconds of the measured attempt.
-        start_seconds: CPU seconds that a worker needs before its first frame.
-        num_bytes: Of the measured attempt's recording.
-        dataset_bytes: That it adds to the dataset; 0 without one.
-        peak_worker_bytes: Memory of a worker.
-        num_episodes, workers: Of the run.
-        free_bytes: On the disk of the output folder.
-    """
-
-    attempts: int
-    successes: int
-    num_frames: int
-    cpu_seconds: dict[str, float]
-    start_seconds: float
-    num_bytes: int
-    dataset_bytes: int
-    peak_worker_bytes: int
-    num_episodes: int
-    workers: int
-    free_bytes: int
-
-    @property
-    def seconds(self) -> float:
-        """Wall-clock seconds of the run with a core for each worker, without the export."""
-        attempts = self.num_episodes * self.attempts / max(self.successes, 1)
-        return self.start_seconds + sum(self.cpu_seconds.values()) * math.ceil(attempts / self.workers)
-
-    @property
-    def total_bytes(self) -> float:
-        """Recordings and dataset."""
-        return (self.num_bytes + self.dataset_bytes) * self.num_episodes
-
-
-def estimate(config: GenerateConfig, options: RunOptions, *, maker: str = MAKE_EPISODE) -> Estimate:
-    """Make pilot episodes in a temporary folder and count up.
+    Returns:
+        Attempts with images, of which the last is measured and the first has the seconds that a worker needs to start;
+        attempts without images, which show how many succeed; and bytes that an episode adds to the dataset (0 without).
 
     Raises:
         ConfigError, GenerationError: A pilot could not be made.
     """
-    assert options.out is not None
     workers = options.workers or available_cores()
     with tempfile.TemporaryDirectory(prefix="demorec-pilot-") as temporary:
         folder = Path(temporary)
         for name in (EPISODES, FAILED, UNFINISHED):
             (folder / name).mkdir()
-        measured = _make(maker, folder, config, _MEASURED, workers=1)
+        measured = _make(folder, config, _MEASURED, workers=1)
         recordings = [folder / report.attempt.file for report in measured if report.attempt.file]
         dataset_bytes = _added_to_dataset(recordings, folder) if options.export else 0
         # Last, since these have the names of the measured ones, and no images.
         count = min(_TRIED, options.num_episodes)
-        tried = _make(maker, folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
-    last, out = measured[-1].attempt, options.out.absolute()
-    return Estimate(
-        attempts=len(tried),
-        successes=sum(report.attempt.success for report in tried),
-        num_frames=last.num_frames,
-        cpu_seconds=dict(last.seconds),
-        start_seconds=measured[0].attempt.seconds.get(STARTING, 0.0),
-        num_bytes=last.num_bytes,
-        dataset_bytes=dataset_bytes,
-        peak_worker_bytes=max(report.peak_bytes for report in measured),
-        num_episodes=options.num_episodes,
-        workers=workers,
-        free_bytes=shutil.disk_usage(next(place for place in (out, *out.parents) if place.exists())).free,
-    )
+        tried = _make(folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
+    return measured, tried, dataset_bytes
 
 
-def _make(maker: str, folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:
+def _make(folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:
     """The first episodes, in order of their ends."""
     made: list[Made] = []
     plans = (EpisodePlan(config=config, episode_index=index) for index in range(count))
-    with LocalExecutor(maker, folder, workers=workers, recycle_after=count) as executor:
+    with LocalExecutor(MAKE_EPISODE, folder, workers=workers, recycle_after=count) as executor:
         for report in chain.from_iterable(executor.carry_out(partial(next, plans, None))):
             if isinstance(report, Raised):
                 raise report.error(f"The pilot episode cannot be made: {report.message}")
-            if isinstance(report, Lost):
-                raise GenerationError(f"The pilot episode cannot be made: {report.reason}.")
             made.append(report)
     return made
 

@@ -53,24 +53,21 @@ class Raised:
     plan: EpisodePlan
     kind: str
     message: str
-    traceback: str
+    traceback: str = ""
     errno: int | None
-    exit_code: int
+    exit_code: int = 0
 
     def error(self, sentence: str) -> DemorecError:
         """What the driver raises for it."""
         return (ConfigError if self.exit_code == ConfigError.exit_code else GenerationError)(sentence)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lost:
-    """The worker ended without a word (killed, out of memory, its machine gone)."""
-
-    plan: EpisodePlan
-    reason: str
+def lost(plan: EpisodePlan, reason: str) -> Raised:
+    """The worker ended without a word (killed, its machine gone): mostly for lack of memory."""
+    return Raised(plan=plan, kind="lost", message=f"{reason}.", errno=errno.ENOMEM)
 
 
-Report = Made | Raised | Lost
+Report = Made | Raised
 
 
 class Executor(Protocol):

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
@@ -26,7 +25,6 @@ from demorec.core.replacing import (
     obstacle,
     replaced_parts,
     settle_parts,
-    shown,
 )
 from demorec.generate.contents import PARTS, RUN, Inspector, check_dataset_place, recordings_of, survey
 from demorec.generate.executor import peak_memory
@@ -42,25 +40,10 @@ from demorec.runs.run_file import (
     RunSession,
     free_name,
     load_run_file,
+    refuse_strangers,
     save_run_file,
+    utc_now,
 )
-
-
-class AnotherRunError(ConfigError):
-    """The folder holds another run than the one that is asked for.
-
-    Args:
-        differences: Between the two, in words.
-        advice: What to do.
-        path: Of the folder.
-    """
-
-    def __init__(self, differences: str, advice: str, path: Path) -> None:
-        super().__init__(differences, advice, path)
-
-    def __str__(self) -> str:
-        differences, advice, path = self.args
-        return f"The output folder holds another run ({differences}): {advice}: {path}"
 
 
 class RunFolder:
@@ -80,7 +63,7 @@ class RunFolder:
         self._made: list[Attempt] = []
         self._peak_worker_bytes = 0
         self._earlier = run.sessions
-        self._session = RunSession(started=_now(), machine=machine())
+        self._session = RunSession(started=utc_now(), machine=machine())
         self._has_session = False
         self._started = time.monotonic()
         self._saved_at = -1e9
@@ -108,7 +91,7 @@ class RunFolder:
 
     def end_session(self, state: str) -> None:
         """Work has ended, for whatever reason."""
-        self._session = replace(self._session, ended=_now(), state=state)
+        self._session = replace(self._session, ended=utc_now(), state=state)
         try:
             self.save()
         except GenerationError:
@@ -151,7 +134,6 @@ class RunFolder:
         return RunResult(
             folder=self.path,
             run=self.run,
-            session=self._session,
             made=tuple(self._made),
             interrupted=interrupted,
         )
@@ -192,7 +174,8 @@ def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: 
     if options.overwrite and _would_replace(path):
         check_replaceable(path, RUN, overwrite=True)
         return True
-    _refuse_strangers(path)
+    if path.is_dir() and not (path / RUN_NAME).exists() and not recordings_of(path):
+        refuse_strangers(path, (*PARTS, LOCK_NAME))
     run, _ = _known_run(path, asked, inspect=inspect)
     if options.export:
         check_dataset_place(path, run)
@@ -248,7 +231,7 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     Only reads. A run without any episode claims nothing: the one that is asked for takes its place.
 
     Raises:
-        AnotherRunError: The folder holds another run.
+        ConfigError: The folder holds another run.
     """
     run, damage = asked, ""
     try:
@@ -264,10 +247,11 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     if different and not recordings and not any(line.file for line in run.known):
         return asked, damage
     if different:
-        advice = "choose another --out or ask for the same"
-        if not obstacle(path, RUN):
-            advice = "choose another --out, ask for the same, or give --overwrite to delete it"
-        raise AnotherRunError("; ".join(different), advice, path)
+        delete = "" if obstacle(path, RUN) else ", or let it delete this one with --overwrite"
+        raise ConfigError(
+            f"The output folder holds another run ({'; '.join(different)}): choose another --out, or ask "
+            f"generate-dataset for the same{delete}: {path}"
+        )
     return run, damage
 
 
@@ -293,20 +277,6 @@ def _told_as_unusable(path: Path) -> Iterator[None]:
     except OSError as error:
         unusable = ConfigError(f"The output folder cannot be used ({error.strerror}): choose another --out: {path}")
         raise resource_error(error) or unusable from error
-
-
-def _refuse_strangers(path: Path) -> None:
-    if not path.is_dir() or (path / RUN_NAME).exists() or recordings_of(path):
-        return
-    strangers = sorted(p.name for p in path.iterdir() if p.name not in (*PARTS, LOCK_NAME, f"{RUN_NAME}.part"))
-    if strangers:
-        raise ConfigError(
-            f"The output folder holds files that are of no run ({shown(strangers)}): choose another --out: {path}"
-        )
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def _processor() -> str:

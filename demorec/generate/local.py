@@ -20,7 +20,7 @@ from types import FrameType
 
 from demorec.core.config import EpisodePlan
 from demorec.core.processes import SPAWN
-from demorec.generate.executor import SINGLE_THREADED, Executor, Lost, Report, attempt_episode
+from demorec.generate.executor import SINGLE_THREADED, Executor, Report, attempt_episode, lost
 
 _OF_THE_GROUP = frozenset({signal.SIGINT, signal.SIGTERM})
 _LEAVE = signal.SIGUSR1
@@ -94,7 +94,7 @@ class LocalExecutor(Executor):
                 worker.process.join()
                 worker.pipe.close()
                 if plan is not None:
-                    reports.append(Lost(plan=plan, reason=_death(worker.process.exitcode)))
+                    reports.append(lost(plan, _death(worker.process.exitcode)))
         return reports
 
     def interrupt(self) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, in_words
 from demorec.core.processes import available_cores
-from demorec.generate.executor import SINGLE_THREADED, Executor, Lost, Report, attempt_episode
+from demorec.generate.executor import SINGLE_THREADED, Executor, Report, attempt_episode, lost
 from demorec.generate.options import RunOptions
 from demorec.runs.run_file import RUN_NAME
 
@@ -124,7 +124,7 @@ class RayExecutor(Executor):
             try:
                 reports.append(ray.get(reference))
             except ray.exceptions.TaskCancelledError:
-                reports.append(Lost(plan=plan, reason="it was cancelled"))
+                reports.append(lost(plan, "it was cancelled"))
             except ray.exceptions.RayTaskError as error:
                 # What the maker raises comes back as a report; this is the worker that cannot even begin.
                 raise GenerationError(f"A Ray worker cannot work: {_last_line(error)}") from error
@@ -134,7 +134,7 @@ class RayExecutor(Executor):
                 self._pending[reference], self._is_cut_off = plan, True
             except ray.exceptions.RayError as error:
                 self._counted_at = -math.inf  # it may have been a whole node
-                reports.append(Lost(plan=plan, reason=f"its Ray worker was lost ({type(error).__name__})"))
+                reports.append(lost(plan, f"its Ray worker was lost ({type(error).__name__})"))
         return reports
 
     def interrupt(self) -> None:

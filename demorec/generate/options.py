@@ -11,7 +11,7 @@ from typing import Literal
 
 from demorec.core.errors import ConfigError, check_option
 from demorec.datasets.lerobot.options import check_repo_id
-from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile, RunSession
+from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,14 +81,12 @@ class RunResult:
 
     Attributes:
         folder: Of the run.
-        run: All that is known now, earlier sessions included.
-        session: This one.
-        made: The attempts of this session.
+        run: All that is known now; where something was made, its last session is this one.
+        made: The attempts of it.
         interrupted: Whether Ctrl-C or SIGTERM ended it.
     """
 
     folder: Path
     run: RunFile
-    session: RunSession
     made: tuple[Attempt, ...]
     interrupted: bool

@@ -24,7 +24,6 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
-from demorec.generate.folder import AnotherRunError
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.mcap import SimulatedRecording
@@ -56,33 +55,20 @@ class Original:
     export: ExportOptions | None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reproduction:
-    """How the copy compares.
-
-    Attributes:
-        result: The run that was made.
-        same: Episodes and attempts whose content is the same bit for bit.
-        different: Those whose content is not, or that the copy does not have.
-        faults: As of `Original`.
-    """
-
-    result: RunResult
-    same: tuple[Key, ...]
-    different: tuple[Key, ...]
-    faults: tuple[str, ...]
-
-
 def reproduce(
     source: Path, options: RunOptions, *, progress: RunObserver, allowed: Sequence[str] = ()
-) -> Reproduction | RunResult:
-    """Make the source's run again in `options.out` and compare; the run's result alone when it was interrupted.
+) -> tuple[RunResult, dict[Key, bool], tuple[str, ...]]:
+    """Make the source's run again in `options.out` and compare, unless it was interrupted.
 
     Args:
         source: A run or a dataset.
         options: How it is carried out.
         progress: Is told how it goes, and first of all in which versions the source differs from what is here.
         allowed: The user's own modules that may be imported for what the source names.
+
+    Returns:
+        The run that was made; episode and attempt -> whether the copy has it with the same content bit for bit; and one
+        line for each recording of the source that is not as it should be.
 
     Raises:
         ConfigError: The source is no run and no dataset, or was made from several runs; or `options.out` is, holds or
@@ -99,13 +85,9 @@ def reproduce(
     different = dict.fromkeys(line for there in original.versions for line in version_differences(there, here))
     if different:
         progress.says(f"Note: {'; '.join(different)}.")
-    try:
-        result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
-    except AnotherRunError as error:
-        differences, _, path = error.args
-        raise AnotherRunError(differences, "choose another --out", path) from error
+    result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
     if result.interrupted:
-        return result
+        return result, {}, ()
     if original.export is None:
         made = {(a.episode_index, a.attempt): a.digest for a in result.run.attempts}
     else:
@@ -117,13 +99,7 @@ def reproduce(
             )
         export_lerobot([result.folder], target, replace(original.export, overwrite=there))
         made = _dataset_digests(target)
-    same = tuple(key for key, value in original.digests.items() if made.get(key) == value)
-    return Reproduction(
-        result=result,
-        same=same,
-        different=tuple(key for key in original.digests if key not in same),
-        faults=original.faults,
-    )
+    return result, {key: made.get(key) == value for key, value in original.digests.items()}, original.faults
 
 
 def _is_such_a_copy(target: Path, original: Original, config_digest: str) -> bool:

@@ -20,7 +20,7 @@ from demorec.core.errors import ConfigError, GenerationError
 from demorec.core.processes import available_cores, handled
 from demorec.core.tables import RENDERERS, load_robot
 from demorec.generate.contents import Inspector
-from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Lost, Made, Raised, Report
+from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Made, Raised, Report
 from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunObserver, RunOptions, RunResult
@@ -177,10 +177,10 @@ class _Driver:
 
     def work(self) -> bool:
         """Until nothing is due any more; returns whether the user has interrupted it."""
-        with catch_interrupts() as interrupts:
+        with _catch_interrupts() as interrupts:
             for reports in self._reports():
                 self._handle(reports)
-                if interrupts.count:
+                if interrupts:
                     break
             else:
                 return False
@@ -209,8 +209,6 @@ class _Driver:
         for report in reports:
             if isinstance(report, Made):
                 self._made(report)
-            elif isinstance(report, Lost):
-                self._again(report.plan, report.reason, _MORE_MEMORY)
             else:
                 self._raised(report)
 
@@ -254,22 +252,15 @@ class _Driver:
         )
 
 
-class Interrupts:
-    """How often the user has asked for the end."""
+@contextmanager
+def _catch_interrupts() -> Iterator[list[int]]:
+    """Catch SIGINT and SIGTERM inside: the first is listed, the second raises KeyboardInterrupt."""
+    caught: list[int] = []
 
-    def __init__(self) -> None:
-        self.count = 0
-
-    def handle(self, number: int, frame: FrameType | None) -> None:
-        """Count the first, raise KeyboardInterrupt at the second."""
-        self.count += 1
-        if self.count > 1:
+    def handle(number: int, frame: FrameType | None) -> None:
+        caught.append(number)
+        if len(caught) > 1:
             raise KeyboardInterrupt
 
-
-@contextmanager
-def catch_interrupts() -> Iterator[Interrupts]:
-    """Catch SIGINT and SIGTERM inside."""
-    interrupts = Interrupts()
-    with handled(interrupts.handle, signal.SIGINT, signal.SIGTERM):
-        yield interrupts
+    with handled(handle, signal.SIGINT, signal.SIGTERM):
+        yield caught

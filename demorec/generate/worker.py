@@ -47,34 +47,38 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
         DemorecError: No trustworthy recording could be made, for a reason that another attempt would not mend.
         OSError: The folder cannot be written to.
     """
-    clock = _Stopwatch(SIMULATION if _simulators.is_warm else STARTING)
+    began, seconds = time.process_time(), dict.fromkeys(STAGES, 0.0)
     with _scratch_folder(folder) as scratch:
         path = scratch / recording_name(plan.episode_index, plan.attempt, success=False)
         try:
-            _record(plan, path, clock)
+            _record(plan, path, began, seconds)
         except SceneError as error:
             for part in scratch.iterdir():
                 part.unlink()
-            return _without_scene(plan, str(error), clock.seconds())
-        with clock.stage(RECORDING):
+            return _without_scene(plan, str(error), _with_rest(seconds, began))
+        with _counted(seconds, RECORDING):
             attempt, *_ = inspect_recording(path)
             file = f"{EPISODES if attempt.success else FAILED}/" + recording_name(
                 plan.episode_index, plan.attempt, success=attempt.success
             )
             path.replace(folder / file)
             sync_folder((folder / file).parent)
-    return replace(attempt, file=file, seconds=clock.seconds())
+    return replace(attempt, file=file, seconds=_with_rest(seconds, began))
 
 
-def _record(plan: EpisodePlan, path: Path, clock: _Stopwatch) -> None:
+def _record(plan: EpisodePlan, path: Path, began: float, seconds: dict[str, float]) -> None:
+    starts = not _simulators.is_warm
     episode = prepare(plan)
     _check_versions(plan, episode.info.versions)
     world, renderer = _simulators.acquire(episode.info)
-    timed: Any = _Timed(renderer, clock, RENDERING) if renderer else None
+    timed: Any = _Timed(renderer, seconds, RENDERING) if renderer else None
     session = Session.of_episode(world, episode, timed)
     with SimulatedWriter(path, episode.info, video=plan.config.video) as writer:
-        recording = _Timed(writer, clock, RECORDING)
+        recording = _Timed(writer, seconds, RECORDING)
         for frame in session.run(ScriptAgent(episode)):
+            if starts:  # the first frame's images included: a worker's first drawing compiles
+                seconds |= {STARTING: time.process_time() - began, RENDERING: 0.0}
+                starts = False
             recording.write(frame)
         recording.finish(session.outcome)
 
@@ -90,44 +94,26 @@ _simulators = SimulatorCache()
 """Of this process."""
 
 
-class _Stopwatch:
-    """CPU seconds by stage. What happens outside every `stage` belongs to the simulation once a frame was recorded.
+@contextmanager
+def _counted(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Count the CPU seconds of what is done within for a stage."""
+    began = time.process_time()
+    try:
+        yield
+    finally:
+        seconds[stage] += time.process_time() - began
 
-    Args:
-        before_first_frame: What it belongs to until then: SIMULATION, or STARTING, which includes the first drawing.
-    """
 
-    def __init__(self, before_first_frame: str) -> None:
-        self._seconds = dict.fromkeys(STAGES, 0.0)
-        self._stage = before_first_frame
-        self._since = time.process_time()
-
-    def seconds(self) -> dict[str, float]:
-        """Stage -> seconds until now."""
-        self._switch(self._stage)
-        return dict(self._seconds)
-
-    @contextmanager
-    def stage(self, stage: str) -> Iterator[None]:
-        """Count what is done within for another stage."""
-        outer = self._switch(STARTING if (self._stage, stage) == (STARTING, RENDERING) else stage)
-        try:
-            yield
-        finally:
-            self._switch(SIMULATION if stage == RECORDING else outer)
-
-    def _switch(self, stage: str) -> str:
-        now = time.process_time()
-        self._seconds[self._stage] = self._seconds.get(self._stage, 0.0) + now - self._since
-        self._since, before, self._stage = now, self._stage, stage
-        return before
+def _with_rest(seconds: dict[str, float], began: float) -> dict[str, float]:
+    """Stage -> CPU seconds of an attempt that ends now; what no other stage has counted is simulation."""
+    return seconds | {SIMULATION: time.process_time() - began - sum(seconds.values())}
 
 
 class _Timed:
     """A renderer or writer whose methods count for a stage."""
 
-    def __init__(self, timed: object, clock: _Stopwatch, stage: str) -> None:
-        self._timed, self._counted = timed, clock.stage(stage)
+    def __init__(self, timed: object, seconds: dict[str, float], stage: str) -> None:
+        self._timed, self._counted = timed, _counted(seconds, stage)
 
     def __getattr__(self, name: str) -> Any:
         return self._counted(getattr(self._timed, name))

@@ -9,15 +9,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
-from demorec.core.files import LOCK_NAME, make_folder, read_json_limited, run_lock
+from demorec.core.files import LOCK_NAME, MAX_JSON_BYTES, make_folder, read_json_limited, run_lock
 from demorec.core.plain import from_plain, to_plain
-from demorec.core.replacing import shown
+from demorec.core.replacing import json_object
 from demorec.episode.external import EpisodeInfo
 from demorec.mcap import Recording, recover
 from demorec.runs.run_file import (
@@ -25,14 +24,15 @@ from demorec.runs.run_file import (
     DATASET,
     EPISODES,
     IMPORT_NAME,
-    MAX_RUN_FILE_BYTES,
     RUN_FORMAT,
     RUN_NAME,
     DamagedRunFileError,
     free_name,
     recording_name,
+    refuse_strangers,
     replace_run_file,
     sha256_of,
+    utc_now,
 )
 
 
@@ -65,14 +65,6 @@ class ExternalEpisode:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectedSession:
-    """One program that added episodes to the run. Wall-clock times in UTC, ISO 8601."""
-
-    started: str
-    ended: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
 class ExternalRun:
     """The content of run.json.
 
@@ -80,13 +72,13 @@ class ExternalRun:
         robot: Its name.
         fps: Nominal frames per second.
         episodes: Every one, in order.
-        sessions: Who added them.
+        sessions: "started" and "ended" (UTC, ISO 8601; "" while it goes on) of each program that added some.
     """
 
     robot: str
     fps: int
     episodes: tuple[ExternalEpisode, ...] = ()
-    sessions: tuple[CollectedSession, ...] = ()
+    sessions: tuple[Mapping[str, str], ...] = ()
 
     @property
     def digest(self) -> str:
@@ -97,11 +89,7 @@ class ExternalRun:
 
 def is_external_run(folder: Path) -> bool:
     """Whether the folder has a run.json of a run whose episodes were collected."""
-    try:
-        plain = read_json_limited(folder / RUN_NAME, MAX_RUN_FILE_BYTES)
-    except (OSError, ValueError):
-        return False
-    return isinstance(plain, dict) and plain.get("kind") == COLLECTED
+    return json_object(folder / RUN_NAME).get("kind") == COLLECTED
 
 
 def load_external_run(folder: Path) -> ExternalRun:
@@ -113,7 +101,7 @@ def load_external_run(folder: Path) -> ExternalRun:
     """
     path = folder / RUN_NAME
     try:
-        plain = read_json_limited(path, MAX_RUN_FILE_BYTES)
+        plain = read_json_limited(path, MAX_JSON_BYTES)
         if not isinstance(plain, dict):
             raise ValueError("no JSON object")
         if plain.get("kind") != COLLECTED or plain.get("format", 0) > RUN_FORMAT:
@@ -142,7 +130,7 @@ class ExternalFolder:
     def __init__(self, path: Path, *, recovers: bool = True) -> None:
         self.path = path
         self.recovered: list[Path] = []
-        self._session = CollectedSession(started=_now())
+        self._session = {"started": utc_now(), "ended": ""}
         known, is_damaged = ExternalRun(robot="", fps=1), False
         if os.path.lexists(path / RUN_NAME):
             try:
@@ -235,7 +223,7 @@ class ExternalFolder:
         """Write run.json, if there is anything to tell."""
         if (info := self.kind()) is None:
             return
-        session = replace(self._session, ended=_now()) if ended else self._session
+        session = self._session | ({"ended": utc_now()} if ended else {})
         run = ExternalRun(
             robot=info.robot, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
         )
@@ -263,7 +251,10 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
     if path.exists() and not path.is_dir():
         raise ConfigError(f"This is a file, no folder for a run: choose another: {path}")
     if path.is_dir() and not is_external_run(path):
-        _refuse_strangers(path)
+        if (path / RUN_NAME).exists():
+            with suppress(DamagedRunFileError):  # whose recordings know what it said
+                load_external_run(path)
+        refuse_strangers(path, (EPISODES, DATASET, IMPORT_NAME, LOCK_NAME))
     make_folder(path / EPISODES)
     with run_lock(path):
         folder = ExternalFolder(path, recovers=recovers)
@@ -272,20 +263,6 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
             yield folder
         finally:
             folder.save(ended=True)
-
-
-def _refuse_strangers(path: Path) -> None:
-    """Raise ConfigError for a folder without a readable run.json that holds other things than collected episodes."""
-    if (path / RUN_NAME).exists():
-        with suppress(DamagedRunFileError):
-            load_external_run(path)
-    strangers = [
-        entry.name
-        for entry in sorted(path.iterdir())
-        if entry.name not in (EPISODES, DATASET, IMPORT_NAME, LOCK_NAME) and not entry.name.startswith(RUN_NAME)
-    ]
-    if strangers:
-        raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {path}")
 
 
 def episode_path(run: Path, episode_index: int) -> Path:
@@ -334,7 +311,3 @@ def _cameras(info: EpisodeInfo) -> dict[str, str]:
 
 def _short(urdf: str) -> str:
     return f"one of digest {sha256(urdf.encode()).hexdigest()[:8]}" if urdf else "none"
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")

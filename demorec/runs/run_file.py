@@ -9,15 +9,17 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
-from demorec.core.files import open_regular, read_json_limited, replace_text
+from demorec.core.files import MAX_JSON_BYTES, open_regular, read_json_limited, replace_text
 from demorec.core.plain import digest, from_plain, to_plain
+from demorec.core.replacing import shown
 
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
@@ -29,10 +31,6 @@ IMPORT_NAME = "import.json"
 """Beside run.json: what `demorec import` read, and what it found in it (`demorec.sources.import_file`)."""
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
-
-
-MAX_RUN_FILE_BYTES = 2 << 30
-"""Above this run.json is not read: some million episodes, which take ten times as much memory."""
 
 
 class DamagedRunFileError(DemorecError):
@@ -201,7 +199,7 @@ def load_run_file(folder: Path) -> RunFile:
     """
     path = folder / RUN_NAME
     try:
-        plain = read_json_limited(path, MAX_RUN_FILE_BYTES)
+        plain = read_json_limited(path, MAX_JSON_BYTES)
         if not isinstance(plain, dict):
             raise ValueError("no JSON object")
         if plain.get("kind") == COLLECTED:
@@ -244,6 +242,18 @@ def sha256_of(path: Path) -> str:
     """SHA-256 (hex) of a file's bytes."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def utc_now() -> str:
+    """In ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def refuse_strangers(folder: Path, own: Collection[str]) -> None:
+    """Raise ConfigError for a folder that holds other things than what a run writes, of these names."""
+    strangers = sorted(p.name for p in folder.iterdir() if p.name not in own and not p.name.startswith(RUN_NAME))
+    if strangers:
+        raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {folder}")
 
 
 def sync_folder(folder: Path) -> None:

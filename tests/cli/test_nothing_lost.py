@@ -594,7 +594,7 @@ def test_reproduce_needs_a_place_beside_its_source(
     assert files_of(place / "runs") == before
 
 
-def test_reproduce_advises_nothing_that_it_does_not_have(
+def test_reproduce_says_whose_the_flags_are_that_it_does_not_have(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = GenerateConfig(seed=1, cameras=())
@@ -602,7 +602,10 @@ def test_reproduce_advises_nothing_that_it_does_not_have(
     monkeypatch.setattr(reproducing, "read_original", lambda source: original)
     assert exit_code("reproduce", tmp_path / "original", "--out", run) == 2
     said = capsys.readouterr().err
-    assert f"holds another run (seed is 0 there and 1 here): choose another --out: {run}" in said
+    assert (
+        "holds another run (seed is 0 there and 1 here): choose another --out, or ask generate-dataset for the same"
+        in said
+    )
 
 
 def test_reproduce_leaves_another_dataset_alone(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

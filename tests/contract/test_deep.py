@@ -28,7 +28,7 @@ from demorec.mcap.ros2 import DEFINITIONS
 from demorec.replay.deep import DeepReport, deep_check, deep_checks
 from demorec.replay.deep.contents import CODED, Contents, content_differences
 from demorec.replay.rerender import RerenderOptions, rerender
-from demorec.runs.run_file import RunSession, load_run_file
+from demorec.runs.run_file import load_run_file
 
 FPS = 10
 
@@ -414,7 +414,7 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     folder = simulate_run(tmp_path / "run", 4, seed=7, fps=FPS)
     path = folder / "episodes" / "episode_000003.mcap"
     run = load_run_file(folder)
-    result = RunResult(folder=folder, run=run, session=RunSession(started=""), made=(), interrupted=False)
+    result = RunResult(folder=folder, run=run, made=(), interrupted=False)
     found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
     assert "2 episodes made again" in found
     assert not [failure for failure in failures if "made again" in failure]

@@ -15,7 +15,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import GenerationError
 from demorec.generate import executor as executing
 from demorec.generate import run as running
-from demorec.generate.executor import Executor, Lost, Report, attempt_episode
+from demorec.generate.executor import Executor, Report, attempt_episode, lost
 from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
 
@@ -58,7 +58,7 @@ class Waning(Executor):
             return []
         plan = self.plans.pop(0)
         if self.is_lost and self.in_flight == "lost":
-            return [Lost(plan=plan, reason="its machine is gone")]
+            return [lost(plan, "its machine is gone")]
         return [attempt_episode("support.makers:make", plan, self.folder)]
 
     def interrupt(self) -> None:

@@ -241,7 +241,7 @@ def test_a_killed_worker_costs_one_attempt(tmp_path: Path, reference: RunResult)
     heard = Remembers()
     result = run_fake(tmp_path / "run", maker="die_once", progress=heard)
     assert result.run.digest == reference.run.digest
-    assert result.session.lost_workers == 1
+    assert result.run.sessions[-1].lost_workers == 1
     assert heard.said == ["Episode 2 is made again: its worker was ended by SIGKILL (out of memory?)."]
 
 

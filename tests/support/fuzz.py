@@ -24,7 +24,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from demorec.cli import COMMANDS, main, parse_command
+from demorec.cli import COMMANDS, main
+from demorec.cli.shared.flags import parse
 from demorec.core.errors import DemorecError
 from demorec.core.text import printable
 
@@ -131,7 +132,7 @@ def results_here(fuzzed: Fuzzed, numbers: Iterable[int]) -> Counter[str]:
         said = io.StringIO()
         try:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                parse_command(COMMANDS.load(name), arguments, prog=f"demorec {name}").run()
+                parse(COMMANDS.load(name), arguments, prog=f"demorec {name}").run()
             results["done"] += 1
         except DemorecError as error:
             said.write(str(error))

@@ -15,7 +15,7 @@ from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.core.config import GenerateConfig
 from demorec.generate.options import RunResult
-from demorec.runs.run_file import RunFile, RunSession, inspect_recording, save_run_file
+from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 
 FAILED = "failed/episode_000000.attempt_0.mcap"
 
@@ -98,7 +98,7 @@ def test_the_closing_table_counts_them_apart(run: Path) -> None:
     """What decides the exit code of generate-dataset."""
     attempt = replace(inspect_recording(run / FAILED)[0], file=FAILED)
     known = RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,))
-    result = RunResult(folder=run, run=known, session=RunSession(started=""), made=(), interrupted=False)
+    result = RunResult(folder=run, run=known, made=(), interrupted=False)
     found, failures = check_run(result, progress=lambda done, total: None)
     assert "not counted: those of 1 failed attempt" in found
     assert not any(failure.startswith(Path(FAILED).name) for failure in failures)

@@ -15,12 +15,12 @@ from demorec.cli.generate_report import next_commands
 from demorec.core.config import GenerateConfig
 from demorec.generate.contents import set_aside
 from demorec.generate.options import RunResult
-from demorec.runs.run_file import ExportRecord, RunFile, RunSession
+from demorec.runs.run_file import ExportRecord, RunFile
 
 
 def result_of(folder: Path, *, cameras: tuple[str, ...] = ("front",)) -> RunResult:
     run = RunFile(config=GenerateConfig(cameras=cameras), versions={}, num_episodes=1)
-    return RunResult(folder=folder, run=run, session=RunSession(started=""), made=(), interrupted=False)
+    return RunResult(folder=folder, run=run, made=(), interrupted=False)
 
 
 EXPORT = ExportRecord(run_digest="12", repo_id="me/cubes")

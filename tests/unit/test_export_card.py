@@ -47,7 +47,7 @@ def commands_of(dataset: Path) -> list[str]:
 )
 def test_the_flags_of_a_config_are_parsed_to_it(config: GenerateConfig) -> None:
     words = shlex.split(" ".join(flags(config, GenerateConfig())))
-    assert parse(Generate, words, prog="generate-dataset", defaults=None).episodes == config
+    assert parse(Generate, words, prog="generate-dataset").episodes == config
 
 
 def test_the_commands_of_a_card_make_the_dataset(tmp_path: Path) -> None:
@@ -61,11 +61,11 @@ def test_the_commands_of_a_card_make_the_dataset(tmp_path: Path) -> None:
     export(make_run(tmp_path / "run", (6, 5, 7)), tmp_path / "d", **options)
     generating, exporting = (shlex.split(command) for command in commands_of(tmp_path / "d"))
     assert generating[0] == "generate-dataset"
-    made = parse(Generate, generating[1:], prog="", defaults=None)
+    made = parse(Generate, generating[1:], prog="")
     assert made.episodes == GenerateConfig(task="pick_place", seed=0, video=VideoConfig(codec="h264"))
     assert (made.options.num_episodes, made.options.export) == (2, False)
     assert exporting[:2] == ["demorec", "export"]
-    parsed = parse(Export, exporting[2:], prog="", defaults=Export.defaults(exporting[2:]))
+    parsed = parse(Export, exporting[2:], prog="")
     assert parsed.options == ExportOptions(**options)
     assert parsed.sources == (made.options.out,)
     assert "demorec reproduce path/of/this/folder --out copy" in (tmp_path / "d" / "README.md").read_text()
@@ -75,7 +75,7 @@ def test_the_commands_of_a_card_make_the_dataset(tmp_path: Path) -> None:
 def test_the_flags_of_an_export_are_parsed_to_it(language: tuple[str, ...] | None) -> None:
     options = ExportOptions(repo_id="me/cubes", language=language, progress=True)
     words = ["run", "--repo-id", "me/cubes", *shlex.split(" ".join(flags(options, ExportOptions(repo_id="me/cubes"))))]
-    parsed = parse(Export, ["lerobot", *words, "--out", "d"], prog="", defaults=Export.defaults(["lerobot", *words]))
+    parsed = parse(Export, ["lerobot", *words, "--out", "d"], prog="")
     assert parsed.options == options
 
 

@@ -1,34 +1,24 @@
-"""CPU seconds of an attempt by stage, with a clock that the test sets."""
+"""CPU seconds of an attempt by stage, with a clock that advances by one at each look."""
 
 from __future__ import annotations
 
 import time
+from itertools import count
+from pathlib import Path
 
 import pytest
 
-from demorec.generate import worker
-from demorec.generate.worker import RECORDING, RENDERING, SIMULATION
-from demorec.runs.run_file import STARTING
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.generate.worker import make_episode
 
 
-@pytest.mark.parametrize(
-    ("first", "expected"),
-    [
-        (SIMULATION, {SIMULATION: 1.0 + 4.0, RENDERING: 20.0 + 50.0, RECORDING: 300.0}),
-        # A worker's first drawing compiles: that belongs to the start.
-        (STARTING, {STARTING: 1.0 + 20.0, SIMULATION: 4.0, RENDERING: 50.0, RECORDING: 300.0}),
-    ],
-)
-def test_every_second_counts_once(first: str, expected: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 1000.0
-    monkeypatch.setattr(time, "process_time", lambda: now)
-    clock = worker._Stopwatch(first)
-    now += 1.0
-    with clock.stage(RENDERING):
-        now += 20.0
-    with clock.stage(RECORDING):
-        now += 300.0
-    now += 4.0
-    with clock.stage(RENDERING):
-        now += 50.0
-    assert clock.seconds() == expected
+def test_every_second_counts_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("episodes", "failed", "unfinished"):
+        (tmp_path / name).mkdir()
+    config = GenerateConfig(task="tutorial", cameras=("front",), width=32, height=32)
+    for index in range(2):
+        looks = count()
+        monkeypatch.setattr(time, "process_time", lambda looks=looks: float(next(looks)))
+        seconds = make_episode(EpisodePlan(config=config, episode_index=index), tmp_path).seconds
+        assert sum(seconds.values()) == next(looks) - 1
+        assert all(value > 0 for value in seconds.values())

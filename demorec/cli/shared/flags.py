@@ -32,7 +32,8 @@ from tyro.constructors import (
 )
 
 from demorec.cli.shared.output import say, tell
-from demorec.core.registry import check_allowed
+from demorec.core.errors import ConfigError
+from demorec.core.registry import is_module_name, split_name
 
 FLAG_TYPES = ConstructorRegistry()
 
@@ -50,18 +51,18 @@ def terminal_width() -> int:
     return max(_NARROWEST, shutil.get_terminal_size().columns)
 
 
-def parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: object) -> Any:
-    """An instance of the command from its flags.
+def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
+    """An instance of the command from its flags; `command.defaults(args)`, where there is one, has their defaults.
 
     Args:
         command: A dataclass.
         args: Of the command line.
         prog: Name of the program.
-        defaults: An instance whose values are the defaults, or None for those of the class.
 
     Raises:
         SystemExit: 0 after --help, 2 after a wrong flag, which is reported first.
     """
+    defaults = command.defaults(args) if hasattr(command, "defaults") else MISSING_NONPROP
     takes_others = OTHERS in command.__dataclass_fields__
     # Python would take an empty path for the current folder.
     if not takes_others and any(not word and not before.startswith("--") for before, word in pairwise(["", *args])):
@@ -78,7 +79,7 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str, defaults: objec
                 args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
                 prog=prog,
                 description=inspect.cleandoc(command.__doc__ or ""),
-                default=MISSING_NONPROP if defaults is None else defaults,
+                default=defaults,
                 config=(tyro.conf.OmitArgPrefixes,),
                 return_unknown_args=takes_others,
             )
@@ -189,7 +190,11 @@ Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_b
 """One module or package each time, since paths may follow."""
 
 
-def allowed_modules(names: Sequence[str]) -> tuple[str, ...]:
+def allowed_modules(names: tuple[str, ...]) -> tuple[str, ...]:
     """What --allow names; ConfigError where that can be no module."""
-    check_allowed(names)
-    return tuple(names)
+    for name in names:
+        if not is_module_name(name):
+            parts = split_name(name)
+            advice = f" Did you mean {parts[0]!r}?" if parts else ""
+            raise ConfigError(f"--allow names a module or package, for example my_tasks, found {name!r}.{advice}")
+    return names

@@ -1,12 +1,14 @@
-"""Where commands must not write, since they read it."""
+"""Where commands must not write, since they read it; and how they read what is no recording."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
-from demorec.cli.shared.output import tell
-from demorec.core.errors import ConfigError
+from demorec.cli.shared.output import renamed, tell
+from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.processes import terminate_as_interrupt
 from demorec.core.replacing import use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
@@ -78,3 +80,37 @@ def run_of(recording: Path) -> Path | None:
     """The run that a recording belongs to by its place; None for one elsewhere."""
     folder = recording.resolve().parent
     return folder.parent if folder.name in (EPISODES, FAILED) else None
+
+
+@contextmanager
+def reading(
+    paths: Sequence[Path], mapping: Path | None, *, imports_datasets: bool = False
+) -> Iterator[tuple[Path, ...]]:
+    """What to read in the place of each path; until the context is left, all output names the user's paths.
+
+    Bags, HDF5 files and datasets are read through a temporary run (`demorec.sources.opening`). No line that is written
+    names it: its episodes are called "demo.hdf5: episode 3".
+
+    Args:
+        paths: As the user named them.
+        mapping: Of `--mapping`.
+        imports_datasets: Whether the command takes datasets as recordings.
+
+    Raises:
+        ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
+        DemorecError: A path cannot be read.
+    """
+    imported = {"hdf5", "rosbag", *(["dataset"] if imports_datasets else [])}
+    if mapping is None and not imported & {find(path).kind for path in paths}:
+        yield tuple(paths)  # without loading what reads bags
+        return
+    from demorec.sources.opening import opened
+
+    with terminate_as_interrupt(), opened(paths, mapping, imports_datasets=imports_datasets, tell=tell) as found:
+        names = {str(one.path): str(one.source) for one in found if one.path != one.source}
+        with renamed(names) as in_users_words:
+            try:
+                yield tuple(one.path for one in found)
+            except DemorecError as error:
+                error.args = tuple(in_users_words(part) for part in error.args)
+                raise

@@ -38,7 +38,7 @@ from demorec.episode.episode import Outcome
 from demorec.episode.features import ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, ActionKind, StateKind, state_names
 from demorec.episode.sensed import SENSED
 from demorec.generate.contents import foreign_recordings
-from demorec.generate.executor import Lost, Raised
+from demorec.generate.executor import Raised
 from demorec.generate.local import LocalExecutor
 from demorec.gym_env import DemorecEnv
 from demorec.learn.evaluate import TakeOver
@@ -211,10 +211,9 @@ def evaluate(
     with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
         for report in chain.from_iterable(executor.carry_out(functools.partial(next, iter(due), None))):
             if isinstance(report, Raised):
-                raise DemorecError(f"Episode {report.plan.episode_index}: {report.kind}: {report.message}")
-            if isinstance(report, Lost):
                 raise DemorecError(
-                    f"Episode {report.plan.episode_index} was lost: {report.reason}; the same command goes on."
+                    f"Episode {report.plan.episode_index}: {report.kind}: {report.message.rstrip('.')}; the same "
+                    "command goes on."
                 )
             evaluation = _with(evaluation, [*evaluation.rollouts, report.attempt])
             _save(evaluation, out)
