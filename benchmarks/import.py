@@ -122,12 +122,13 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from demorec.sources.bag import open_bag
+    from demorec.sources.decoding import BagDecoder
     from demorec.sources.episodes import windows
     from demorec.sources.fields import picture_bytes
     from demorec.sources.mapping_file import read_mapping
     from demorec.sources.picture_messages import decode_picture, decode_video
     from demorec.sources.rows import Timelines
-    from demorec.sources.streams import BagDecoder, read_streams
+    from demorec.sources.streams import read_streams
 
     known = read_mapping(mapping)
     opened = open_bag(bag)
@@ -167,8 +168,8 @@ def decoding_and_coding(bag: Path) -> None:
     from demorec.core.config import VideoConfig
     from demorec.mcap.video import make_encoder
     from demorec.sources.bag import open_bag
+    from demorec.sources.decoding import BagDecoder
     from demorec.sources.picture_messages import decode_picture
-    from demorec.sources.streams import BagDecoder
 
     decoder = BagDecoder(open_bag(bag).num_bytes)
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}

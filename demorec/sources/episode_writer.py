@@ -96,7 +96,7 @@ def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:
         topic=stream.topic,
         head=head,
         kept=_kept(head),
-        numbers=stream.numbers[line.order[taken]],
+        numbers=np.asarray(stream.places)[line.order[taken]],
         stamps_ns=line.times_ns[taken],
         positions=np.searchsorted(taken, place),
     )

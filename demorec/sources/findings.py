@@ -114,7 +114,7 @@ def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     if late or backwards:
         yield "order", f"{max(late, backwards)} messages come before earlier ones"
     if repeated := line.num_repeated:
-        checksums = line.stream.checksums[is_known].astype(np.int64)
+        checksums = np.asarray(line.stream.sums)[is_known].astype(np.int64)
         same = int(np.sum((np.diff(known) == 0) & (np.diff(checksums) == 0)))
         yield "duplicates", f"{repeated} messages have the time of another one, {same} of them the same bytes as well"
     if not line.is_regular:
@@ -307,7 +307,7 @@ def _picture_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     sizes = {(head.width, head.height) for head in stream.heads.kinds() if head.width}
     if len(sizes) > 1:
         yield "size", f"its images change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
-    sums = stream.picture_sums[line.order]
+    sums = np.asarray(stream.image_sums)[line.order]
     begin, end = _longest_run(sums.astype(np.int64))
     if end - begin + 1 >= _FROZEN:
         at = (line.times_ns[begin] - line.times_ns[0]) / NS
@@ -368,7 +368,7 @@ def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
             yield of_stream(stream, "swapped", text)
     for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
         shared = min(len(stream), len(other_stream))
-        if shared >= _FROZEN and np.mean(np.isin(stream.picture_sums, other_stream.picture_sums)) > 0.9:
+        if shared >= _FROZEN and np.mean(np.isin(stream.image_sums, other_stream.image_sums)) > 0.9:
             text = f"{stream.topic} and {other_stream.topic} show the same images"
             yield Finding(kind="same_pictures", stream=f"camera {name}, camera {other_name}", text=text)
 

@@ -34,6 +34,7 @@ from demorec.sources.bag import Bag, bags_in
 from demorec.sources.bag_files import BagError
 from demorec.sources.batch import Batch, ImportResult, Job, PlannedBag, files_of, processes
 from demorec.sources.clock import NS, Int
+from demorec.sources.decoding import BagDecoder
 from demorec.sources.episode_writer import (
     ImportedEpisodeWriter,
     PlannedEpisode,
@@ -50,7 +51,7 @@ from demorec.sources.import_file import BagReport, EpisodeReport, ImportFile, lo
 from demorec.sources.mapping import SourceMapping
 from demorec.sources.mapping_file import read_mapping
 from demorec.sources.rows import RATE, EpisodeRows, NoRowsError, Timelines
-from demorec.sources.streams import BagDecoder, read_streams
+from demorec.sources.streams import read_streams
 
 
 def import_bags(

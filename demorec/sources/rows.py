@@ -147,7 +147,7 @@ class Timelines:
                 count = len(times) - 1
         cameras = {
             name: CameraRows(
-                numbers=self.lines[name].stream.numbers[self.lines[name].order[chosen[name].index]][:count],
+                numbers=np.asarray(self.lines[name].stream.places)[self.lines[name].order[chosen[name].index]][:count],
                 index=self.lines[name].order[chosen[name].index][:count],
                 ages_ns=chosen[name].age_ns[:count],
             )

@@ -24,12 +24,11 @@ from demorec.sources.bag_files import BagError, BagMessage
 from demorec.sources.candidates import Vector, transforms_of, vectors_of
 from demorec.sources.choice import Choice, choose_features
 from demorec.sources.clock import NS, SKEW_S
-from demorec.sources.decoding import UnknownEncodingError
+from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import FieldError, follow, stamp_of
 from demorec.sources.mapping import Clock
 from demorec.sources.picture_messages import PictureHead, picture_head
 from demorec.sources.ros_types import Values
-from demorec.sources.streams import BagDecoder
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
 _KEPT = 64
