@@ -13,10 +13,9 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from demorec.sources.bag_findings import all_findings, row_findings
 from demorec.sources.episodes import Window
 from demorec.sources.fields import SourceReader, layout_of
-from demorec.sources.findings import all_findings
-from demorec.sources.import_run import row_findings
 from demorec.sources.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
 from demorec.sources.picture_messages import PictureHead, PictureHeads
 from demorec.sources.ros_types import Budgets
@@ -112,7 +111,12 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
     assert "repeats" not in _kinds(lines, rows)
     # No later than need be: where nothing jitters, images are as good as new, but for a row after the last one.
     if not jitter:
-        assert sorted(rows.cameras["front"].ages_ns.tolist())[COUNT - 2] <= 3_000
+        assert (
+            sorted((rows.times_ns - rows.cameras["front"].stamps_ns[rows.cameras["front"].positions]).tolist())[
+                COUNT - 2
+            ]
+            <= 3_000
+        )
 
 
 @settings(max_examples=200, **PATIENT)
