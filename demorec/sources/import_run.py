@@ -6,11 +6,10 @@ Several processes may read and write; bags are numbered and taken into the run i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache, partial
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +45,7 @@ from demorec.sources.episode_writer import (
 )
 from demorec.sources.episodes import Window, subtask_rows, task_text, windows
 from demorec.sources.fields import FieldError
+from demorec.sources.frames_writer import importing_versions
 from demorec.sources.import_file import BagReport, EpisodeReport, ImportFile, load_import_file, stream_reports
 from demorec.sources.mapping import SourceMapping
 from demorec.sources.mapping_file import read_mapping
@@ -179,7 +179,7 @@ class _Importer:
                 files=tuple(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
                 mapping_digest=self.mapping.digest,
             ),
-            versions=dict(_versions()),
+            versions=importing_versions(),
         )
         subtasks = subtask_rows(bag, lines.streams, rows.window, rows.times_ns, self.mapping)
         episode = PlannedEpisode(info=info, rows=rows, subtasks=subtasks)
@@ -281,11 +281,6 @@ def _pictures(bag: Bag, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[st
 
 def _unusable(bag: Bag, topic: str, error: ValueError) -> BagError:
     return BagError(f"An image of {topic} cannot be used, since {error}: {bag.path}")
-
-
-@cache
-def _versions() -> Mapping[str, str]:
-    return {name: version(name) for name in ("demorec", "av")}
 
 
 def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:
