@@ -54,7 +54,7 @@ class RollingParquet:
         # A dictionary of numbers that hardly repeat costs time and makes the file larger.
         self._dictionary = True if repeating is None else list(repeating)
         self._rows = 0
-        self._collected: list[Mapping[str, Any]] = []
+        self._pending: list[Mapping[str, Any]] = []
         self._waiting: list[pa.Table] = []
         self._waiting_rows = 0
         self._waiting_bytes = 0
@@ -73,15 +73,15 @@ class RollingParquet:
 
     def add_row(self, row: Mapping[str, Any]) -> None:
         """Append a row: so many make a table."""
-        self._collected.append(row)
-        if len(self._collected) >= _ROWS_PER_TABLE:
+        self._pending.append(row)
+        if len(self._pending) >= _ROWS_PER_TABLE:
             self._write_rows()
 
     def _write_rows(self) -> None:
-        if self._collected:
-            self.make_room(len(self._collected))
-            self.write(pa.Table.from_pylist(self._collected, schema=self.schema))
-            self._collected.clear()
+        if self._pending:
+            self.make_room(len(self._pending))
+            self.write(pa.Table.from_pylist(self._pending, schema=self.schema))
+            self._pending.clear()
 
     def write(self, table: pa.Table) -> None:
         """Append a table."""
