@@ -20,6 +20,7 @@ export codes it.
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import multiprocessing
 import resource
@@ -119,15 +120,17 @@ def ours(bags_: list[Path], out: Path, mapping: Path, *, exports: bool) -> None:
 
 def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     """The same rows through LeRobotDataset.add_frame and save_episode, with its defaults."""
+    import av
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from demorec.sources.bag import open_bag
+    from demorec.sources.decoding import BagDecoder
     from demorec.sources.episodes import windows
     from demorec.sources.fields import picture_bytes
     from demorec.sources.mapping_file import read_mapping
-    from demorec.sources.picture_messages import decode_picture, decode_video
+    from demorec.sources.picture_messages import decode_picture
     from demorec.sources.rows import Timelines
-    from demorec.sources.streams import BagDecoder, read_streams
+    from demorec.sources.streams import read_streams
 
     known = read_mapping(mapping)
     opened = open_bag(bag)
@@ -151,7 +154,9 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
         else:
             packets[name].append(picture_bytes(values))
     for name, coded in packets.items():
-        kept[name] += decode_video("h264", coded) if coded else []
+        if coded:
+            with av.open(io.BytesIO(b"".join(coded)), mode="r", format="h264") as file:
+                kept[name] += [frame.to_ndarray(format="rgb24").astype(np.uint8) for frame in file.decode(video=0)]
     for row in range(len(rows.times_ns)):
         frame: dict[str, object] = {
             f"observation.images.{name}": kept[name][int(camera.numbers[row])] for name, camera in rows.cameras.items()
@@ -167,8 +172,8 @@ def decoding_and_coding(bag: Path) -> None:
     from demorec.core.config import VideoConfig
     from demorec.mcap.video import make_encoder
     from demorec.sources.bag import open_bag
+    from demorec.sources.decoding import BagDecoder
     from demorec.sources.picture_messages import decode_picture
-    from demorec.sources.streams import BagDecoder
 
     decoder = BagDecoder(open_bag(bag).num_bytes)
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}

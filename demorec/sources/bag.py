@@ -35,6 +35,8 @@ _MAX_EVENTS = 100_000
 """Of YAML, 25 microseconds each; a bag of 500 topics with their settings has some 40,000."""
 _MAX_FILES = 10_000
 _MAX_PROBLEMS = 100
+Files = tuple[tuple[str, str], ...]
+"""Name and SHA-256, hex digits, of each of a bag's files."""
 _READERS = {MCAP_MAGIC: read_mcap, SQLITE_MAGIC: read_sqlite}
 
 
@@ -62,9 +64,9 @@ class Bag:
         """Of its files."""
         return sum(file.stat().st_size for file in self.files)
 
-    def sha256s(self) -> dict[str, str]:
-        """Name of each of its files -> SHA-256 of its bytes, hex digits."""
-        return {path.name: sha256_of(path) for path in self.files}
+    def sha256s(self) -> Files:
+        """Of its files, by which it is known again."""
+        return tuple((path.name, sha256_of(path)) for path in self.files)
 
     def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Its messages in the order in which they were written.

@@ -6,11 +6,10 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from demorec.core.errors import ConfigError, DemorecError, resource_error, witho
 from demorec.core.processes import SPAWN
 from demorec.episode.external import EpisodeInfo
 from demorec.runs.external import ExternalEpisode, ExternalFolder, differences
-from demorec.sources.bag import Bag, open_bag
+from demorec.sources.bag import Bag, Files, open_bag
 from demorec.sources.episode_writer import PlannedEpisode
 from demorec.sources.import_file import BagReport, ImportFile, SkippedBag, save_import_file
 
@@ -54,78 +53,44 @@ def processes(workers: int) -> Iterator[Executor]:
             raise
 
 
-def in_order[Item, Read, Job, Written](
-    items: Iterable[Item],
-    pool: Executor,
-    *,
-    ahead: int,
-    read: Callable[[Item], Read],
-    accept: Callable[[Item, Future[Read]], Job | None],
-    write: Callable[[Job], Written],
-) -> Iterator[Written]:
-    """What `write` returns, in the order of the items.
-
-    Args:
-        items: Things to be read.
-        pool: Calls `read` and `write`, which are imported by name where they are called in other processes.
-        ahead: How many items are under way at a time: bounds the memory.
-        accept: Called here, in the order of the items, with what was read: what shall be written, if anything. What it
-            raises is raised after all items before have been written.
-    """
-    waiting = deque(items)
-    reading: deque[tuple[Item, Future[Read]]] = deque()
-    writing: deque[Future[Written]] = deque()
-    failure: Exception | None = None
-    while waiting or reading or writing:
-        while waiting and len(reading) + len(writing) < ahead:
-            item = waiting.popleft()
-            reading.append((item, pool.submit(read, item)))
-        if writing and writing[0].done():
-            yield writing.popleft().result()
-        elif reading and reading[0][1].done():
-            try:
-                job = accept(*reading.popleft())
-            except Exception as error:
-                failure = error
-                waiting.clear()
-                reading.clear()
-                continue
-            if job is not None:
-                writing.append(pool.submit(write, job))
-        else:
-            first: list[Future[Any]] = [*list(writing)[:1], *(future for _, future in list(reading)[:1])]
-            wait(first, return_when=FIRST_COMPLETED)
-    if failure is not None:
-        raise failure
-
-
-Files = tuple[tuple[str, str], ...]
-"""Name and SHA-256 of each of a bag's files."""
-
-
 _MAX_REASON = 1000
 """Characters: an error may quote what a bag holds."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImportResult:
-    """What an import made.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedBag:
+    """A bag that has been read.
 
     Attributes:
-        reports: Of every bag that is in the run, in the order in which they were given.
-        num_new: Bags that were read now; the others were there.
-        skipped: Bags that were left out -> why.
+        bag: That one.
+        report: Of all its episodes.
+        episodes: That are to be written, numbered from 0 until the run's numbers are known.
     """
 
-    reports: tuple[BagReport, ...]
-    num_new: int
-    skipped: Mapping[Path, str]
+    bag: Bag
+    report: BagReport
+    episodes: tuple[PlannedEpisode, ...]
+
+    def numbered(self, first: int) -> PlannedBag:
+        """The same with the numbers of a run."""
+        reports = (
+            replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
+            for row in self.report.episodes
+        )
+        episodes = (
+            replace(episode, info=replace(episode.info, episode_index=episode.info.episode_index + first))
+            for episode in self.episodes
+        )
+        return replace(self, report=replace(self.report, episodes=tuple(reports)), episodes=tuple(episodes))
 
 
 class Batch:
     """The bags of one call: numbered and taken into the run in their order, whoever reads and writes them when.
 
     So what is in the run depends neither on how many processes there are nor on when they were interrupted.
+
+    Attributes:
+        num_new: Bags that were read now; the others were there.
     """
 
     def __init__(
@@ -134,7 +99,7 @@ class Batch:
         self._paths, self._known, self._skips, self._progress = paths, known, skips, progress
         self._files: dict[Path, Files] = {}  # of bags that are in the run, or will be
         self._skipped: dict[Path, str] = {}
-        self._num_new = self._num_done = 0
+        self.num_new = self._num_done = 0
         self._next_index = known.num_episodes
         self._kind: EpisodeInfo | None = None
         self._progress(0, len(paths))
@@ -152,7 +117,7 @@ class Batch:
         known = {report.files for report in self._known.bags}
         sizes = {(report.num_bytes, *(name for name, _ in report.files)) for report in self._known.bags}
         likely = [bag for bag in bags if (bag.num_bytes, *(file.name for file in bag.files)) in sizes]
-        for bag, files in zip(likely, pool.map(files_of, likely), strict=True):
+        for bag, files in zip(likely, pool.map(Bag.sha256s, likely), strict=True):
             if files in known:
                 self._files[bag.path] = files
                 self._advance()
@@ -166,33 +131,58 @@ class Batch:
         *,
         ahead: int,
         read: Callable[[Bag], PlannedBag],
-        write: Callable[[Job], tuple[BagReport, list[ExternalEpisode]]],
+        write: Callable[[PlannedBag], tuple[BagReport, list[ExternalEpisode]]],
         tell: Callable[[BagReport], None],
     ) -> None:
-        """Take new bags into a run.
+        """Take new bags into a run; what a bag raises is raised after all bags before it are there.
 
         Args:
             bags: Those that are not there yet.
             folder: Of the run.
-            pool: Calls `read` and `write`.
-            ahead: How many bags are under way at a time.
+            pool: Calls `read` and `write`, which pickle.
+            ahead: How many bags are under way at a time: bounds the memory.
             read: Reads and judges a bag.
             write: Writes its episodes; its report, and their lines of run.json.
             tell: Called with the report of each bag that is in the run now.
         """
         self._kind = folder.kind()
-        accept = partial(self._accept, folder)
-        for report, lines in in_order(bags, pool, ahead=ahead, read=read, accept=accept, write=write):
-            folder.extend(lines)
-            self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())
-            save_import_file(self._known, folder.path)
-            self._num_new += 1
-            self._advance()
-            tell(report)
+        waiting, failure = deque(bags), None
+        reading: deque[tuple[Bag, Future[PlannedBag]]] = deque()
+        writing: deque[Future[tuple[BagReport, list[ExternalEpisode]]]] = deque()
+        while waiting or reading or writing:
+            while waiting and len(reading) + len(writing) < ahead:
+                bag = waiting.popleft()
+                reading.append((bag, pool.submit(read, bag)))
+            if writing and writing[0].done():
+                tell(self._take(folder, *writing.popleft().result()))
+            elif reading and reading[0][1].done():
+                try:
+                    planned = self._accept(folder, *reading.popleft())
+                except Exception as error:
+                    failure = error
+                    waiting.clear()
+                    reading.clear()
+                    continue
+                if planned is not None:
+                    writing.append(pool.submit(write, planned))
+            else:
+                first: list[Future[Any]] = [*list(writing)[:1], *(future for _, future in list(reading)[:1])]
+                wait(first, return_when=FIRST_COMPLETED)
+        if failure is not None:
+            raise failure
         if self._known.bags:
             save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
 
-    def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> Job | None:
+    def _take(self, folder: ExternalFolder, report: BagReport, lines: Sequence[ExternalEpisode]) -> BagReport:
+        """A bag whose episodes are written into the run."""
+        folder.extend(lines)
+        self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())
+        save_import_file(self._known, folder.path)
+        self.num_new += 1
+        self._advance()
+        return report
+
+    def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> PlannedBag | None:
         """What is to be written of a bag, with its episodes' numbers; None for one that is left out or there."""
         try:
             planned = read.result()
@@ -207,8 +197,7 @@ class Batch:
             return None
         planned = planned.numbered(self._next_index)
         self._next_index += len(planned.episodes)
-        missing = [episode for episode in planned.episodes if not folder.has(episode.info)]
-        return Job(bag=bag, report=planned.report, episodes=missing, folder=folder.path)
+        return replace(planned, episodes=tuple(one for one in planned.episodes if not folder.has(one.info)))
 
     def _check_kind(self, planned: PlannedBag, bag: Bag) -> None:
         """ConfigError unless the episodes are of the kind that the run has."""
@@ -243,44 +232,14 @@ class Batch:
         now = [SkippedBag(name=path.name, reason=self._skipped[path]) for path in self._paths if path in self._skipped]
         return (*before, *now)
 
-    def result(self) -> ImportResult:
-        """What came of it."""
+    @property
+    def reports(self) -> tuple[BagReport, ...]:
+        """Of every bag that is in the run, in the order in which they were given."""
         reports = {report.files: report for report in self._known.bags}
         files = dict.fromkeys(self._files[path] for path in self._paths if path in self._files)
-        skipped = {path: self._skipped[path] for path in self._paths if path in self._skipped}
-        return ImportResult(reports=tuple(reports[key] for key in files), num_new=self._num_new, skipped=skipped)
+        return tuple(reports[key] for key in files)
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlannedBag:
-    """A bag that has been read; its episodes are numbered from 0."""
-
-    report: BagReport
-    episodes: tuple[PlannedEpisode, ...]
-
-    def numbered(self, first: int) -> PlannedBag:
-        """The same with the numbers of a run."""
-        reports = (
-            replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
-            for row in self.report.episodes
-        )
-        episodes = (
-            replace(episode, info=replace(episode.info, episode_index=episode.info.episode_index + first))
-            for episode in self.episodes
-        )
-        return PlannedBag(report=replace(self.report, episodes=tuple(reports)), episodes=tuple(episodes))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Job:
-    """Episodes of a bag that are to be written into the folder of a run, and the report of all of them."""
-
-    bag: Bag
-    report: BagReport
-    episodes: Sequence[PlannedEpisode]
-    folder: Path
-
-
-def files_of(bag: Bag) -> Files:
-    """By which a bag is known again."""
-    return tuple(bag.sha256s().items())
+    @property
+    def skipped(self) -> dict[Path, str]:
+        """Bags that were left out -> why."""
+        return {path: self._skipped[path] for path in self._paths if path in self._skipped}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 from demorec.sources.candidates import Vector
 
@@ -22,24 +21,13 @@ _QUANTITIES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choice:
-    """What a mapping takes, and what it offers.
+def choose_features(vectors: Sequence[Vector]) -> tuple[list[Vector], list[Vector], list[Vector], str]:
+    """The parts of the state and of the action: joints if there are any, otherwise poses and velocities in space.
 
-    Attributes:
-        state, action: Their parts, in order; an empty action is the next state.
-        others: All other vectors.
-        warning: That the robot's arm is not in it; "" where it is.
+    Returns:
+        The state, the action (empty: it is the next state), all other vectors, and a warning that the robot's arm is
+        not among the parts, "" where it is.
     """
-
-    state: tuple[Vector, ...]
-    action: tuple[Vector, ...]
-    others: tuple[Vector, ...]
-    warning: str
-
-
-def choose_features(vectors: Sequence[Vector]) -> Choice:
-    """The state and the action: joints if there are any, otherwise poses and velocities in space."""
     usable = [vector for vector in vectors if vector.is_sure and vector.rate_hz and vector.kind != "numbers"]
     measured = [vector for vector in usable if vector.role != "action"]
     commands = [vector for vector in usable if vector.role == "action"]
@@ -61,8 +49,7 @@ def choose_features(vectors: Sequence[Vector]) -> Choice:
     elif all(vector.kind == "gripper" for vector in action):
         action = []  # the arm's command is missing, and the next state has the gripper's opening as well
     taken = {id(vector) for vector in (*state, *action)}
-    others = tuple(vector for vector in vectors if id(vector) not in taken)
-    return Choice(state=tuple(state), action=tuple(action), others=others, warning=warning)
+    return state, action, [vector for vector in vectors if id(vector) not in taken], warning
 
 
 def _lacking(grippers: Sequence[Vector], vectors: Sequence[Vector]) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from demorec.episode.external import Camera, EpisodeInfo, Origin, SourceFile, Ve
 from demorec.runs.external import open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
-from demorec.sources.frames_writer import FramesImport, Picture, write_frames
+from demorec.sources.frames_writer import FramesImport, Picture, importing_versions, write_frames
 
 
 def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> FramesImport:
@@ -109,7 +108,7 @@ def _info(recording: DatasetRecording, cameras: dict[str, Camera], digest: Calla
         origin=Origin(
             kind="import", files=tuple(SourceFile(name=name, sha256=digest(dataset.root / name)) for name in names)
         ),
-        versions={"demorec": version("demorec"), "av": version("av")},
+        versions=importing_versions(),
     )
 
 

@@ -10,10 +10,12 @@ import numpy as np
 
 from demorec.core.errors import in_words
 from demorec.core.plain import MAX_DEPTH, parse_json
-from demorec.mcap.limits import Budget
-from demorec.sources.bag_files import BagChannel
+from demorec.mcap.limits import Budget, SpentError
+from demorec.sources.bag_files import BagChannel, BagMessage
 from demorec.sources.ros_types import Budgets, Values, ros_decoder
 
+_BYTES_OF_VALUE = 200
+"""That are counted for each that is kept."""
 _BYTES_PER_STEP = 8
 """Of a protobuf definition, which takes some twenty times its length in memory."""
 _FEW_FIELDS, _MAX_FIELDS = 2_000_000, 4_000_000
@@ -46,6 +48,48 @@ def decoder_of(channel: BagChannel, budgets: Budgets | None = None) -> Decoder:
                 raise ValueError(f"the encoding {other[:40]!r} is not read; cdr, ros1, protobuf and json are")
     except ValueError as error:
         raise UnknownEncodingError(str(error)) from error
+
+
+class BagDecoder:
+    """Decoders of a bag's channels, made when they are first needed.
+
+    Args:
+        num_bytes: Of the bag's files, by which grows what may be read of it.
+
+    Attributes:
+        budgets: What may still be made of it.
+    """
+
+    def __init__(self, num_bytes: int = 0) -> None:
+        self.budgets = Budgets(num_bytes)
+        self._decoders: dict[BagChannel, Decoder | UnknownEncodingError] = {}
+
+    def values(self, message: BagMessage) -> Values:
+        """Of a message.
+
+        Raises:
+            UnknownEncodingError: Its channel cannot be read at all.
+            ValueError: The message does not fit its type.
+        """
+        decoder = self._decoders.get(message.channel)
+        if decoder is None:
+            try:
+                decoder = decoder_of(message.channel, self.budgets)
+            except UnknownEncodingError as error:
+                decoder = error
+            self._decoders[message.channel] = decoder
+        if isinstance(decoder, UnknownEncodingError):
+            raise UnknownEncodingError(str(decoder))
+        return decoder(message.data)
+
+    def may_keep(self, message: BagMessage) -> bool:
+        """Whether the values that a message has just given are few enough to be kept beside those kept before."""
+        used = self.budgets.values.used - self.budgets.values.begun
+        try:
+            self.budgets.numbers.take(len(message.data) + _BYTES_OF_VALUE * used)
+        except SpentError:
+            return False
+        return True
 
 
 def _decode_json(data: bytes, budget: Budget) -> Values:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,17 +21,16 @@ from demorec.episode.external import (
     Camera,
     EpisodeInfo,
     Feature,
-    Kept,
     Sample,
     SampledFrame,
 )
 from demorec.mcap import EpisodeWriter
 from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.clock import Int, Timeline
+from demorec.sources.clock import Int
 from demorec.sources.fields import picture_bytes
 from demorec.sources.mapping import STATE, recorded_unit
-from demorec.sources.picture_messages import KEPT_FORMATS, PictureHead, decode_picture
+from demorec.sources.picture_messages import decode_picture
 from demorec.sources.ros_types import Values
 from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines
 from demorec.sources.streams import BagStreams
@@ -41,94 +40,23 @@ _MAX_WAITING = 1 << 29
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PicturePlan:
-    """The images that an episode takes of a camera.
-
-    Attributes:
-        topic: Of them.
-        head: Of the first.
-        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are encoded
-            once.
-        numbers: (P,) which of the topic's messages are taken, in the order of their times.
-        stamps_ns: (P,) their times.
-        positions: (R,) which of the taken ones each row shows.
-    """
-
-    topic: str
-    head: PictureHead
-    kept: Kept
-    numbers: Int
-    stamps_ns: Int
-    positions: Int
-
-    @property
-    def num_bytes(self) -> int:
-        """Of one in memory: of its pixels, or about those of what stays encoded."""
-        pixels = self.head.width * self.head.height
-        return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
-
-    @property
-    def told(self) -> str:
-        """What becomes of them, for people."""
-        shown = len(np.unique(self.positions))
-        what = f"{len(self.numbers)} images {self.head.width}x{self.head.height}, "
-        kind = self.head.encoding if self.head.format == "raw" else self.head.format
-        what += f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
-        repeated = len(self.positions) - shown
-        rows = "row shows" if repeated == 1 else "rows show"
-        what += f", {repeated} {rows} the image of the row before" if repeated else ""
-        return what + (f", {len(self.numbers) - shown} shown by no row" if len(self.numbers) > shown else "")
-
-
-def picture_plan(rows: CameraRows, line: Timeline) -> PicturePlan:
-    """Of a camera in an episode: of stills those that rows show, of video all from the keyframe before on."""
-    stream = line.stream
-    place = np.searchsorted(line.times_ns, line.stamps_ns[rows.index])
-    head = stream.heads[int(line.order[place[0]])]
-    taken = np.unique(place)
-    if head.format in KEPT_FORMATS and head.format != "jpeg":
-        first = int(taken[0])
-        while not stream.heads[int(line.order[first])].is_keyframe:
-            first -= 1
-        head = stream.heads[int(line.order[first])]
-        taken = np.arange(first, int(taken[-1]) + 1)
-    return PicturePlan(
-        topic=stream.topic,
-        head=head,
-        kept=_kept(head),
-        numbers=stream.numbers[line.order[taken]],
-        stamps_ns=line.times_ns[taken],
-        positions=np.searchsorted(taken, place),
-    )
-
-
-def _kept(head: PictureHead) -> Kept:
-    """What stays as it is of images like this one."""
-    if head.encoding in DEPTH_UNITS:
-        return cast(Kept, head.encoding)
-    return cast(Kept, head.format) if head.format in KEPT_FORMATS else ""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedEpisode:
     """An episode that shall be written.
 
     Attributes:
         info: What is known of it.
         rows: Its rows.
-        plans: Camera -> its images.
         subtasks: Row -> what is begun there, in words.
     """
 
     info: EpisodeInfo
     rows: EpisodeRows
-    plans: Mapping[str, PicturePlan]
     subtasks: Mapping[int, str]
 
 
 @dataclass(kw_only=True, eq=False)
 class _Waiting:
-    plan: PicturePlan
+    plan: CameraRows
     first: int
     places: Int
     num_written: int = 0
@@ -155,9 +83,9 @@ class ImportedEpisodeWriter:
     def __init__(self, path: Path, episode: PlannedEpisode, *, video: VideoConfig) -> None:
         self._rows, self._subtasks = episode.rows, episode.subtasks
         self._waiting: dict[str, _Waiting] = {}
-        for name, plan in episode.plans.items():
-            first = int(plan.numbers.min()) if len(plan.numbers) else 0
-            self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.numbers, first))
+        for name, plan in episode.rows.cameras.items():
+            first = int(plan.taken.min()) if len(plan.taken) else 0
+            self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.taken, first))
         self._next_row = 0
         self._writer = EpisodeWriter(path, episode.info, video=video)
         self._is_finished = False
@@ -172,7 +100,7 @@ class ImportedEpisodeWriter:
     @property
     def is_complete(self) -> bool:
         """Whether nothing more is needed of the bag."""
-        return all(waiting.num_written == len(waiting.plan.numbers) for waiting in self._waiting.values())
+        return all(waiting.num_written == len(waiting.plan.taken) for waiting in self._waiting.values())
 
     def add(self, topic: str, number: int, values: Values) -> None:
         """Take a message of a camera's topic, if the episode wants it.
@@ -220,7 +148,7 @@ class ImportedEpisodeWriter:
         """Write what is left and give the recording its name; BagError when images have not come."""
         self._write_rows()
         if self._next_row < len(self._rows.times_ns):
-            missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.numbers)]
+            missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.taken)]
             raise BagError(f"The bag has changed while it was read: images of {missing[0]} are missing.")
         self._writer.finish(Outcome(success=self._rows.window.success, num_frames=self._next_row))
         self._is_finished = True
@@ -270,7 +198,7 @@ def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints:
     )
 
 
-def described_camera(name: str, plan: PicturePlan, lines: Timelines) -> Camera:
+def described_camera(name: str, plan: CameraRows, lines: Timelines) -> Camera:
     """A camera as recordings know it."""
     clock = "header" if lines.lines[name].is_header else "log"
     info = lines.streams.infos.get(name, {})

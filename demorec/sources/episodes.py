@@ -80,10 +80,10 @@ def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:
     """The calls of services as markers."""
     try:
         if episodes.topic:
-            calls = streams.calls[episodes.topic]
+            calls = streams.calls[episodes.topic].calls()
             return [Text(time_ns=call.time_ns, value=call.value(episodes.field)) for call in calls]
         ends = ((episodes.start_topic, episodes.start), (episodes.stop_topic, episodes.stop))
-        return [Text(time_ns=call.time_ns, value=word) for topic, word in ends for call in streams.calls[topic]]
+        return [Text(time_ns=call.time_ns, value=word) for topic, word in ends for call in streams.calls[topic].calls()]
     except FieldError as error:
         raise BagError(f"The calls of {episodes.topic} cannot be used, since {error}: {bag.path}") from error
 

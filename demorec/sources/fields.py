@@ -278,12 +278,13 @@ class SourceReader:
     """Reads the vector of a source from message after message.
 
     Attributes:
+        layout: As given.
         others: Names in messages beside those of the first one, where the source takes all that there are.
     """
 
     def __init__(self, source: Source, layout: SourceLayout) -> None:
         self._source = source
-        self._layout = layout
+        self.layout = layout
         self._orders: dict[tuple[str, ...], list[int]] = {}
         self._takes_all = not source.joints and not source.elements
         self.others: dict[str, None] = {}
@@ -295,13 +296,13 @@ class SourceReader:
             FieldError: The message does not have what the first one had.
             OtherPublisherError: It has none of the joints.
         """
-        found = follow(values, self._layout.steps)
+        found = follow(values, self.layout.steps)
         parts = [found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)]
         vector = _joined(parts)
         source = self._source
-        if self._layout.joints:
-            assert self._layout.names_steps is not None
-            names = tuple(_names_at(values, self._layout.names_steps))
+        if self.layout.joints:
+            assert self.layout.names_steps is not None
+            names = tuple(_names_at(values, self.layout.names_steps))
             order = self._orders.get(names) or self._order_of(names)
             if len(vector) != len(names):
                 raise FieldError(f"{len(vector)} values have {len(names)} names")
@@ -310,12 +311,12 @@ class SourceReader:
             if max(source.elements) >= len(vector):
                 raise FieldError(f"there are {len(vector)} values, too few")
             return vector[list(source.elements)]
-        if len(vector) != len(self._layout.names):
-            raise FieldError(f"there are {len(vector)} values where the first message has {len(self._layout.names)}")
+        if len(vector) != len(self.layout.names):
+            raise FieldError(f"there are {len(vector)} values where the first message has {len(self.layout.names)}")
         return vector
 
     def _order_of(self, names: tuple[str, ...]) -> list[int]:
-        joints = self._layout.joints
+        joints = self.layout.joints
         if self._takes_all and len(self.others) < MAX_ELEMENTS:
             self.others |= dict.fromkeys(name for name in names if name not in joints)
         missing = [joint for joint in joints if joint not in names]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import version
 from typing import Any
 
 from numpy.typing import NDArray
@@ -40,6 +42,12 @@ class FramesImport:
         yield from (f"{name} is left out: {reason}." for name, reason in self.left_out.items() if reason)
         if unnamed := [name for name, reason in self.left_out.items() if not reason]:
             yield f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}."
+
+
+@cache
+def importing_versions() -> Mapping[str, str]:
+    """Of what reads and writes an episode, for its recording."""
+    return {name: version(name) for name in ("demorec", "av")}
 
 
 def write_frames(

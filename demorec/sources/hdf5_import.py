@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
 from demorec.sources.episode_writer import urdf_text
-from demorec.sources.frames_writer import FramesImport, write_frames
+from demorec.sources.frames_writer import FramesImport, importing_versions, write_frames
 from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, is_camera, picture_lengths
 from demorec.sources.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.sources.mapping_file import read_mapping
@@ -63,23 +62,37 @@ def import_hdf5(
         expect(path, "hdf5")
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigError("A file is given twice: name each once.")
-    plans: list[_Plan] = []
+    plans: list[tuple[Path, str, EpisodeInfo, Outcome]] = []
     left_out: dict[str, str] = {}
+    cameras: dict[str, str] = {}
+    has_last = False
     for path in paths:
-        with ForeignFile(path) as file:
+        with ForeignFile(path) as file, _named(path):
             source = SourceFile(name=path.name, sha256=sha256_of(path))
             places = episode_places(file, mapping.episodes)
             for place in places:
-                plans.append(_Plan(file, place, mapping, urdf, source, len(plans)))
-                _make_alike(plans[-1], plans[0])
+                episode = _Stored(file, place, mapping)
+                info = episode.described(urdf, source, len(plans))
+                plans.append(
+                    (path, place, _alike(info, plans[0][2] if plans else info, file, place), episode.outcome())
+                )
+                cameras = cameras or {one.name: f"{one.width}x{one.height}, {one.told}" for one in episode.cameras}
+                has_last |= episode.has_last
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
-    if any(plan.has_last for plan in plans):
+    if has_last:
         left_out["the last observation of each episode"] = "no action follows it"
+    with open_external_run(out, recovers=False) as folder:
+        missing = [plan for plan in plans if not folder.has(plan[2])]
+        for path, place, info, outcome in missing:
+            with ForeignFile(path) as file, _named(path):
+                episode = _Stored(file, place, mapping)
+                images = {camera.name: camera.pictures() for camera in episode.cameras}
+                write_frames(folder, info, episode.frames(), images, outcome=outcome, video=video or VideoConfig())
     return FramesImport(
         num_episodes=len(plans),
-        num_frames=sum(plan.num_frames for plan in plans),
-        num_new=_write(plans, mapping, out, video or VideoConfig()),
-        cameras=plans[0].told,
+        num_frames=sum(outcome.num_frames for _, _, _, outcome in plans),
+        num_new=len(missing),
+        cameras=cameras,
         left_out=left_out,
     )
 
@@ -88,6 +101,8 @@ class _Stored:
     """An episode in an opened file; Hdf5FitError when its datasets do not fit the mapping."""
 
     def __init__(self, file: ForeignFile, place: str, mapping: SourceMapping) -> None:
+        self._file, self._place, self._mapping = file, place, mapping
+
         def array(name: str, *, may_be_ragged: bool = False) -> StoredArray:
             return file.array("/".join(filter(None, (place, name.strip("/")))), may_be_ragged=may_be_ragged)
 
@@ -129,6 +144,37 @@ class _Stored:
         for vectors in zip(*columns, strict=True):
             yield {feature.name: vector for feature, vector in zip(self.features, vectors, strict=True)}
 
+    def described(self, urdf: str, source: SourceFile, episode_index: int) -> EpisodeInfo:
+        """What the recording shall say of it; every number is looked at."""
+        file, place, mapping = self._file, self._place, self._mapping
+        for _ in self.frames():
+            pass
+        if attribute := mapping.robot.urdf_attribute:
+            urdf = str(found_attribute(file, place, attribute) or "")
+        try:
+            joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf or attribute else set()
+        except ValueError as error:
+            raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
+        info = EpisodeInfo(
+            episode_index=episode_index,
+            instruction=task_of(file, place, mapping),
+            robot=mapping.robot.name,
+            urdf=urdf,
+            fps=rate_of(file, place, mapping),
+            features=tuple(feature.described(joints) for feature in self.features),
+            cameras=tuple(camera.described() for camera in self.cameras),
+            origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
+            versions=importing_versions(),
+        )
+        if wrong := find_problems(info):
+            raise Hdf5FitError("; ".join(wrong))
+        return info
+
+    def outcome(self) -> Outcome:
+        """How it ended; Hdf5Error when the file does not say."""
+        success = success_of(self._file, self._place, self._mapping, self.num_rows)
+        return Outcome(success=success, num_frames=self.num_frames)
+
 
 def _num_rows(observed: Sequence[StoredArray], others: Sequence[StoredArray]) -> int:
     """Of an episode: observations may have one more than actions, what the last action led to.
@@ -145,60 +191,12 @@ def _num_rows(observed: Sequence[StoredArray], others: Sequence[StoredArray]) ->
     return num_rows
 
 
-def _write(plans: Sequence[_Plan], mapping: SourceMapping, out: Path, video: VideoConfig) -> int:
-    """Record what is not there; how many episodes that were."""
-    with open_external_run(out, recovers=False) as folder:
-        missing = [plan for plan in plans if not folder.has(plan.info)]
-        for plan in missing:
-            with ForeignFile(plan.path) as file, _named(plan.path):
-                episode = _Stored(file, plan.place, mapping)
-                pictures = {camera.name: camera.pictures() for camera in episode.cameras}
-                outcome = Outcome(success=plan.success, num_frames=plan.num_frames)
-                write_frames(folder, plan.info, episode.frames(), pictures, outcome=outcome, video=video)
-    return len(missing)
-
-
-class _Plan:
-    """What an episode shall be; every number is looked at."""
-
-    def __init__(
-        self, file: ForeignFile, place: str, mapping: SourceMapping, urdf: str, source: SourceFile, episode_index: int
-    ) -> None:
-        self.path, self.place = file.path, place
-        with _named(file.path):
-            episode = _Stored(file, place, mapping)
-            for _ in episode.frames():
-                pass
-            if attribute := mapping.robot.urdf_attribute:
-                urdf = str(found_attribute(file, place, attribute) or "")
-            try:
-                joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf or attribute else set()
-            except ValueError as error:
-                raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
-            self.info = EpisodeInfo(
-                episode_index=episode_index,
-                instruction=task_of(file, place, mapping),
-                robot=mapping.robot.name,
-                urdf=urdf,
-                fps=rate_of(file, place, mapping),
-                features=tuple(feature.described(joints) for feature in episode.features),
-                cameras=tuple(camera.described() for camera in episode.cameras),
-                origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
-                versions={"demorec": version("demorec"), "av": version("av")},
-            )
-            if wrong := find_problems(self.info):
-                raise Hdf5FitError("; ".join(wrong))
-            self.num_frames, self.has_last = episode.num_frames, episode.has_last
-            self.success = success_of(file, place, mapping, episode.num_rows)
-            self.told = {camera.name: f"{camera.width}x{camera.height}, {camera.told}" for camera in episode.cameras}
-
-
-def _make_alike(plan: _Plan, first: _Plan) -> None:
-    """Let an episode share the first one's model, a long text, in memory; ConfigError when it differs."""
-    if different := differences(first.info, plan.info):
-        name = f"{plan.place} of {plan.path}" if plan.place else str(plan.path)
+def _alike(info: EpisodeInfo, first: EpisodeInfo, file: ForeignFile, place: str) -> EpisodeInfo:
+    """An episode that shares the first one's model, a long text, in memory; ConfigError when it differs."""
+    if different := differences(first, info):
+        name = f"{place} of {file.path}" if place else str(file.path)
         raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
-    plan.info = replace(plan.info, urdf=first.info.urdf)
+    return replace(info, urdf=first.urdf)
 
 
 def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str, str]:

@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 from demorec.core.plain import digest
-from demorec.core.registry import nearest_match
-from demorec.episode.validity import MAX_CAMERAS, MAX_FEATURES
 
 SourceKind = Literal["bag", "hdf5"]
 Unit = Literal["", "rad", "degree", "percent", "m", "mm"]
@@ -285,131 +283,6 @@ class SourceMapping:
         named = parts | {camera.dataset for camera in self.cameras.values()} | {self.episodes.success}
         return frozenset(name.strip("/") for name in named)
 
-    def problems(self) -> Iterator[str]:
-        """What is impossible in it, whatever the bag or file."""
-        yield from self._feature_problems()
-        if ACTION not in self.features:
-            what = "topic" if self.kind == "bag" else "dataset"
-            yield f"there is no feature 'action': name its {what}, or next = \"observation.state\""
-        yield from self._camera_problems()
-        if not self.robot.name.strip():
-            yield "robot.name is empty"
-        task, clock = self.task, self.clock
-        elsewhere = "topic" if self.kind == "bag" else "attribute"
-        if (bool(task.text.strip()) + bool(task.topic or task.attribute) + task.file_name) != 1:
-            yield f"[task] needs one of text, {elsewhere} and file_name"
-        if self.robot.urdf and (self.robot.urdf_topic or self.robot.urdf_attribute):
-            yield f"robot.urdf and robot.urdf_{elsewhere} are both given, one is enough"
-        if not (clock.fps == 0 and self.kind == "hdf5") and not 1 <= clock.fps <= MAX_FPS:
-            yield f"clock.fps is {clock.fps}, allowed are 1 to {MAX_FPS}"
-        if self.kind == "bag":
-            yield from self._bag_problems()
-            return
-        for name in sorted(filter(self.leaves_out, self.datasets)):
-            yield f"leave_out leaves out {name!r}, which the mapping names"
-        if self.episodes.mask and not self.episodes.group:
-            yield "episodes.mask chooses among the episodes of a group, but episodes.group is empty"
-
-    def _feature_problems(self) -> Iterator[str]:
-        if len(self.features) > MAX_FEATURES:
-            yield f"there are {len(self.features):,} features, allowed are up to {MAX_FEATURES}"
-            return
-        if STATE not in self.features:
-            yield f'there is no feature {STATE!r}: write [[features."{STATE}"]] and what it is taken from'
-        for name, sources in self.features.items():
-            if "/" in name or not name or name.startswith("observation.images"):
-                yield f"a feature cannot be called {name!r}"
-            if not sources:
-                yield f"the feature {name!r} has no source"
-            for source in sources:
-                yield from _element_problems(f"the feature {name!r}", source)
-                yield from self._next_problems(name, source)
-                yield from _place_problems(f"the feature {name!r}", source, self.kind)
-
-    def _next_problems(self, name: str, source: Source) -> Iterator[str]:
-        if not source.next:
-            return
-        place, known = f"the feature {name!r}", [other for other in self.features if other != name]
-        if len(self.features[name]) > 1:
-            yield f"{place} has other sources beside next"
-        if source.next == STATE and STATE not in self.features:
-            return  # said already
-        if source.next not in known:
-            yield f"{place} follows {source.next!r}, which is no feature.{nearest_match(source.next, known)}".rstrip(
-                "."
-            )
-        elif any(other.next for other in self.features[source.next]):
-            yield f"{place} follows {source.next!r}, which follows another feature itself"
-
-    def _camera_problems(self) -> Iterator[str]:
-        if len(self.cameras) > MAX_CAMERAS:
-            yield f"there are {len(self.cameras):,} cameras, allowed are up to {MAX_CAMERAS}"
-            return
-        for name, camera in self.cameras.items():
-            if not name.isidentifier():
-                yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"
-            if not (camera.topic or camera.dataset):
-                yield f"cameras.{name} needs a {'topic' if self.kind == 'bag' else 'dataset'}"
-            yield from _age_problems(f"cameras.{name}", camera.max_age_s)
-
-    def _bag_problems(self) -> Iterator[str]:
-        task, clock, episodes = self.task, self.clock, self.episodes
-        yield from _age_problems("clock", clock.max_age_s)
-        fields = {task.topic: task.field, **({episodes.topic: episodes.field} if episodes.cut == "marker" else {})}
-        if self.subtasks.topic and fields.get(self.subtasks.topic, self.subtasks.field) != self.subtasks.field:
-            yield f"subtasks.field is {self.subtasks.field!r}, but another field of the same topic is taken for texts"
-        if episodes.cut == "marker" and not episodes.topic:
-            yield 'episodes.cut = "marker" needs episodes.topic'
-        given = (bool(episodes.topic), bool(episodes.start_topic), bool(episodes.stop_topic))
-        if episodes.cut == "service" and given not in ((True, False, False), (False, True, True)):
-            yield 'episodes.cut = "service" needs either episodes.topic, or start_topic and stop_topic'
-        if episodes.cut != "service" and any(given[1:]):
-            yield 'episodes.start_topic and stop_topic are for episodes.cut = "service" alone'
-        if episodes.cut == "times" and not episodes.times_s:
-            yield 'episodes.cut = "times" needs episodes.times_s'
-        if any(not begin < end for begin, end in episodes.times_s):
-            yield "episodes.times_s has an episode that ends before it begins"
-        if not 0 < episodes.gap_s <= MAX_SECONDS:
-            yield f"episodes.gap_s is {episodes.gap_s:g}, it must be above 0 and at most {MAX_SECONDS:g}"
-        if not 0 <= clock.max_trim_s <= MAX_SECONDS:
-            yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
-        if any(not -MAX_SECONDS <= time <= MAX_SECONDS for times in episodes.times_s for time in times):
-            yield f"episodes.times_s has a time beyond {MAX_SECONDS:g} s"
-
-
-def _age_problems(place: str, age: float | None) -> Iterator[str]:
-    if age is not None and not 0 < age <= MAX_SECONDS:
-        yield f"{place}.max_age_s is {age:g}, it must be above 0 and at most {MAX_SECONDS:g}"
-
-
-def _place_problems(place: str, source: Source, kind: SourceKind) -> Iterator[str]:
-    """What is impossible in where a source's numbers are."""
-    what = "topic" if kind == "bag" else "dataset"
-    if bool(source.topic or source.dataset) == bool(source.next):
-        yield f"{place} needs either a {what} or next in each of its {'sources' if kind == 'bag' else 'parts'}"
-    if source.topic and not source.field:
-        yield f"{place} needs the field of {source.topic}"
-    if source.joints and source.elements:
-        yield f"{place} picks elements of {source.topic} both by joints and by elements"
-    if len(set(source.joints)) != len(source.joints):
-        yield f"{place} names a joint of {source.topic} twice"
-    yield from _age_problems(place, source.max_age_s)
-
-
-def _element_problems(place: str, source: Source) -> Iterator[str]:
-    """What is impossible in which numbers are taken, and in their units."""
-    if len(set(source.elements)) != len(source.elements):
-        yield f"{place} names an element twice"
-    if any(element < 0 for element in source.elements):
-        yield f"{place} names an element below 0"
-    pair = (source.unit, source.to or source.unit)
-    if pair not in _CONVERSIONS and pair[0] != pair[1]:
-        yield f"{place} cannot turn {source.unit or 'no unit'} into {source.to}"
-    if "percent" in pair and pair[0] != pair[1] and not source.limits:
-        yield f"{place} needs limits, since -100..100 stands for each joint's own range"
-    if any(not low < high for low, high in source.limits):
-        yield f"{place} has limits that are not [lowest, highest]"
-
 
 def _said(value: Any, kind: SourceKind) -> Any:
     """Of a mapping as plain data what is for its kind of source."""
@@ -421,7 +294,7 @@ def _said(value: Any, kind: SourceKind) -> Any:
     return [_said(item, kind) for item in value] if isinstance(value, tuple) else value
 
 
-_CONVERSIONS: Mapping[tuple[str, str], float] = {
+CONVERSIONS: Mapping[tuple[str, str], float] = {
     ("degree", "rad"): math.pi / 180,
     ("rad", "degree"): 180 / math.pi,
     ("mm", "m"): 1e-3,
@@ -435,7 +308,7 @@ _CONVERSIONS: Mapping[tuple[str, str], float] = {
 
 def conversion_factor(unit: str, to: str) -> float | None:
     """What numbers are multiplied with; None for not at all, NaN where `Source.limits` say it for each element."""
-    return _CONVERSIONS.get((unit, to or unit))
+    return CONVERSIONS.get((unit, to or unit))
 
 
 def recorded_unit(unit: str) -> str:

@@ -10,7 +10,6 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.core.errors import ConfigError
@@ -33,19 +32,6 @@ _MOST_SHOWN = 6
 _NEEDS_MAPPING: tuple[PathKind, ...] = ("hdf5", "rosbag")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Opened:
-    """What is to be read in the place of a path.
-
-    Attributes:
-        source: As the user named it.
-        path: A run of its episodes, or the path itself where that is read as it is.
-    """
-
-    source: Path
-    path: Path
-
-
 @contextmanager
 def opened(
     paths: Sequence[Path],
@@ -53,8 +39,8 @@ def opened(
     *,
     imports_datasets: bool,
     tell: Callable[[str], None],
-) -> Iterator[list[Opened]]:
-    """Give each path as something that holds recordings, or as a dataset.
+) -> Iterator[list[Path]]:
+    """Give for each path a run of its episodes, or the path itself where that is read as it is.
 
     Args:
         paths: Recordings, runs, folders of recordings, datasets, HDF5 files, bags and folders of bags.
@@ -75,7 +61,7 @@ def opened(
         found = []
         for number, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
             if kind is None:
-                found.append(Opened(source=path, path=path))
+                found.append(path)
                 continue
             run = Path(folder) / str(number) / path.resolve().name
             run.parent.mkdir()
@@ -85,7 +71,7 @@ def opened(
             else:
                 chosen = mapping or _suggested(path, kind, Path(folder) / f"{number}.toml", tell)
                 _import(path, kind, chosen, run, tell)
-            found.append(Opened(source=path, path=run))
+            found.append(run)
         yield found
 
 

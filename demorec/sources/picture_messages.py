@@ -331,15 +331,6 @@ def _parameter_sets(codec: str, data: bytes) -> bytes:
     return b"".join(data[at:end] for (kind, at), end in zip(units, places, strict=True) if kind in kinds)
 
 
-def decode_video(codec: str, packets: Iterable[bytes]) -> Iterator[NDArray[np.uint8]]:
-    """The images of packets, from a keyframe on; FieldError when they cannot be decoded."""
-    for frame in _frames(codec, packets):
-        try:
-            yield cast(NDArray[np.uint8], frame.to_ndarray(format="rgb24"))
-        except (av.FFmpegError, ValueError) as error:
-            raise FieldError(f"its {codec} video cannot be decoded") from error
-
-
 def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
     try:
         context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[codec], "r"))

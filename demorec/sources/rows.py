@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.external import DEPTH_UNITS
+from demorec.episode.external import DEPTH_UNITS, Kept
 from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline
 from demorec.sources.episodes import Window
 from demorec.sources.mapping import ROWS, CameraSource, Sampling, Source, SourceMapping
+from demorec.sources.picture_messages import KEPT_FORMATS, VIDEO_FORMATS, PictureHead
 from demorec.sources.streams import BagStreams, Stream
 
 RATE = 0.05
@@ -52,17 +53,47 @@ class FeatureRows:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraRows:
-    """A camera of an episode.
+    """The images that an episode takes of a camera.
 
     Attributes:
-        numbers: (R,) which message of its topic each row shows, from 0.
-        index: (R,) which message of its stream that is.
-        ages_ns: (R,) as in `Chosen`.
+        topic: Of them.
+        head: Of the first.
+        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are encoded
+            once.
+        taken: (P,) which of the topic's messages are taken, in the order of their times.
+        stamps_ns: (P,) their times.
+        positions: (R,) which of the taken ones each row shows.
     """
 
-    numbers: Int
-    index: Int
-    ages_ns: Int
+    topic: str
+    head: PictureHead
+    kept: Kept
+    taken: Int
+    stamps_ns: Int
+    positions: Int
+
+    @property
+    def numbers(self) -> Int:
+        """(R,) which of the topic's messages each row shows."""
+        return self.taken[self.positions]
+
+    @property
+    def num_bytes(self) -> int:
+        """Of one in memory: of its pixels, or about those of what stays encoded."""
+        pixels = self.head.width * self.head.height
+        return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
+
+    @property
+    def told(self) -> str:
+        """What becomes of them, for people."""
+        shown = len(np.unique(self.positions))
+        what = f"{len(self.taken)} images {self.head.width}x{self.head.height}, "
+        kind = self.head.encoding if self.head.format == "raw" else self.head.format
+        what += f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
+        repeated = len(self.positions) - shown
+        rows = "row shows" if repeated == 1 else "rows show"
+        what += f", {repeated} {rows} the image of the row before" if repeated else ""
+        return what + (f", {len(self.taken) - shown} shown by no row" if len(self.taken) > shown else "")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +104,7 @@ class EpisodeRows:
         window: Where it is in the bag.
         times_ns: (R,) of the rows, by the mapping's clock.
         features: Name -> feature.
-        cameras: Name -> camera.
+        cameras: Name -> its images.
         trimmed_ns: How much of the window's beginning and end no row covers.
         follows: Of whose messages each has a row ("camera front"); "" for a grid.
     """
@@ -145,14 +176,7 @@ class Timelines:
             if any(source.next for source in sources):
                 features[name] = _next_of(features[sources[0].next], times)
                 count = len(times) - 1
-        cameras = {
-            name: CameraRows(
-                numbers=self.lines[name].stream.numbers[self.lines[name].order[chosen[name].index]][:count],
-                index=self.lines[name].order[chosen[name].index][:count],
-                ages_ns=chosen[name].age_ns[:count],
-            )
-            for name in self.mapping.cameras
-        }
+        cameras = {name: _camera(self.lines[name], chosen[name].index[:count]) for name in self.mapping.cameras}
         return EpisodeRows(
             window=window,
             times_ns=times[:count],
@@ -322,6 +346,27 @@ class Timelines:
             units=tuple(units),
             ages_ns=np.max(np.stack(ages), axis=0),
         )
+
+
+def _camera(line: Timeline, shown: Int) -> CameraRows:
+    """Of a camera that shows these images (R,) of its timeline: of video all are taken from the keyframe before on."""
+    stream, taken = line.stream, np.unique(shown)
+    head = stream.heads[int(line.order[shown[0]])]
+    if head.format in VIDEO_FORMATS:
+        first = int(taken[0])
+        while not stream.heads[int(line.order[first])].is_keyframe:
+            first -= 1
+        head = stream.heads[int(line.order[first])]
+        taken = np.arange(first, int(taken[-1]) + 1)
+    kept = head.encoding if head.encoding in DEPTH_UNITS else head.format if head.format in KEPT_FORMATS else ""
+    return CameraRows(
+        topic=stream.topic,
+        head=head,
+        kept=cast(Kept, kept),
+        taken=np.asarray(stream.places)[line.order[taken]],
+        stamps_ns=line.times_ns[taken],
+        positions=np.searchsorted(taken, shown),
+    )
 
 
 def _from_keyframe(line: Timeline) -> Timeline:

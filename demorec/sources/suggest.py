@@ -22,14 +22,13 @@ from demorec.mcap.limits import SpentError
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.bag_files import BagError, BagMessage
 from demorec.sources.candidates import Vector, transforms_of, vectors_of
-from demorec.sources.choice import Choice, choose_features
+from demorec.sources.choice import choose_features
 from demorec.sources.clock import NS, SKEW_S
-from demorec.sources.decoding import UnknownEncodingError
+from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import FieldError, follow, stamp_of
 from demorec.sources.mapping import Clock
 from demorec.sources.picture_messages import PictureHead, picture_head
 from demorec.sources.ros_types import Values
-from demorec.sources.streams import BagDecoder
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
 _KEPT = 64
@@ -111,11 +110,11 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
         for name, topic in sorted(topics.items())
         for vector in _vectors(name, topic)
     ]
-    choice = choose_features(vectors)
+    state, action, others, warning = choose_features(vectors)
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
-    if choice.warning:
-        tell(choice.warning)
-        lines += [f"# ATTENTION: {choice.warning}", "#"]
+    if warning:
+        tell(warning)
+        lines += [f"# ATTENTION: {warning}", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
     lines += list(_listed(topics))
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
@@ -124,8 +123,8 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
-    lines += ["", "[clock]", *_clock(topics, cameras, [*choice.state, *choice.action])]
-    lines += [*_services(topics), *_subtasks(topics), *_features(choice)]
+    lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action])]
+    lines += [*_services(topics), *_subtasks(topics), *_features(state, action, others)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
         lines += [] if topics[topic].has_stamp else [_LOG]
@@ -330,28 +329,28 @@ def _services(topics: Mapping[str, _Topic]) -> Iterator[str]:
         yield f"# topic = {quoted(name)}"
 
 
-def _features(choice: Choice) -> Iterator[str]:
-    yield from _chosen("observation.state", choice.state)
-    if not choice.state:
+def _features(state: Sequence[Vector], action: Sequence[Vector], others: Sequence[Vector]) -> Iterator[str]:
+    yield from _chosen("observation.state", state)
+    if not state:
         yield from ("", "# No topic is known to hold the robot's state.")
-    yield from _chosen("action", choice.action)
-    if not choice.action:
-        offers = any(vector.role == "action" for vector in choice.others)
+    yield from _chosen("action", action)
+    if not action:
+        offers = any(vector.role == "action" for vector in others)
         found = (
             "No topic is sure to be the command (see those below)" if offers else "No topic says that it is a command"
         )
         yield from ("", f"# {found}, so the next state is the action.")
         yield from ("[[features.action]]", 'next = "observation.state"')
-    poses = [vector for vector in choice.others if vector.kind == "pose" and vector.role != "action"]
+    poses = [vector for vector in others if vector.kind == "pose" and vector.role != "action"]
     poses = [vector for vector in poses if vector.is_robot] or poses
-    is_sure = bool(choice.state) and len({vector.topic for vector in poses}) == 1 and poses[0].field == "pose"
+    is_sure = bool(state) and len({vector.topic for vector in poses}) == 1 and poses[0].field == "pose"
     for vector in poses if is_sure else ():
         yield from _source("observation.ee_pose", vector, prefix="")
-    offered = [vector for vector in choice.others if not (is_sure and vector in poses)]
+    offered = [vector for vector in others if not (is_sure and vector in poses)]
     offered.sort(key=lambda vector: vector.field.startswith("transforms["))
     for vector in offered[:_MAX_OFFERED]:
         name = {"state": "observation.state", "action": "action"}.get(vector.role, "observation.extra")
-        name = "observation.state" if not choice.state and not vector.role else name
+        name = "observation.state" if not state and not vector.role else name
         for line in _source(name, vector, prefix=""):
             yield f"# {line}" if line else ""
     if len(offered) > _MAX_OFFERED:

@@ -16,9 +16,8 @@ from support import bags
 
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.bag_files import BagChannel, BagError
-from demorec.sources.decoding import UnknownEncodingError, decoder_of
+from demorec.sources.decoding import BagDecoder, UnknownEncodingError, decoder_of
 from demorec.sources.fields import stamp_of
-from demorec.sources.streams import BagDecoder
 
 
 def _read(bag: Bag) -> tuple[list[tuple[str, int, dict[str, Any]]], list[str]]:

@@ -83,10 +83,11 @@ def test_each_row_holds_the_right_message(name: str, tmp_path: Path) -> None:
             assert rows.values[row].tobytes() == expected.tobytes()
             assert rows.ages_ns[row] == max(time_ns - note.header_ns for note in taken)
     for camera, source in mapping.cameras.items():
+        shown = episode.cameras[camera]
         for row, time_ns in enumerate(episode.times_ns.tolist()):
             number, note = _latest(bags.of_topic(notes, source.topic), time_ns)
-            assert episode.cameras[camera].numbers[row] == number
-            assert episode.cameras[camera].ages_ns[row] == time_ns - note.header_ns
+            assert shown.numbers[row] == number
+            assert shown.stamps_ns[shown.positions[row]] == note.header_ns
 
 
 def _so101(tmp_path: Path, notes: bags.Notes, *changes: tuple[str, str]) -> list[EpisodeRows]:

@@ -14,7 +14,7 @@ from demorec.check.run import ExternalRun
 from demorec.core.tables import CHECKS
 from demorec.sources.bag import open_bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.findings import all_findings
+from demorec.sources.bag_findings import all_findings
 from demorec.sources.import_run import import_bags
 from demorec.sources.mapping_file import read_mapping
 from demorec.sources.rows import Timelines

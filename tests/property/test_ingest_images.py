@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_right
 from collections.abc import Callable
 from fractions import Fraction
@@ -12,12 +13,12 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from demorec.sources.bag_findings import all_findings, row_findings
 from demorec.sources.episodes import Window
-from demorec.sources.fields import layout_of
-from demorec.sources.findings import all_findings
-from demorec.sources.import_run import row_findings
+from demorec.sources.fields import SourceReader, layout_of
 from demorec.sources.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
 from demorec.sources.picture_messages import PictureHead, PictureHeads
+from demorec.sources.ros_types import Budgets
 from demorec.sources.rows import EpisodeRows, Timelines
 from demorec.sources.streams import BagStreams, Stream
 
@@ -45,16 +46,16 @@ def _stream(label: str, times: list[int], *, is_camera: bool) -> Stream:
     heads = PictureHeads()
     for _ in times if is_camera else ():
         heads.append(PictureHead("jpeg", "", 64, 48, True))
-    stamps = np.array(times)
-    return Stream(
-        label=label, topic=f"/{label}", type="", log_ns=stamps + 1_000_000, header_ns=stamps,
-        numbers=np.arange(len(times)) if is_camera else np.arange(0),
-        values=None if is_camera else np.linspace(0, 1, len(times))[:, None],
-        layout=None if is_camera else layout_of(SOURCE, {"name": ["a"], "position": np.zeros(1)}),
-        heads=heads, checksums=np.arange(len(times), dtype=np.uint32),
-        picture_sums=np.arange(len(times) if is_camera else 0, dtype=np.uint32),
-        frame_ids=(), num_malformed=0, first_problem="",
-    )  # fmt: skip
+    stream = Stream(label=label, topic=f"/{label}", budgets=Budgets())
+    stream.logged, stream.stamped = array("q", [time + 1_000_000 for time in times]), array("q", times)
+    stream.sums = array("I", range(len(times)))
+    if is_camera:
+        stream.heads, stream.places, stream.image_sums = heads, array("q", range(len(times))), stream.sums
+    else:
+        stream.source, stream.dtype = SOURCE, np.dtype(np.float64)
+        stream.reader = SourceReader(SOURCE, layout_of(SOURCE, {"name": ["a"], "position": np.zeros(1)}))
+        stream.vectors = bytearray(np.linspace(0, 1, len(times)).tobytes())
+    return stream
 
 
 def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, EpisodeRows]:
@@ -66,11 +67,9 @@ def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, Episo
         features={"observation.state": (SOURCE,), "action": (SOURCE,)},
         cameras={name: CameraSource(topic=f"/{name}") for name in cameras},
     )  # fmt: skip
-    streams = BagStreams(
-        sources={(name, 0): _stream("joints", joints, is_camera=False) for name in ("observation.state", "action")},
-        cameras={name: _stream(name, times, is_camera=True) for name, times in cameras.items()},
-        infos={}, texts={}, calls={}, problems=[], num_bytes=1 << 30,
-    )  # fmt: skip
+    streams = BagStreams(mapping, num_bytes=1 << 30)
+    streams.sources = {(name, 0): _stream("joints", joints, is_camera=False) for name in mapping.features}
+    streams.cameras = {name: _stream(name, times, is_camera=True) for name, times in cameras.items()}
     lines = Timelines(streams, mapping)
     return lines, lines.rows(Window(begin_ns=joints[0], end_ns=joints[-1]))
 
@@ -112,7 +111,12 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
     assert "repeats" not in _kinds(lines, rows)
     # No later than need be: where nothing jitters, images are as good as new, but for a row after the last one.
     if not jitter:
-        assert sorted(rows.cameras["front"].ages_ns.tolist())[COUNT - 2] <= 3_000
+        assert (
+            sorted((rows.times_ns - rows.cameras["front"].stamps_ns[rows.cameras["front"].positions]).tolist())[
+                COUNT - 2
+            ]
+            <= 3_000
+        )
 
 
 @settings(max_examples=200, **PATIENT)

@@ -107,10 +107,10 @@ def reading(
     from demorec.sources.opening import opened
 
     with terminate_as_interrupt(), opened(paths, mapping, imports_datasets=imports_datasets, tell=tell) as found:
-        names = {str(one.path): str(one.source) for one in found if one.path != one.source}
+        names = {str(run): str(path) for path, run in zip(paths, found, strict=True) if run != path}
         with renamed(names) as in_users_words:
             try:
-                yield tuple(one.path for one in found)
+                yield tuple(found)
             except DemorecError as error:
                 error.args = tuple(in_users_words(part) for part in error.args)
                 raise

@@ -201,7 +201,6 @@ def _add_stream(container: OutputContainer, first: EncodedVideo) -> VideoStream:
 
 _AV1_SEQUENCE_HEADER = 1
 _AV1_TEMPORAL_DELIMITER = 2
-_H264_IDR = 5
 _PARAMETER_SETS = {"h264": (7, 8), "hevc": (32, 33, 34)}
 
 
@@ -213,10 +212,6 @@ def mp4_samples(
     Raises:
         ExportError: One of them is none.
     """
-    if codec == "h264":
-        found = _h264_samples(data, lengths)
-        if found is not None:
-            return found
     ends = [0, *accumulate(lengths.tolist())]
     units = [data[a:b] for a, b in pairwise(ends)]
     samples = [mp4_sample(codec, unit) for unit in units]
@@ -224,35 +219,6 @@ def mp4_samples(
         raise ExportError(f"A packet of the {codec} video holds no image.")
     sizes = np.array([len(sample) for sample in samples], dtype=np.int64)
     return b"".join(samples), sizes, np.array([is_keyframe(codec, unit) for unit in units], dtype=np.bool_)
-
-
-def _h264_samples(data: bytes, lengths: NDArray[np.int64]) -> tuple[bytes, NDArray[np.int64], NDArray[np.bool_]] | None:
-    """All of an episode at once; None for what encoders do not write, which one access unit at a time sorts out."""
-    values = np.frombuffer(data, dtype=np.uint8)
-    ends = np.cumsum(lengths)
-    begins = ends - lengths
-    zeros = np.flatnonzero(values[:-3] == 0)
-    codes = zeros[(values[zeros + 1] == 0) & (values[zeros + 2] == 1)]
-    unit = np.searchsorted(begins, codes, side="right") - 1
-    if not len(codes) or len(np.unique(unit)) != len(lengths):
-        return None
-    first = np.searchsorted(codes, begins)
-    gap = codes[first] - begins
-    starts, stops = codes + 3, np.minimum(np.append(codes[1:], len(values)), ends[unit])
-    if gap.max() > 1 or values[begins].any() or (starts >= stops).any():
-        return None
-    # A NAL unit never ends in a zero byte, so zeros before a start code belong to that start code.
-    while (padded := values[stops - 1] == 0).any():
-        stops = stops - padded
-    sizes = stops - starts
-    if sizes.min() < 1:
-        return None
-    view, heads = memoryview(data), sizes.astype(">u4").tobytes()
-    parts: list[bytes | memoryview] = []
-    for number, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True)):
-        parts += (heads[4 * number : 4 * number + 4], view[start:stop])
-    is_idr = (values[starts] & 31) == _H264_IDR
-    return b"".join(parts), np.add.reduceat(sizes + 4, first), np.logical_or.reduceat(is_idr, first)
 
 
 def mp4_sample(codec: str, access_unit: bytes) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition, next_position
 from demorec.datasets.staging import sync_file
 
+_ROWS_PER_TABLE = 100
 _ROWS_PER_GROUP = 4096
 _BYTES_PER_GROUP = 2 * MEBIBYTE
 """Tables are collected up to so many rows or bytes: a row group costs a writer and a reader far more than its rows."""
@@ -53,6 +54,7 @@ class RollingParquet:
         # A dictionary of numbers that hardly repeat costs time and makes the file larger.
         self._dictionary = True if repeating is None else list(repeating)
         self._rows = 0
+        self._pending: list[Mapping[str, Any]] = []
         self._waiting: list[pa.Table] = []
         self._waiting_rows = 0
         self._waiting_bytes = 0
@@ -68,6 +70,18 @@ class RollingParquet:
                 self._finish_file()
                 self.position = self.position.next(self._chunks_size)
         return self.position
+
+    def add_row(self, row: Mapping[str, Any]) -> None:
+        """Append a row: so many make a table."""
+        self._pending.append(row)
+        if len(self._pending) >= _ROWS_PER_TABLE:
+            self._write_rows()
+
+    def _write_rows(self) -> None:
+        if self._pending:
+            self.make_room(len(self._pending))
+            self.write(pa.Table.from_pylist(self._pending, schema=self.schema))
+            self._pending.clear()
 
     def write(self, table: pa.Table) -> None:
         """Append a table."""
@@ -94,6 +108,7 @@ class RollingParquet:
 
     def close(self) -> None:
         """Finish the last file and make it durable; harmless when called twice."""
+        self._write_rows()
         if self._writer is not None:
             self._finish_file()
 

@@ -43,7 +43,6 @@ from demorec.mcap import AnyRecording, SimulatedRecording
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
 
-_ROWS_PER_TABLE = 100
 _POSE = pa.list_(pa.float64(), 7)
 _VECTOR = pa.list_(pa.float64())
 
@@ -208,8 +207,6 @@ class SidecarWriter:
         self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA)
         self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA)
         self._camera_poses: RollingParquet | None = None
-        self._episode_rows: list[dict[str, Any]] = []
-        self._attempt_rows: list[dict[str, Any]] = []
         self._configs: dict[str, Any] = dict(configs)
 
     def _table(self, template: str, schema: pa.Schema, repeating: Sequence[str] | None = None) -> RollingParquet:
@@ -236,7 +233,7 @@ class SidecarWriter:
         episode_index = written.episode_index
         robot = record.robot
         added = {"episode_index": episode_index, "content_digest": written.digest}
-        self._episode_rows.append({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
+        self._episodes.add_row({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
         if robot is not None:
             write_robot(self._root, robot)
         if record.config_digest or record.config:
@@ -244,14 +241,10 @@ class SidecarWriter:
         self.add_attempt(attempt, in_dataset=True)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)
-        if len(self._episode_rows) >= _ROWS_PER_TABLE:
-            self._flush_episodes()
 
     def add_attempt(self, attempt: Mapping[str, Any], *, in_dataset: bool) -> None:
         """An attempt that was seen, whether or not it is in the dataset."""
-        self._attempt_rows.append({**attempt, "in_dataset": in_dataset})
-        if len(self._attempt_rows) >= _ROWS_PER_TABLE:
-            self._flush_attempts()
+        self._attempts.add_row({**attempt, "in_dataset": in_dataset})
 
     def _add_camera_poses(self, episode_index: int, poses: Mapping[str, Array]) -> None:
         if self._camera_poses is None:
@@ -265,22 +258,8 @@ class SidecarWriter:
         self._camera_poses.make_room(frames)
         self._camera_poses.write(pa.Table.from_arrays(arrays, schema=self._camera_poses.schema))
 
-    def _flush_episodes(self) -> None:
-        if self._episode_rows:
-            self._episodes.make_room(len(self._episode_rows))
-            self._episodes.write(pa.Table.from_pylist(self._episode_rows, schema=EPISODE_SCHEMA))
-            self._episode_rows.clear()
-
-    def _flush_attempts(self) -> None:
-        if self._attempt_rows:
-            self._attempts.make_room(len(self._attempt_rows))
-            self._attempts.write(pa.Table.from_pylist(self._attempt_rows, schema=ATTEMPT_SCHEMA))
-            self._attempt_rows.clear()
-
     def finish(self, export: Mapping[str, Any]) -> Mapping[str, Any]:
         """Close the tables and write the two JSON files; return config digest -> configuration."""
-        self._flush_episodes()
-        self._flush_attempts()
         for table in (self._episodes, self._attempts, self._camera_poses):
             if table is not None:
                 table.close()

@@ -1,0 +1,260 @@
+"""What is odd between the streams of a bag, and in the rows that are made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.episode.external import DEPTH_UNITS
+from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
+from demorec.sources.fields import frame_id_of
+from demorec.sources.findings import FROZEN, GAP, LOST, NOTE, STILL_S, Finding, of_stream, stream_findings
+from demorec.sources.mapping import ACTION, STATE, SourceMapping
+from demorec.sources.rows import RATE, EpisodeRows, Timelines
+from demorec.sources.streams import BagStreams
+
+_EPOCH_S = 1e8
+"""Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
+_DEGREES = (40.0, 80.0)
+"""Times the range of the same joints, of which one is in degrees: 57, and a leader does not reach as far as its arm."""
+_FULL_TURNS = 4 * np.pi
+"""Beyond which no joint angle is in rad."""
+_SLOW = 1.15
+"""Periods of the rows, from which on a stream is called slower than they are."""
+
+
+def all_findings(lines: Timelines) -> tuple[Finding, ...]:
+    """What is odd in a bag, each thing once."""
+    once: dict[tuple[str, str], Finding] = {}
+    for finding in _findings(lines, list(lines.lines.values())):
+        once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
+    return tuple(once.values())
+
+
+def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    skews = _comparable_skews(lines)
+    for line in lines:
+        yield from stream_findings(line, skews[line])
+    for problem in bag.streams.problems:
+        yield Finding(kind="cut_off", stream="", text=problem)
+    yield from _joint_findings([line for line in lines if line.is_regular])
+    yield from _extent_findings([line for line in lines if line.is_regular])
+    yield from _offset_findings(lines)
+    yield from _mixed_findings(bag, lines)
+    yield from _camera_findings(bag.streams)
+    yield from _slow_findings(lines, bag.mapping.clock.fps)
+    yield from _unit_findings(bag.streams, bag.mapping)
+    yield from _action_findings(bag.streams, bag.mapping)
+
+
+def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
+    """(K,) of each stream: time of recording minus that of the header, nanoseconds.
+
+    Where all headers count from another beginning than times of recording (simulated time), that difference says
+    nothing of a single stream: then it is the one to the difference of the stream that has most messages.
+    """
+    skews: dict[Timeline, Numbers] = {line: line.skews_ns.astype(np.float64) for line in lines}
+    known = [line for line in lines if len(line.skews_ns)]
+    if not known or any(abs(np.median(line.skews_ns)) < _EPOCH_S * NS for line in known):
+        return skews
+    usual = max(known, key=lambda line: len(line.skews_ns))
+    stamps = usual.stream.header_ns[usual.stream.header_ns > 0]
+    order = np.argsort(stamps, kind="stable")
+    for line in known:
+        own = line.stream.header_ns[line.stream.header_ns > 0]
+        skews[line] = line.skews_ns - np.interp(own, stamps[order], usual.skews_ns[order])
+    return skews
+
+
+def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+    """What goes by the time of recording where other streams go by headers, and these are of another clock."""
+    skews = [float(np.median(line.skews_ns)) / NS for line in lines if line.is_header]
+    if not skews or abs(usual := float(np.median(skews))) <= SKEW_S:
+        return
+    text = f'goes by times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
+    for line in (line for line in lines if not line.is_header):
+        yield of_stream(line.stream, "clock_offset", text)
+    for topic, texts in bag.streams.texts.items():
+        if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
+            yield Finding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
+
+
+def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
+    """Joints that stop coming while others of their topic, or the same ones from another publisher, go on."""
+    for line in regular:
+        joints = line.stream.layout.joints if line.stream.layout else ()
+        key = (line.stream.topic, line.is_header)
+        others = [other for other in regular if (other.stream.topic, other.is_header) == key]
+        early = max(int(other.times_ns[-1]) for other in others) - int(line.times_ns[-1])
+        if joints and early > GAP * line.period_ns:
+            told = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")
+            text = f"{told} stop {early / NS:.2f} s before other joints of the topic"
+            yield of_stream(line.stream, "early_end", text)
+
+
+def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
+    if len(regular) < 2:
+        return
+    begin = float(np.median([line.times_ns[0] for line in regular]))
+    end = float(np.median([line.times_ns[-1] for line in regular]))
+    for line in regular:
+        late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
+        if late > STILL_S:
+            yield of_stream(line.stream, "late_start", f"begins {late:.2f} s late")
+        if early > STILL_S:
+            yield of_stream(line.stream, "early_end", f"ends {early:.2f} s early")
+
+
+def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+    """Streams whose headers are on another clock than those of most."""
+    skews = {line.stream.label: float(np.median(line.skews_ns)) / NS for line in lines if len(line.skews_ns)}
+    if len(skews) < 2:
+        return
+    usual = float(np.median(list(skews.values())))
+    for label, skew in skews.items():
+        if abs(skew - usual) > SKEW_S:
+            text = f"its clock is off by {usual - skew:+.3f} s against that of the other streams"
+            yield Finding(kind="clock_offset", stream=label, text=text)
+
+
+def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
+    """Cameras whose messages are those of another one, by coordinate frame or image."""
+    for name, stream in streams.cameras.items():
+        frame = frame_id_of(streams.infos.get(name, {}))
+        if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
+            text = f"its images are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
+            yield of_stream(stream, "swapped", text)
+        elif stream.heads[0].encoding not in DEPTH_UNITS and (other := _claimed_by(name, streams)):  # registered to one
+            text = f"its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
+            yield of_stream(stream, "swapped", text)
+    for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
+        shared = min(len(stream), len(other_stream))
+        if shared >= FROZEN and np.mean(np.isin(stream.image_sums, other_stream.image_sums)) > 0.9:
+            text = f"{stream.topic} and {other_stream.topic} show the same images"
+            yield Finding(kind="same_pictures", stream=f"camera {name}, camera {other_name}", text=text)
+
+
+def _claimed_by(name: str, streams: BagStreams) -> str:
+    """The camera to whose topic a camera's coordinate frame belongs by its words, where it is not its own."""
+
+    def words(text: str) -> set[str]:
+        return {word for word in text.lower().replace("/", " ").replace("_", " ").split() if word not in _COMMON}
+
+    stream = streams.cameras[name]
+    frame = words(stream.frame_ids[0]) if stream.frame_ids else set()
+    own = words(stream.topic)
+    for other, other_stream in streams.cameras.items():
+        theirs = words(other_stream.topic)
+        if other != name and frame & (theirs - own) and not frame & (own - theirs):
+            return f"camera {other}"
+    return ""
+
+
+_COMMON = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "optical", "frame", "link", "rgb", "depth"}
+
+
+def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
+    """Streams that are slower than the rows; cameras only where none has an image for each row."""
+    regular = [line for line in lines if line.is_regular]
+    slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
+    is_filmed = any(line.stream.heads and line not in slow for line in regular)
+    for line in slow:
+        rate = NS / line.period_ns
+        if not line.stream.heads:
+            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times")
+        elif not is_filmed:
+            advice = f"use fps = {max(1, round(rate))}"
+            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
+
+
+def _unit_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
+    for (name, index), stream in streams.sources.items():
+        source = mapping.features[name][index]
+        if stream.values is None or source.next or (source.to or source.unit) != "rad":
+            continue
+        largest = float(np.nanmax(np.abs(stream.values), initial=0.0))
+        if largest > _FULL_TURNS:
+            yield of_stream(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
+
+
+def _action_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
+    """State and action that do not speak of the same thing."""
+    if any(source.next for source in mapping.features[ACTION]):
+        return
+    state, action = streams.sources[STATE, 0], streams.sources[ACTION, 0]
+    if state.values is None or action.values is None or state.layout is None or action.layout is None:
+        return
+    shared = [(state.layout.names.index(name), column) for column, name in enumerate(action.layout.names)
+              if name in state.layout.names]  # fmt: skip
+    moving = [pair for pair in shared if _spread(action.values[:, pair[1]]) > 0.05]
+    dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]
+    if dead:
+        name = state.layout.names[dead[0][0]]
+        yield of_stream(state, "stuck", f"{name!r} never changes while the action of the same name does")
+    ratios = [_spread(state.values[:, ours]) / _spread(action.values[:, theirs]) for ours, theirs in moving]
+    ratio = float(np.median(ratios)) if len(ratios) > 1 else 1.0
+    wide, narrow = (state, action) if ratio > 1 else (action, state)
+    if _DEGREES[0] < max(ratio, 1 / max(ratio, 1e-9)) < _DEGREES[1]:
+        text = f"in degrees, it seems: joints move {max(ratio, 1 / ratio):.3g} times as far as those of {narrow.topic}"
+        yield of_stream(wide, "unit", text)
+
+
+def _spread(numbers: NDArray[Any]) -> float:
+    finite: Int = numbers[np.isfinite(numbers)]
+    return float(np.ptp(finite)) if len(finite) else 0.0
+
+
+def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+    """What is odd in the rows of a bag's episodes, each thing once."""
+    fps = lines.mapping.clock.fps
+    for rows in (rows for rows in episodes if rows.follows and len(rows.times_ns) > 1):
+        steps = np.diff(rows.times_ns)
+        rate = NS / float(steps[steps <= LOST * np.median(steps)].mean())
+        if abs(rate - fps) > RATE * fps:
+            text = f"rows follow its messages, {rate:.1f} a second, fps says {fps}"
+            yield Finding(kind="fps", stream=rows.follows, text=text)
+            break
+    for name in lines.mapping.cameras if episodes else ():
+        yield from _use_findings(name, lines, episodes)
+
+
+def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+    """What becomes of a camera's images: a finding where rows could show more of them, else a note."""
+    line, clock = lines.lines[name], lines.mapping.clock
+    num_repeated = num_free = num_skipped = num_images = 0
+    for rows in episodes:
+        shown = lines.chosen(name, rows.times_ns).index
+        steps = np.diff(shown)
+        repeated = shown[1:][steps == 0]
+        num_repeated += len(repeated)
+        # Not those where an image is missing, or the stream is at its end; and an episode may begin between two images.
+        repeated = repeated[repeated < len(line.times_ns) - 1]
+        waits = line.times_ns[repeated + 1] - line.times_ns[repeated]
+        num_free += max(0, int(np.sum(waits <= LOST * line.period_ns)) - 1)
+        num_skipped += int(np.maximum(steps - 1, 0).sum())
+        num_images += int(shown[-1] - shown[0]) + 1
+    num_rows = sum(len(rows.times_ns) for rows in episodes)
+    rate = NS / max(line.period_ns, 1)
+    repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows show the image before"
+    skips = f"{100 * num_skipped / num_images:.3g} % of its images are in no row"
+    if min(num_free, num_skipped):  # where a row repeats and another skips, other rows would lose nothing
+        advice = 'use rows = "camera"'
+        if abs(rate - clock.fps) > max(RATE * clock.fps, 0.5):
+            advice = f"use fps = {max(1, round(rate))}"
+        elif clock.rows == "camera":
+            advice = "they come too unevenly for these rows"
+        yield of_stream(line.stream, "repeats", f"{repeats} and {skips}: {advice}")
+    elif max(num_free / num_rows, num_skipped / num_images) > RATE:
+        told = f"{repeats if num_free else skips}, since it comes {rate:.1f} times a second and rows {clock.fps} times"
+        # Every second image can be meant; now the next one and now the one after it only beside a slower camera.
+        is_uneven = abs(rate / clock.fps - round(rate / clock.fps)) > RATE
+        if num_skipped and is_uneven and not any(rows.follows for rows in episodes):
+            yield of_stream(line.stream, "skips", f"{told}: use fps = {max(1, round(rate))}")
+        else:
+            yield of_stream(line.stream, NOTE, told)
+    elif num_skipped and (follows := next((rows.follows for rows in episodes if rows.follows), "")):
+        yield of_stream(line.stream, NOTE, f"{skips}: rows follow {follows}")
