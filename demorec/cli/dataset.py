@@ -27,8 +27,8 @@ _COMMANDS = (
 class Dataset:
     """Edit LeRobot datasets (v3.0, v2.1), whoever wrote them: no image is encoded again, the sources stay as they are.
 
-    Commands: select and drop episodes (--where, --episodes); trim them (--head, --tail, --idle); split (--shares); merge
-    datasets (--mapping); rename OLD=NEW...; drop-features NAME...; set-task; reorder (--by, --order); shuffle.
+    Commands: select and drop episodes (--where, --episodes); trim them (--head, --tail, --idle); split (--shares);
+    merge datasets (--mapping); rename OLD=NEW...; drop-features NAME...; set-task; reorder (--by, --order); shuffle.
 
     A condition compares columns of the table of episodes or of demorec's sidecar, and episode_index, num_frames,
     duration_s, task: success and num_frames < 300; "cube" in task.
