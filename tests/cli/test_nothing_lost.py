@@ -108,7 +108,7 @@ def test_editing_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.Capt
     before = files_of(place.parent)
     arguments = ("dataset", "select", place / "dataset", "--episodes", "0", "--out", place / target)
     assert exit_code(*arguments, "--overwrite") == 2
-    assert TARGETS[target] in capsys.readouterr().err
+    assert len(capsys.readouterr().err.splitlines()) == 1
     assert exit_code(*arguments) == 2
     assert exit_code(*arguments[:-1], place / "dataset", "--overwrite") == 2  # the source itself
     assert files_of(place.parent) == before
