@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, ExportError
 from demorec.core.registry import check_choice
 
 if TYPE_CHECKING:
     from demorec.datasets.editing.plan import Plan, Source
 
 _COMMANDS = (
-    "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle",
+    "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle", "diff",
 )  # fmt: skip
+_SHOWN = 20
+"""Differences of each level that are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +31,7 @@ class Dataset:
 
     Commands: select and drop episodes (--where, --episodes); trim them (--head, --tail, --idle); split (--shares);
     merge datasets (--mapping); rename OLD=NEW...; drop-features NAME...; set-task; reorder (--by, --order); shuffle.
+    diff A B says in what two datasets differ, wherever their episodes lie (exit code 0: nothing, 1: something).
 
     A condition compares columns of the table of episodes or of demorec's sidecar, and episode_index, num_frames,
     duration_s, task: success and num_frames < 300; "cube" in task.
@@ -42,14 +45,15 @@ class Dataset:
       demorec dataset rename cups observation.image=observation.images.top --out named
       demorec dataset set-task cups --task 'pick up the cup' --out told
       demorec dataset reorder cups --by num_frames --out sorted
+      demorec dataset diff cups sorted
     """
 
     command: Annotated[Positional[str], arg(metavar="COMMAND")]
     """What to do."""
     words: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET")]
-    """The dataset, of merge two or more; behind it the features of rename (OLD=NEW) and drop-features."""
-    out: Path
-    """Folder of the new dataset; of split the folder in which each part gets one."""
+    """The dataset, of merge two or more, of diff two; behind it the features of rename (OLD=NEW) and drop-features."""
+    out: Path | None = None
+    """Folder of the new dataset; of split the folder in which each part gets one. Of all but diff."""
     where: str = ""
     """Episodes for which this holds (select, drop, set-task)."""
     episodes: str = ""
@@ -86,12 +90,18 @@ class Dataset:
     """Replace a dataset that is there."""
     dry_run: bool = False
     """Say what would come out, and write nothing."""
+    json: bool = False
+    """Print JSON (diff)."""
 
     def run(self) -> int:
         """Plan, write, and say what came out."""
         check_choice("command of demorec dataset", self.command, _COMMANDS)
-        if not self.words:
-            raise ConfigError(f"No dataset is given: demorec dataset {self.command} DATASET --out NEW.")
+        if self.command == "diff":
+            return self._diff()
+        if not self.words or self.out is None:
+            raise ConfigError(
+                f"Give a dataset and where the new one goes: demorec dataset {self.command} DATASET --out NEW."
+            )
         refuse_inside([self.out])
         from demorec.datasets.editing.plan import Source
         from demorec.datasets.editing.write import write_plan
@@ -120,6 +130,29 @@ class Dataset:
                 more = f" and {len(report.left_out) - 5} more" if len(report.left_out) > 5 else ""
                 say(f"Not taken over: {', '.join(report.left_out[:5])}{more}.")
         return 0
+
+    def _diff(self) -> int:
+        from demorec.datasets.editing.compare import LEVELS
+        from demorec.datasets.editing.diff import diff
+
+        if len(self.words) != 2:
+            raise ConfigError(f"Two datasets are compared, given are {len(self.words)}: demorec dataset diff A B.")
+        a, b = (Path(word) for word in self.words)
+        try:
+            with ProgressBar("reading") as bar:
+                found = diff(a, b, progress=bar.set)
+        except ExportError as error:  # of which the exit code would say that they differ
+            raise ConfigError(str(error)) from error
+        if self.json:
+            say_json(found.to_json())
+            return 0 if found.is_same else 1
+        for level in LEVELS:
+            lines = [item.line for item in found.differences if item.level == level]
+            say(*lines[:_SHOWN], *([f"{level}: {len(lines) - _SHOWN} more (--json)"] if len(lines) > _SHOWN else ()))
+        say(*found.notes)
+        episodes = f"{found.num_same} of {found.num_episodes[0]} and {found.num_episodes[1]} episodes are the same"
+        say(f"{'No difference' if found.is_same else counted(len(found.differences), 'difference')}: {episodes}.")
+        return 0 if found.is_same else 1
 
     def _plan(self, sources: Sequence[Source]) -> Plan:
         from demorec.datasets.editing import operations
