@@ -71,13 +71,13 @@ class EpisodeContent:
         length: Frames.
         rows: Column -> digest of its values.
         images: Camera feature -> digest of its encoded images; None where only their pixels can be compared.
-        sketch: Hashes of some rows, the same ones in every episode that has these rows.
+        sketch: (N,) hashes of some rows, the same ones in every episode that has these rows.
     """
 
     length: int
     rows: Mapping[str, bytes]
     images: Mapping[str, bytes | None]
-    sketch: frozenset[int]
+    sketch: NDArray[np.uint64]
 
     def equals(self, other: EpisodeContent) -> bool:
         """Whether every bit of both is known to be the same."""
@@ -187,12 +187,12 @@ def moving_columns(columns: Mapping[str, NDArray[Any]]) -> list[str]:
     return [name for name, values in columns.items() if name not in AUTOMATIC_FEATURES and values.dtype.kind in "fiub"]
 
 
-def _sketch(columns: Mapping[str, NDArray[Any]]) -> frozenset[int]:
-    found: set[int] = set()
+def _sketch(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint64]:
+    found = [np.zeros(0, np.uint64)]
     for name in moving_columns(columns):
         salt = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
-        found |= {salt ^ value for value in np.unique(row_hashes(columns[name]))[:_SKETCH].tolist()}
-    return frozenset(found)
+        found.append(np.unique(row_hashes(columns[name]))[:_SKETCH] ^ np.uint64(salt))
+    return np.concatenate(found)
 
 
 def matched(a: Sequence[EpisodeContent], b: Sequence[EpisodeContent]) -> dict[int, int]:
@@ -225,11 +225,11 @@ def _alike(
     """((less for more alike, places apart), episode of a, episode of b)."""
     holders: dict[Any, list[int]] = {}
     for number in rest_b:
-        for value in (*b[number].sketch, *_image_keys(b[number])):
+        for value in (*b[number].sketch.tolist(), *_image_keys(b[number])):
             holders.setdefault(value, []).append(number)
     for number in rest_a:
         one = a[number]
-        common = Counter(other for value in one.sketch for other in holders.get(value, ()))
+        common = Counter(other for value in one.sketch.tolist() for other in holders.get(value, ()))
         same_images = Counter(other for key in _image_keys(one) for other in holders.get(key, ()))
         for other in {*common, *same_images}:
             most = max(len(one.sketch), len(b[other].sketch), 1)
