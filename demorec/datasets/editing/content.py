@@ -188,7 +188,7 @@ def moving_columns(columns: Mapping[str, NDArray[Any]]) -> list[str]:
 
 
 def _sketch(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint64]:
-    found = [np.zeros(0, np.uint64)]
+    found: list[NDArray[np.uint64]] = [np.zeros(0, np.uint64)]
     for name in moving_columns(columns):
         salt = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
         found.append(np.unique(row_hashes(columns[name]))[:_SKETCH] ^ np.uint64(salt))
