@@ -42,7 +42,7 @@ class Dataset:
       demorec dataset trim cups --idle --out moving
       demorec dataset split cups --shares train=0.8 val=0.2 --by task --out parts
       demorec dataset merge monday tuesday --out both
-      demorec dataset rename cups observation.image=observation.images.top --out named
+      demorec dataset rename cups observation.image=observation.images.top --out new
       demorec dataset set-task cups --task 'pick up the cup' --out told
       demorec dataset reorder cups --by num_frames --out sorted
       demorec dataset diff cups sorted
