@@ -41,6 +41,7 @@ COMMANDS: Registry[type[Command]] = Registry(
         "info": "demorec.cli.info:Info",
         "view": "demorec.cli.view:View",
         "export": "demorec.cli.export:Export",
+        "dataset": "demorec.cli.dataset:Dataset",
         "check": "demorec.cli.check:Check",
         "report": "demorec.cli.report:Report",
         "replay": "demorec.cli.replay:Replay",

@@ -103,6 +103,17 @@ def test_export_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.Captu
     assert files_of(place.parent) == before
 
 
+@pytest.mark.parametrize("target", TARGETS)
+def test_editing_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.CaptureFixture[str], target: str) -> None:
+    before = files_of(place.parent)
+    arguments = ("dataset", "select", place / "dataset", "--episodes", "0", "--out", place / target)
+    assert exit_code(*arguments, "--overwrite") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert exit_code(*arguments) == 2
+    assert exit_code(*arguments[:-1], place / "dataset", "--overwrite") == 2  # the source itself
+    assert files_of(place.parent) == before
+
+
 def test_the_home_folder_is_no_target(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files_of(place.parent)
     elsewhere = write_episode(place.parent / "other.mcap", num_frames=3, cameras=())

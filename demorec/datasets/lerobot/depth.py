@@ -24,7 +24,7 @@ from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.stats import PixelHistogram
 
 _NEAREST, _FARTHEST, _SHIFT = 0.01, 10.0, 3.5
-_LARGEST_CODE = 4095
+LARGEST_CODE = 4095
 _GOP, _CRF = 2, 30
 _PARAMETERS = "lossless=1"
 
@@ -39,7 +39,7 @@ def quantised(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
     high = math.log(float(np.float32(_FARTHEST) + shift))
     metres = np.maximum(np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0), np.float32(0))
     scaled = (np.log(metres + shift) - low) / (high - low)
-    return np.asarray(np.rint(scaled * _LARGEST_CODE).clip(0, _LARGEST_CODE), dtype=np.uint16)
+    return np.asarray(np.rint(scaled * LARGEST_CODE).clip(0, LARGEST_CODE), dtype=np.uint16)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,11 +65,11 @@ class DepthScale:
 
     def values(self) -> Array:
         """(4096,) distance in metres that each code stands for."""
-        codes = np.arange(_LARGEST_CODE + 1)
+        codes = np.arange(LARGEST_CODE + 1)
         if not self.use_log:
-            return np.asarray(self.nearest + codes * ((self.farthest - self.nearest) / _LARGEST_CODE))
+            return np.asarray(self.nearest + codes * ((self.farthest - self.nearest) / LARGEST_CODE))
         low, high = math.log(self.nearest + self.shift), math.log(self.farthest + self.shift)
-        return np.asarray(np.exp(low + codes * ((high - low) / _LARGEST_CODE)) - self.shift)
+        return np.asarray(np.exp(low + codes * ((high - low) / LARGEST_CODE)) - self.shift)
 
     def shown(self) -> NDArray[np.float32]:
         """(4096,) the same for people's eyes: 0, nothing measured, for the lowest code."""
@@ -89,13 +89,13 @@ def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[Enc
     """Code depth images (H, W) in metres; also count their codes for the statistics."""
     context: av.VideoCodecContext | None = None
     packets: list[av.Packet] = []
-    counts = np.zeros(_LARGEST_CODE + 1, dtype=np.int64)
+    counts = np.zeros(LARGEST_CODE + 1, dtype=np.int64)
     number = 0
     height = width = 0
     for number, image in enumerate(images, start=1):
         codes = quantised(image)
         height, width = codes.shape
-        counts += np.bincount(codes.ravel(), minlength=_LARGEST_CODE + 1)
+        counts += np.bincount(codes.ravel(), minlength=LARGEST_CODE + 1)
         if context is None:
             context = _encoder(width, height, fps)
         frame = av.VideoFrame.from_ndarray(codes, format="gray12le")

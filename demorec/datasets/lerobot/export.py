@@ -21,7 +21,7 @@ from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.boxes import BoxWriter, SeenByCamera
 from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
-from demorec.datasets.lerobot.facts import STAGE_COLUMNS, EpisodeProgress, read_progress, write_progress
+from demorec.datasets.lerobot.facts import STAGE_COLUMNS, EpisodeProgress, fact_types, read_progress, write_progress
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetInfo, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
@@ -113,7 +113,7 @@ class _Export:
         configs = self._existing.configs if self._existing else {}
         limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
         with (
-            DatasetWriter(self._folder, info, start, self._facts(begun[-1])) as writer,
+            DatasetWriter(self._folder, info, start, fact_types(self._facts(begun[-1]))) as writer,
             SidecarWriter(self._folder, configs, **limits) as sidecar,
             BoxWriter(self._folder, fps=info.fps) as boxes,
         ):

@@ -178,6 +178,11 @@ def fact_type(name: str) -> pa.DataType | None:
     return pa.float64() if name.startswith((DRAWN, CHECKED)) else _TYPES.get(name)
 
 
+def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
+    """Columns of facts -> type."""
+    return {name: kind for name in names if (kind := fact_type(name)) is not None}
+
+
 def facts_of(root: Path) -> tuple[str, ...]:
     """Names of the columns of facts in the table of episodes of a dataset; ExportError when it is damaged."""
     tables = sorted((root / "meta" / "episodes").glob("*/*.parquet"))

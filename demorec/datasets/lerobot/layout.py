@@ -54,7 +54,10 @@ _ARROW_TYPES = {
     "int64": pa.int64(),
     "bool": pa.bool_(),
     "string": pa.string(),
+    **{str(kind): kind for kind in (pa.int8(), pa.int16(), pa.int32(), pa.uint8(), pa.uint16(), pa.uint32())},
 }
+_IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+"""A file of an image in a row, as HF datasets has it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +84,12 @@ class DatasetFeature:
     @property
     def is_numeric(self) -> bool:
         """Whether its frames are numbers, which have statistics of their own."""
-        return self.dtype not in ("video", "string", "language")
+        return self.dtype not in ("video", "image", "string", "language")
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether its frames are images, in mp4 files or in the data table."""
+        return self.dtype in ("video", "image")
 
     @property
     def is_depth(self) -> bool:
@@ -336,6 +344,10 @@ def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
         if feature.dtype == "language" and name in TYPES:
             fields.append(pa.field(name, TYPES[name]))
             described[name] = language_feature(name)
+            continue
+        if feature.dtype == "image":
+            fields.append(pa.field(name, _IMAGE))
+            described[name] = {"_type": "Image"}
             continue
         if feature.dtype not in _ARROW_TYPES or len(feature.shape) != 1:
             raise ExportError(

@@ -45,6 +45,8 @@ class EncodedVideo:
         is_keyframe: (lead + T,) bool, which ones can be decoded by themselves.
         digest: SHA-256 of the samples of the T images, hex.
         lead: How many images are in front that belong to no frame, from a keyframe on.
+        shifts: (lead + T,) int64, by how many places each image is shown after the place at which it is stored; None
+            where images are shown in the order in which they were encoded.
     """
 
     codec: str
@@ -56,6 +58,7 @@ class EncodedVideo:
     is_keyframe: NDArray[np.bool_]
     digest: str
     lead: int = 0
+    shifts: NDArray[np.int64] | None = None
 
     @classmethod
     def of_access_units(
@@ -81,6 +84,11 @@ class EncodedVideo:
     def num_frames(self) -> int:
         """T."""
         return len(self.sizes) - self.lead
+
+    @property
+    def delay(self) -> int:
+        """How many images a decoder has to hold back until it can show them in order."""
+        return 0 if self.shifts is None else -int(self.shifts.min())
 
     @property
     def num_bytes(self) -> int:
@@ -115,6 +123,7 @@ class Mp4Writer:
 
     def __init__(self, path: Path, first: EncodedVideo, *, fps: int) -> None:
         self.parameter_sets = first.parameter_sets()
+        self.delay = first.delay
         self.num_images = 0
         self.num_bytes = 0
         self._path = path
@@ -139,11 +148,13 @@ class Mp4Writer:
     def add(self, video: EncodedVideo) -> None:
         """Append the images of an episode; if they are in a file, it is deleted."""
         time = self.num_images * self._ticks
+        shifts = [0] * len(video.sizes) if video.shifts is None else video.shifts.tolist()
         with video.opened() as samples, self._muxing():
-            for size, is_keyframe in zip(video.sizes.tolist(), video.is_keyframe.tolist(), strict=True):
+            for size, is_keyframe, shift in zip(video.sizes.tolist(), video.is_keyframe.tolist(), shifts, strict=True):
                 packet = av.Packet(samples.read(size))
                 packet.stream = self._stream
-                packet.pts = packet.dts = time
+                packet.pts = time + shift * self._ticks
+                packet.dts = time - self.delay * self._ticks
                 packet.duration = self._ticks
                 packet.is_keyframe = is_keyframe
                 self._container.mux_one(packet)

@@ -129,8 +129,10 @@ class RollingParquet:
             self._sink.close()
 
 
-def vector_array(values: NDArray[Any], arrow_type: pa.DataType) -> pa.Array:
-    """A column of scalars (T,) or fixed-size vectors (T, D)."""
+def vector_array(values: NDArray[Any] | pa.Array, arrow_type: pa.DataType) -> pa.Array:
+    """A column of scalars (T,) or fixed-size vectors (T, D); a column that is one already keeps every bit."""
+    if isinstance(values, pa.Array):
+        return values if values.type == arrow_type else values.cast(arrow_type)
     if pa.types.is_fixed_size_list(arrow_type):
         flat = pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type.value_type)
         return pa.FixedSizeListArray.from_arrays(flat, type=arrow_type)

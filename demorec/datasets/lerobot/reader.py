@@ -199,7 +199,7 @@ class RowReader:
         """(N, D) of a feature, (N, 1) digests of language; ExportError unless it is as info.json says."""
         feature = self._info.features[name]
         try:
-            values = column_digests(column) if feature.dtype == "language" else _column(column)
+            values = column_digests(column) if feature.dtype == "language" else column_values(column)
         except (ValueError, TypeError, pa.ArrowException) as error:
             raise ExportError(f"The column {name} holds something else than numbers: {self._root}") from error
         if feature.dtype in _NUMBERS and values.shape[1:] != (math.prod(feature.shape),):
@@ -209,7 +209,8 @@ class RowReader:
         return values
 
 
-def _column(column: Any) -> NDArray[Any]:
+def column_values(column: pa.Array) -> NDArray[Any]:
+    """(T, D) numbers of a column, or (T, 1) texts."""
     if str(column.type) in ("string", "large_string"):
         return np.array(column.to_pylist(), dtype=np.str_).reshape(-1, 1)
     return column_numbers(column)

@@ -22,7 +22,7 @@ from PIL import Image
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, in_words
-from demorec.datasets.lerobot.depth import DepthScale
+from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
 from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo, FilePosition
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -193,15 +193,25 @@ class EpisodeVideo:
         for frame in self._frames(begin):
             yield cast(Rgb, frame.to_ndarray(format="rgb24"))
 
-    def distances(self) -> Iterator[NDArray[np.float32]]:
-        """(H, W) metres of every frame, 0 where nothing was measured."""
-        height, width = self._feature.shape[:2]
+    @cached_property
+    def depth_scale(self) -> DepthScale:
+        """What the codes of its depth stand for; ExportError when that is not known."""
         try:
-            metres = DepthScale.of(self._feature.info or {}).shown()
+            return DepthScale.of(self._feature.info or {})
         except ValueError as error:
             raise ExportError(f"The depth of {self._key} cannot be read ({error}): {self._root / INFO_PATH}") from error
-        for frame in self._frames(size=(width, height)):
-            yield metres[np.minimum(frame.to_ndarray(format="gray12le"), len(metres) - 1)]
+
+    def codes(self, begin: int = 0) -> Iterator[NDArray[np.uint16]]:
+        """(H, W) codes of depth, 0 to 4095, of every frame from one on."""
+        height, width = self._feature.shape[:2]
+        for frame in self._frames(begin, (width, height)):
+            yield np.minimum(frame.to_ndarray(format="gray12le"), LARGEST_CODE)
+
+    def distances(self) -> Iterator[NDArray[np.float32]]:
+        """(H, W) metres of every frame, 0 where nothing was measured."""
+        metres = self.depth_scale.shown()
+        for codes in self.codes():
+            yield metres[codes]
 
     def images_at(self, frames: Sequence[int]) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of some frames, numbered from 0 within the episode."""

@@ -10,6 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,14 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.facts import fact_type
-from demorec.datasets.lerobot.language import REPEATING, EpisodeLanguage, language_arrays, language_digests
+from demorec.datasets.lerobot.language import (
+    REPEATING,
+    EpisodeLanguage,
+    column_digests,
+    is_language,
+    language_arrays,
+    language_digests,
+)
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     DATA_PATH,
@@ -37,6 +44,7 @@ from demorec.datasets.lerobot.layout import (
 from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.reader import column_values
 from demorec.datasets.lerobot.stats import (
     NAMES,
     PixelHistogram,
@@ -59,21 +67,24 @@ class EpisodeData:
 
     Attributes:
         task: Instruction.
-        columns: Feature -> (T,) or (T, D), without cameras and the automatic features.
+        columns: Feature -> (T,) or (T, D), or a column of Arrow's of T values, which stays as it is; without videos and
+            the automatic features.
         videos: Camera feature -> encoded images, T of them.
         video_info: Camera feature -> how they were encoded, the `info` of the feature.
-        pixels: Camera feature -> histogram, for the statistics.
-        language: What is said about it; written where the dataset has the columns for it.
+        pixels: Camera feature -> histogram for the statistics, or the statistics where the images were not seen.
+        language: What is said about it; written where the dataset has the columns for it and `columns` has none.
         facts: Column of the table of episodes -> value; written where the dataset has the column.
+        row_tasks: Instruction of each row, where there is more than one; `task` is the first.
     """
 
     task: str
-    columns: Mapping[str, NDArray[Any]]
+    columns: Mapping[str, NDArray[Any] | pa.Array]
     videos: Mapping[str, EncodedVideo] = field(default_factory=dict)
     video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
-    pixels: Mapping[str, PixelHistogram] = field(default_factory=dict)
+    pixels: Mapping[str, PixelHistogram | Statistics] = field(default_factory=dict)
     language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
     facts: Mapping[str, Any] = field(default_factory=dict)
+    row_tasks: Sequence[str] = ()
 
     @property
     def num_frames(self) -> int:
@@ -99,7 +110,7 @@ class WriterStart:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenEpisode:
-    """Where an episode went, and its digest (`demorec.datasets.lerobot.digest`)."""
+    """Where an episode went, and its digest (`demorec.datasets.lerobot.layout`), "" with images in rows."""
 
     episode_index: int
     digest: str
@@ -112,15 +123,19 @@ class DatasetWriter:
         root: Folder of the dataset; for an appending writer it holds the old files already.
         info: Features and limits; its counters are taken from `start`.
         start: Where to go on.
-        facts: Which of the episodes' facts the table of episodes has (`demorec.datasets.lerobot.facts`).
+        facts: Columns of the episodes' facts in the table of episodes -> type (`demorec.datasets.lerobot.facts`).
     """
 
     def __init__(
-        self, root: Path, info: DatasetInfo, start: WriterStart | None = None, facts: Sequence[str] = ()
+        self,
+        root: Path,
+        info: DatasetInfo,
+        start: WriterStart | None = None,
+        facts: Mapping[str, pa.DataType] = MappingProxyType({}),
     ) -> None:
         self._root = root
         self._info = info
-        self._facts = tuple(facts)
+        self._facts = dict(facts)
         self._start = start or WriterStart()
         self._schema = data_schema(info.features)
         self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
@@ -128,7 +143,8 @@ class DatasetWriter:
         self._tasks = {task: index for index, task in enumerate(self._start.tasks)}
         self.num_episodes = self._start.num_episodes
         self.num_frames = self._start.num_frames
-        strings = [name for name in self._schema.names if name not in (*self._numeric, *self._language)]
+        strings = [name for name in self._schema.names if info.features[name].dtype == "string"]
+        self._cameras = [name for name, feature in info.features.items() if feature.is_camera]
         self._data = RollingParquet(
             root,
             DATA_PATH,
@@ -143,6 +159,7 @@ class DatasetWriter:
         self._video_positions = {key: next_position(root / "videos" / key, info.chunks_size) for key in info.video_keys}
         self._video_info = {key: info.features[key].info for key in info.video_keys}
         self._pixels: dict[str, PixelHistogram] = {}
+        self._unseen: dict[str, list[Statistics]] = {}
 
     def __enter__(self) -> DatasetWriter:
         return self
@@ -158,8 +175,10 @@ class DatasetWriter:
         frames = episode.num_frames
         if frames == 0:
             raise ExportError("An episode without frames cannot be exported.")
-        task_index = self._tasks.setdefault(episode.task, len(self._tasks))
-        spoken = set(self._language)
+        tasks = dict.fromkeys(episode.row_tasks or [episode.task])
+        task_indices = {task: self._tasks.setdefault(task, len(self._tasks)) for task in tasks}
+        task_index = np.array([task_indices[task] for task in episode.row_tasks or [episode.task] * frames])
+        spoken = {name for name in self._language if name not in episode.columns}
         columns = {
             **{
                 name: episode.columns[name] for name in self._schema.names if name not in {*AUTOMATIC_FEATURES, *spoken}
@@ -168,7 +187,7 @@ class DatasetWriter:
             "frame_index": np.arange(frames),
             "episode_index": np.full(frames, self.num_episodes),
             "index": np.arange(self.num_frames, self.num_frames + frames),
-            "task_index": np.full(frames, task_index),
+            "task_index": task_index,
         }
         position = self._data.make_room(frames)
         texts = language_arrays(episode.language, frames) if spoken else {}
@@ -179,7 +198,7 @@ class DatasetWriter:
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
         row: dict[str, Any] = {
             "episode_index": self.num_episodes,
-            "tasks": [episode.task],
+            "tasks": list(tasks),
             "length": frames,
             "data/chunk_index": position.chunk,
             "data/file_index": position.file,
@@ -187,15 +206,14 @@ class DatasetWriter:
             "dataset_to_index": self.num_frames + frames,
             **{name: episode.facts.get(name) for name in self._facts},
         }
-        statistics = vector_statistics({name: columns[name] for name in self._numeric})
+        values = {name: values_of(column) for name, column in columns.items() if name not in self._cameras}
+        statistics = vector_statistics({name: values[name] for name in self._numeric})
         digests = {}
         for key in self._info.video_keys:
             row.update(self._add_video(key, episode.videos[key], frames))
             digests[key] = episode.videos[key].digest
             self._video_info[key] = merged_video_info(self._video_info[key] or {}, dict(episode.video_info[key]))
-            pixels = episode.pixels[key]
-            self._pixels[key] = self._pixels[key] + pixels if key in self._pixels else pixels
-            statistics[key] = pixels.statistics()
+        statistics |= {key: self._count(key, episode.pixels[key]) for key in self._cameras}
         self._rows.append(row)
         self._row_statistics.append(statistics)
         if len(self._rows) >= _EPISODES_PER_TABLE:
@@ -203,10 +221,20 @@ class DatasetWriter:
         self.num_frames += frames
         self.num_episodes += 1
         if spoken:
-            columns.update(language_digests(episode.language, frames))
+            values.update(language_digests(episode.language, frames))
+        has_digest = len(digests) == len(self._cameras)
         return WrittenEpisode(
-            episode_index=self.num_episodes - 1, digest=episode_digest(episode.task, columns, digests)
+            episode_index=self.num_episodes - 1,
+            digest=episode_digest(episode.task, values, digests) if has_digest else "",
         )
+
+    def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
+        """The statistics of a camera in an episode, which those of all episodes take in."""
+        if isinstance(pixels, Statistics):
+            self._unseen.setdefault(key, []).append(pixels)
+            return pixels
+        self._pixels[key] = self._pixels[key] + pixels if key in self._pixels else pixels
+        return pixels.statistics()
 
     def _add_video(self, key: str, video: EncodedVideo, frames: int) -> dict[str, int | float]:
         if video.num_frames != frames:
@@ -217,6 +245,7 @@ class DatasetWriter:
             file.num_bytes + video.num_bytes >= self._info.video_files_size_in_mb * MEBIBYTE
             or (file.num_images + len(video.sizes)) / fps > _MAX_SECONDS_PER_VIDEO
             or file.parameter_sets != video.parameter_sets()
+            or file.delay < video.delay
         ):
             file.close()
             file = None
@@ -245,10 +274,10 @@ class DatasetWriter:
         statistics: dict[str, Statistics] = dict(
             data_statistics(sorted((self._root / "data").glob("*/*.parquet")), self._info.features)
         )
-        for key in self._info.video_keys:
+        for key in self._cameras:
             new = self._pixels[key].statistics() if key in self._pixels else None
             parts = [part for part in (self._start.statistics.get(key), new) if part is not None]
-            if parts:
+            if parts := [*parts, *self._unseen.get(key, ())]:
                 statistics[key] = merge_statistics(parts)
         ordered = {name: statistics[name].to_json() for name in self._info.features if name in statistics}
         write_text(self._root / STATS_PATH, json.dumps(ordered, indent=4) + "\n")
@@ -270,12 +299,12 @@ class DatasetWriter:
         for key in self._info.video_keys:
             fields += [(f"videos/{key}/{name}", pa.int64()) for name in ("chunk_index", "file_index")]
             fields += [(f"videos/{key}/{name}", pa.float64()) for name in ("from_timestamp", "to_timestamp")]
-        for key in (*self._numeric, *self._info.video_keys):
+        for key in (*self._numeric, *self._cameras):
             number = pa.list_(pa.float64())
-            if key in self._info.video_keys:
+            if key in self._cameras:
                 number = pa.list_(pa.list_(number))
             fields += [(f"stats/{key}/{name}", pa.list_(pa.int64()) if name == "count" else number) for name in NAMES]
-        fields += [(name, fact_type(name)) for name in self._facts]
+        fields += list(self._facts.items())
         fields += [("meta/episodes/chunk_index", pa.int64()), ("meta/episodes/file_index", pa.int64())]
         return pa.schema(fields)
 
@@ -302,6 +331,13 @@ class DatasetWriter:
         self._episodes.write(pa.Table.from_arrays(arrays, schema=self._episodes.schema))
         self._rows.clear()
         self._row_statistics.clear()
+
+
+def values_of(column: NDArray[Any] | pa.Array) -> NDArray[Any]:
+    """Numbers or texts of a column, digests of one of language."""
+    if not isinstance(column, pa.Array):
+        return column
+    return column_digests(column) if is_language(column.type) else column_values(column)
 
 
 def _sizes(info: DatasetInfo) -> dict[str, Any]:

@@ -1,0 +1,227 @@
+"""`demorec dataset`: LeRobot datasets, whoever wrote them, selected, trimmed, split, merged, renamed, reordered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from demorec.cli.shared.output import counted, say, say_json
+from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
+from demorec.core.errors import ConfigError, ExportError
+from demorec.core.registry import check_choice
+
+if TYPE_CHECKING:
+    from demorec.datasets.editing.plan import Plan, Source
+
+_COMMANDS = (
+    "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle", "diff",
+)  # fmt: skip
+_SHOWN = 20
+"""Differences of each level that are printed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """Edit LeRobot datasets (v3.0, v2.1), whoever wrote them: no image is encoded again, the sources stay as they are.
+
+    Commands: select and drop episodes (--where, --episodes); trim them (--head, --tail, --idle); split (--shares);
+    merge datasets (--mapping); rename OLD=NEW...; drop-features NAME...; set-task; reorder (--by, --order); shuffle.
+    diff A B says in what two datasets differ, wherever their episodes lie (exit code 0: nothing, 1: something).
+
+    A condition compares columns of the table of episodes or of demorec's sidecar, and episode_index, num_frames,
+    duration_s, task: success and num_frames < 300; "cube" in task.
+
+    Examples:
+      demorec dataset select cups --where 'success and num_frames < 300' --out good
+      demorec dataset drop cups --episodes 3,7,20:25 --out rest
+      demorec dataset trim cups --idle --out moving
+      demorec dataset split cups --shares train=0.8 val=0.2 --by task --out parts
+      demorec dataset merge monday tuesday --out both
+      demorec dataset rename cups observation.image=observation.images.top --out new
+      demorec dataset set-task cups --task 'pick up the cup' --out told
+      demorec dataset reorder cups --by num_frames --out sorted
+      demorec dataset diff cups sorted
+    """
+
+    command: Annotated[Positional[str], arg(metavar="COMMAND")]
+    """What to do."""
+    words: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET")]
+    """The dataset, of merge two or more, of diff two; behind it the features of rename (OLD=NEW) and drop-features."""
+    out: Path | None = None
+    """Folder of the new dataset; of split the folder in which each part gets one. Of all but diff."""
+    where: str = ""
+    """Episodes for which this holds (select, drop, set-task)."""
+    episodes: str = ""
+    """Numbers of episodes, 0,3,5:9 (select, drop, set-task)."""
+    head: int = 0
+    """Frames to cut off at the beginning of each episode (trim)."""
+    tail: int = 0
+    """Frames to cut off at the end (trim)."""
+    idle: bool = False
+    """Cut off what is before the first and after the last motion (trim)."""
+    idle_feature: str = "observation.state"
+    """In which motion shows (trim)."""
+    idle_threshold: float = 0.01
+    """Motion is a change by more than this share of the feature's range (trim)."""
+    idle_margin: int = 3
+    """Still frames that stay at either end (trim)."""
+    shares: tuple[str, ...] = ()
+    """Names and shares of the parts, train=0.8 val=0.2 (split)."""
+    by: str = ""
+    """Column to sort by (reorder), or whose values are shared out alike (split)."""
+    descending: bool = False
+    """Largest first (reorder)."""
+    order: str = ""
+    """Numbers of all episodes in their new order, 2,0,1 (reorder)."""
+    seed: int = 0
+    """Of the order or the parts (shuffle, split)."""
+    task: str = ""
+    """The new instruction (set-task)."""
+    mapping: Path | None = None
+    """What becomes what where datasets differ (merge)."""
+    decode: bool = False
+    """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""
+    overwrite: bool = False
+    """Replace a dataset that is there."""
+    dry_run: bool = False
+    """Say what would come out, and write nothing."""
+    json: bool = False
+    """Print JSON (diff)."""
+
+    def run(self) -> int:
+        """Plan, write, and say what came out."""
+        check_choice("command of demorec dataset", self.command, _COMMANDS)
+        if self.command == "diff":
+            return self._diff()
+        if not self.words or self.out is None:
+            raise ConfigError(
+                f"Give a dataset and where the new one goes: demorec dataset {self.command} DATASET --out NEW."
+            )
+        refuse_inside([self.out])
+        from demorec.datasets.editing.plan import Source
+        from demorec.datasets.editing.write import write_plan
+
+        num_sources = len(self.words) if self.command == "merge" else 1
+        takes_words = self.command in ("rename", "drop-features")
+        if len(self.words) > num_sources and not takes_words:
+            raise ConfigError(f"demorec dataset {self.command} takes one dataset; demorec dataset merge joins several.")
+        sources = [Source(Path(word)) for word in self.words[:num_sources]]
+        plans = self._split(sources[0]) if self.command == "split" else {"": self._plan(sources)}
+        for name, plan in plans.items():
+            out = self.out / name
+            self._tell(plan)
+            frames = sum(cut.last - cut.first for cut in plan.cuts)
+            if self.dry_run:
+                say(f"Would be {counted(len(plan.cuts), 'episode')}, {frames} frames: {out}")
+                continue
+            with ProgressBar("writing") as bar:
+                report = write_plan(plan, out, overwrite=self.overwrite, decode=self.decode, progress=bar.set)
+            say(f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames: {out}")
+            if report.lead:
+                say(f"{counted(report.lead, 'image')} before cuts stay in the videos, since later ones need them.")
+            if report.decoded:
+                say(f"Images of {counted(report.decoded, 'episode')} were decoded for their statistics.")
+            if report.left_out:
+                more = f" and {len(report.left_out) - 5} more" if len(report.left_out) > 5 else ""
+                say(f"Not taken over: {', '.join(report.left_out[:5])}{more}.")
+        return 0
+
+    def _diff(self) -> int:
+        from demorec.datasets.editing.compare import LEVELS
+        from demorec.datasets.editing.diff import diff
+
+        if len(self.words) != 2:
+            raise ConfigError(f"Two datasets are compared, given are {len(self.words)}: demorec dataset diff A B.")
+        a, b = (Path(word) for word in self.words)
+        try:
+            with ProgressBar("reading") as bar:
+                found = diff(a, b, progress=bar.set)
+        except ExportError as error:  # of which the exit code would say that they differ
+            raise ConfigError(str(error)) from error
+        if self.json:
+            say_json(found.to_json())
+            return 0 if found.is_same else 1
+        for level in LEVELS:
+            lines = [item.line for item in found.differences if item.level == level]
+            say(*lines[:_SHOWN], *([f"{level}: {len(lines) - _SHOWN} more (--json)"] if len(lines) > _SHOWN else ()))
+        say(*found.notes)
+        episodes = f"{found.num_same} of {found.num_episodes[0]} and {found.num_episodes[1]} episodes are the same"
+        say(f"{'No difference' if found.is_same else counted(len(found.differences), 'difference')}: {episodes}.")
+        return 0 if found.is_same else 1
+
+    def _plan(self, sources: Sequence[Source]) -> Plan:
+        from demorec.datasets.editing import operations
+        from demorec.datasets.editing.merge import merge
+
+        source, words = sources[0], self.words[1:]
+        match self.command:
+            case "select" | "drop":
+                if not self.where and not self.episodes:
+                    raise ConfigError(f"Say what to {self.command}: --where or --episodes.")
+                return operations.select(source, self._chosen(source), drop=self.command == "drop")
+            case "trim":
+                if self.idle == bool(self.head or self.tail):
+                    raise ConfigError("Give either --idle, or frames by --head and --tail.")
+                if self.idle:
+                    return operations.trim_idle(source, self.idle_feature, self.idle_threshold, self.idle_margin)
+                return operations.trim(source, self.head, self.tail)
+            case "merge":
+                return merge(sources, self.mapping)
+            case "rename":
+                return operations.rename(source, _pairs(words, "old=new"))
+            case "drop-features":
+                return operations.drop_features(source, words)
+            case "set-task":
+                return operations.set_task(source, self.task, self._chosen(source))
+            case "reorder":
+                return operations.reorder(source, self.by, _numbers(self.order), descending=self.descending)
+            case _:
+                return operations.shuffle(source, self.seed)
+
+    def _split(self, source: Source) -> Mapping[str, Plan]:
+        from demorec.datasets.editing.operations import split
+
+        try:
+            shares = {name: float(share) for name, share in _pairs(self.shares, "train=0.8").items()}
+        except ValueError as error:
+            raise ConfigError("A share is a number: --shares train=0.8 val=0.2.") from error
+        if wrong := [name for name in shares if Path(name).name != name or name in ("", ".", "..")]:
+            raise ConfigError(f"A part cannot be called {wrong[0]!r}: its name is that of its folder.")
+        return split(source, shares, self.seed, by=self.by)
+
+    def _chosen(self, source: Source) -> list[int]:
+        from demorec.datasets.editing.operations import chosen
+
+        return chosen(source, self.where, _numbers(self.episodes) if self.episodes else None)
+
+    def _tell(self, plan: Plan) -> None:
+        """List what is cut off of episodes."""
+        for cut in plan.cuts:
+            length = plan.sources[cut.source].dataset.places[cut.episode].length
+            if (cut.first, cut.last) != (0, length):
+                say(f"episode {cut.episode}: {cut.first} frames cut at the beginning, {length - cut.last} at the end")
+
+
+def _numbers(text: str) -> list[int]:
+    """Of episodes: 0,3,5:9; the end of a range is not part of it."""
+    found: list[int] = []
+    for part in text.split(",") if text else ():
+        first, colon, last = part.strip().partition(":")
+        try:
+            begin = int(first)
+            found += range(begin, int(last)) if colon else [begin]
+        except (ValueError, MemoryError, OverflowError) as error:
+            raise ConfigError(f"Episodes are numbers and ranges, such as 0,3,5:9, not {text!r}.") from error
+    return found
+
+
+def _pairs(words: Sequence[str], example: str) -> dict[str, str]:
+    found = dict(word.partition("=")[::2] for word in words)
+    if not words or any("=" not in word for word in words) or len(found) != len(words):
+        raise ConfigError(f"Each name is given once, with what it gets, such as {example}.")
+    return found

@@ -1,0 +1,242 @@
+"""What an episode contains, as digests: by them the episodes of one dataset are found in another.
+
+Positions do not count: `index` and `episode_index` are taken from the episode's first row on, `task_index` as the text
+that it stands for. So an episode is the same wherever it lies, in files of whatever size and format.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from demorec.core.errors import ExportError, in_words
+from demorec.datasets.editing.packets import PacketCutter
+from demorec.datasets.editing.plan import Source
+from demorec.datasets.editing.write import Rows
+from demorec.datasets.lerobot.language import column_digests
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
+from demorec.datasets.lerobot.reader import EpisodePlace, column_values
+
+TASK = "task"
+"""Column of the instructions, in place of `task_index`."""
+_SKETCH = 16
+"""Rows of each feature that stand for all of them: those of the smallest hashes (Broder 1997), in whatever frame."""
+_LEAST_ALIKE = 0.3
+"""Share of the rows that two episodes have in common, so that one is called a changed version of the other."""
+_IMAGES_ALIKE = 0.5
+"""What equal videos count beside the rows."""
+_WORDS = np.random.default_rng(0).integers(1, 2**63, size=4096, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shared:
+    """The features that two datasets have in common and that can be compared value by value.
+
+    Attributes:
+        columns: Of the data table, less images; feature -> whether both have it in one type.
+        cameras: Feature -> whether both store its images in one way, so that equal bytes are equal images.
+    """
+
+    columns: Mapping[str, bool]
+    cameras: Mapping[str, bool]
+
+    @classmethod
+    def of(cls, a: Source, b: Source) -> Shared:
+        """Of two datasets."""
+        pairs = {name: (item, b.info.features[name]) for name, item in a.info.features.items()
+                 if name in b.info.features}  # fmt: skip
+        columns, cameras = {}, {}
+        for name, (one, other) in pairs.items():
+            if one.is_camera and other.is_camera:
+                if one.shape == other.shape:
+                    cameras[name] = one.dtype == other.dtype
+            elif one.shape == other.shape and (one.dtype == other.dtype or (one.is_numeric and other.is_numeric)):
+                columns[name] = one.dtype == other.dtype
+        return cls(columns=columns, cameras=cameras)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeContent:
+    """Of one episode.
+
+    Attributes:
+        length: Frames.
+        rows: Column -> digest of its values.
+        images: Camera feature -> digest of its encoded images; None where only their pixels can be compared.
+        sketch: (N,) hashes of some rows, the same ones in every episode that has these rows.
+    """
+
+    length: int
+    rows: Mapping[str, bytes]
+    images: Mapping[str, bytes | None]
+    sketch: NDArray[np.uint64]
+
+    def equals(self, other: EpisodeContent) -> bool:
+        """Whether every bit of both is known to be the same."""
+        return self._key() == other._key() and None not in self.images.values()
+
+    def _key(self) -> tuple[Any, ...]:
+        return self.length, tuple(self.rows.values()), tuple(self.images.values())
+
+
+class ContentReader:
+    """The columns of a dataset's episodes in a given order, and their digests.
+
+    Args:
+        source: The dataset.
+        shared: What of it is compared.
+        order: Numbers of the episodes that will be asked for.
+        aside: File for rows that are not asked for in their order.
+    """
+
+    def __init__(self, source: Source, shared: Shared, order: Iterable[int], aside: Path) -> None:
+        self._source, self._shared = source, shared
+        features = source.info.features
+        self._stored = [name for name in shared.cameras if not features[name].is_video]
+        self._rows = Rows(source, [*shared.columns, *self._stored], list(order), aside)
+        self._cutters = {
+            name: PacketCutter(source.root, source.info, name) for name in shared.cameras if features[name].is_video
+        }
+
+    def columns(self, number: int) -> dict[str, NDArray[Any]]:
+        """Column -> (T, D) numbers, or (T, 1) texts; of language and stored images digests of each row."""
+        place, table = self._source.dataset.places[number], self._rows.read(number)
+        features, found = self._source.info.features, {}
+        for name in (*self._shared.columns, *self._stored):
+            values = _values(table.column(name).combine_chunks(), features[name], self._source.root)
+            if name == "index":
+                values = values - place.from_index
+            elif name == "episode_index":
+                values = values - place.episode_index
+            found[TASK if name == "task_index" else name] = self._texts(values) if name == "task_index" else values
+        return found
+
+    def _texts(self, indices: NDArray[Any]) -> NDArray[np.str_]:
+        tasks = self._source.dataset.tasks
+        texts = [
+            tasks[int(index)] if np.isfinite(index) and 0 <= index < len(tasks) else f"no task {index}"
+            for index in indices.ravel()
+        ]
+        return np.array(texts, dtype=np.str_).reshape(-1, 1)
+
+    def read(self, number: int) -> EpisodeContent:
+        """The digests of an episode; ExportError when it cannot be read."""
+        place, columns = self._source.dataset.places[number], self.columns(number)
+        stored = {name: columns.pop(name) for name in self._stored}
+        rows = {}
+        for name, values in columns.items():
+            is_text = values.dtype.kind not in "fiub"
+            kept = values if self._shared.columns.get(name, True) or is_text else values.astype(np.float64)
+            rows[name] = _digest(kept)
+        images: dict[str, bytes | None] = {}
+        for name, is_same_kind in self._shared.cameras.items():
+            images[name] = None
+            if is_same_kind:
+                images[name] = _digest(stored[name]) if name in stored else self._packets(name, place)
+        return EpisodeContent(length=place.length, rows=rows, images=images, sketch=_sketch(columns))
+
+    def _packets(self, name: str, place: EpisodePlace) -> bytes | None:
+        try:
+            video = self._cutters[name].cut(place, 0, place.length)
+            sets = video.parameter_sets()
+        except ExportError:  # packets that cannot be told apart by episode; whether there are any, decoding shows
+            return None
+        assert isinstance(video.samples, bytes)
+        head = f"{video.codec} {video.width} {video.height} {video.lead} {video.sizes.tolist()} {len(sets)}"
+        return hashlib.sha256(b"".join((head.encode(), sets, video.samples))).digest()
+
+
+def _values(array: Any, feature: DatasetFeature, root: Path) -> NDArray[Any]:
+    array = array if isinstance(array, pa.Array) else pa.concat_arrays(array.chunks)
+    try:
+        if feature.dtype == "language":
+            return column_digests(array)
+        if feature.dtype == "image":
+            digests = [hashlib.sha256(data or b"").hexdigest() for data in array.field("bytes").to_pylist()]
+            return np.array(digests, dtype=np.str_).reshape(-1, 1)
+        return column_values(array)
+    except (ValueError, TypeError, KeyError, pa.ArrowException) as error:
+        raise ExportError(f"A column holds something else than info.json says ({in_words(error)}): {root}") from error
+
+
+def _digest(values: NDArray[Any]) -> bytes:
+    is_text = values.dtype.kind not in "fiub"
+    data = repr(values.tolist()).encode() if is_text else np.ascontiguousarray(values).tobytes()
+    return hashlib.sha256(f"{values.shape}{'' if is_text else values.dtype}".encode() + data).digest()
+
+
+def row_hashes(values: NDArray[Any]) -> NDArray[np.uint64]:
+    """(T,) a hash of each row of (T, D) numbers; that of equal numbers is equal, whatever their type."""
+    words = np.ascontiguousarray(values.astype(np.float64) + 0.0).view(np.uint64)
+    found: NDArray[np.uint64] = (words * _WORDS[np.arange(words.shape[1]) % len(_WORDS)]).sum(axis=1, dtype=np.uint64)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):  # splitmix64 (Steele et al. 2014)
+        found = (found ^ (found >> np.uint64(shift))) * np.uint64(factor)
+    return found ^ (found >> np.uint64(31))
+
+
+def moving_columns(columns: Mapping[str, NDArray[Any]]) -> list[str]:
+    """Names of the columns of numbers that say something about an episode, not about its place."""
+    return [name for name, values in columns.items() if name not in AUTOMATIC_FEATURES and values.dtype.kind in "fiub"]
+
+
+def _sketch(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint64]:
+    found: list[NDArray[np.uint64]] = [np.zeros(0, np.uint64)]
+    for name in moving_columns(columns):
+        salt = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
+        found.append(np.unique(row_hashes(columns[name]))[:_SKETCH] ^ np.uint64(salt))
+    return np.concatenate(found)
+
+
+def matched(a: Sequence[EpisodeContent], b: Sequence[EpisodeContent]) -> dict[int, int]:
+    """Number of an episode -> number of the same one, or of its changed version, in the other dataset.
+
+    The same ones are found first; then those with the most in common. Of equals the one at the same place is taken.
+    """
+    found: dict[int, int] = {}
+    equal: dict[tuple[Any, ...], list[int]] = {}
+    for number, content in enumerate(b):
+        equal.setdefault(content._key(), []).append(number)
+    for by_place in (True, False):
+        for number, content in enumerate(a):
+            others = equal.get(content._key(), [])
+            if number not in found and (number in others if by_place else others):
+                found[number] = others.pop(others.index(number) if by_place else 0)
+    taken = set(found.values())
+    rest_a = [number for number in range(len(a)) if number not in found]
+    rest_b = [number for number in range(len(b)) if number not in taken]
+    for _, one, other in sorted(_alike(a, b, rest_a, rest_b)):
+        if one not in found and other not in taken:
+            found[one] = other
+            taken.add(other)
+    return dict(sorted(found.items()))
+
+
+def _alike(
+    a: Sequence[EpisodeContent], b: Sequence[EpisodeContent], rest_a: Sequence[int], rest_b: Sequence[int]
+) -> Iterator[tuple[tuple[float, int], int, int]]:
+    """((less for more alike, places apart), episode of a, episode of b)."""
+    holders: dict[Any, list[int]] = {}
+    for number in rest_b:
+        for value in (*b[number].sketch.tolist(), *_image_keys(b[number])):
+            holders.setdefault(value, []).append(number)
+    for number in rest_a:
+        one = a[number]
+        common = Counter(other for value in one.sketch.tolist() for other in holders.get(value, ()))
+        same_images = Counter(other for key in _image_keys(one) for other in holders.get(key, ()))
+        for other in {*common, *same_images}:
+            most = max(len(one.sketch), len(b[other].sketch), 1)
+            alike = common[other] / most + _IMAGES_ALIKE * same_images[other] / max(len(one.images), 1)
+            if alike >= _LEAST_ALIKE:
+                yield (-alike, abs(number - other)), number, other
+
+
+def _image_keys(content: EpisodeContent) -> list[tuple[str, bytes]]:
+    return [(name, digest) for name, digest in content.images.items() if digest is not None]

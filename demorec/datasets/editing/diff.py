@@ -1,0 +1,332 @@
+"""In what two LeRobot datasets differ: info, features, tasks, episodes, rows, images, statistics.
+
+Where episodes lie does not count: neither their order nor the files, the format's version or the task numbers. Episodes
+are matched by content (`content.py`), those that are not equal bit for bit are compared (`compare.py`).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.core.errors import ExportError, in_words
+from demorec.datasets.editing.compare import LEVELS, Difference, EpisodeComparer
+from demorec.datasets.editing.content import TASK, ContentReader, EpisodeContent, Shared, matched
+from demorec.datasets.editing.plan import Source
+from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.layout import STATS_PATH, DatasetFeature
+from demorec.datasets.options import ProgressCallback
+
+_STORAGE = ("version", "chunks_size", "data_files_size_in_mb", "video_files_size_in_mb", "data_path", "video_path")
+_OLD_TOTALS = ("total_chunks", "total_videos")
+_FOLLOWS = frozenset(("episode_index", "num_frames", "length", "task", "tasks"))
+"""Of the columns of episodes, what is compared elsewhere."""
+_PLACES = ("index", "episode_index", "task_index")
+_TOLERANCE = 1e-6
+"""Relative to the larger value or the feature's range: some writers sum in float32, and in the order of episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetDiff:
+    """What was found.
+
+    Attributes:
+        pairs: Number of an episode in A -> its number in B.
+        num_episodes: Of A and of B.
+        num_same: Pairs of which every row and image is equal.
+        differences: By level.
+        notes: What does not count: order, and how things are stored.
+    """
+
+    pairs: Mapping[int, int]
+    num_episodes: tuple[int, int]
+    num_same: int
+    differences: tuple[Difference, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def is_same(self) -> bool:
+        """Whether nothing differs."""
+        return not self.differences
+
+    @property
+    def is_reordered(self) -> bool:
+        """Whether episodes that both have come in another order."""
+        others = list(self.pairs.values())
+        return others != sorted(others)
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "same": self.is_same,
+            "reordered": self.is_reordered,
+            "episodes_a": self.num_episodes[0],
+            "episodes_b": self.num_episodes[1],
+            "episodes_same": self.num_same,
+            "pairs": [[a, b] for a, b in self.pairs.items()],
+            "differences": [difference.to_json() for difference in self.differences],
+            "notes": list(self.notes),
+        }
+
+
+def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetDiff:
+    """Compare two datasets of v3.0 or v2.1; memory is that of an episode, and some numbers for each one.
+
+    Raises:
+        ExportError: One is damaged.
+    """
+    sources = (Source(a), Source(b))
+    shared = Shared.of(*sources)
+    with tempfile.TemporaryDirectory(prefix="demorec-diff-") as folder:
+        contents = _contents(sources, shared, Path(folder), progress)
+        pairs = matched(*contents)
+        changed = {n: m for n, m in pairs.items() if not contents[0][n].equals(contents[1][m])}
+        found = list(_compared(sources, shared, contents, changed, Path(folder)))
+    unmatched = [(n, None) for n in range(len(contents[0])) if n not in pairs]
+    others = set(pairs.values())
+    extra = [(None, m) for m in range(len(contents[1])) if m not in others]
+    found += [_one_sided(sources, episode) for episode in (*unmatched, *extra)]
+    found = [*_tasks(sources, found, [*unmatched, *extra]), *_info(sources), *_features(sources),
+             *_facts(sources, pairs, contents)]  # fmt: skip
+    result = DatasetDiff(
+        pairs=pairs,
+        num_episodes=(len(contents[0]), len(contents[1])),
+        num_same=len(pairs) - len({item.episodes for item in found if item.level in ("episodes", "rows", "images")
+                                   and item.episodes is not None and None not in item.episodes}),
+        differences=(),
+        notes=(),
+    )  # fmt: skip
+    found += _statistics(sources, found, is_reordered=result.is_reordered)
+    found.sort(key=lambda item: LEVELS.index(item.level))
+    return DatasetDiff(pairs=pairs, num_episodes=result.num_episodes, num_same=result.num_same,
+                       differences=tuple(found), notes=tuple(_notes(sources, result)))  # fmt: skip
+
+
+def _contents(
+    sources: tuple[Source, Source], shared: Shared, folder: Path, progress: ProgressCallback | None
+) -> list[list[EpisodeContent]]:
+    total, done = sum(len(source.dataset) for source in sources), 0
+    found: list[list[EpisodeContent]] = []
+    for source in sources:
+        reader = ContentReader(source, shared, range(len(source.dataset)), folder / "none")
+        found.append([])
+        for number in range(len(source.dataset)):
+            found[-1].append(reader.read(number))
+            done += 1
+            if progress is not None:
+                progress(done, total)
+    return found
+
+
+def _compared(
+    sources: tuple[Source, Source],
+    shared: Shared,
+    contents: Sequence[Sequence[EpisodeContent]],
+    changed: Mapping[int, int],
+    folder: Path,
+) -> Iterator[Difference]:
+    readers = (
+        ContentReader(sources[0], shared, changed.keys(), folder / "a"),
+        ContentReader(sources[1], shared, changed.values(), folder / "b"),
+    )
+    comparer = EpisodeComparer(sources, readers, shared)
+    for n, m in changed.items():
+        one, other = contents[0][n].images, contents[1][m].images
+        equal = {name: digest is not None and digest == other[name] for name, digest in one.items()}
+        yield from comparer.differences(n, m, equal)
+
+
+def _one_sided(sources: tuple[Source, Source], episode: tuple[int | None, int | None]) -> Difference:
+    side = 0 if episode[1] is None else 1
+    number = episode[side]
+    assert number is not None
+    length = sources[side].dataset.places[number].length
+    name = "missing" if side == 0 else "extra"
+    return Difference(level="episodes", name=name, episodes=episode, details={"frames": length},
+                      text=f"episode {number} of {'AB'[side]}, {length} frames, is not in {'BA'[side]}")  # fmt: skip
+
+
+def _tasks(
+    sources: tuple[Source, Source],
+    found: Sequence[Difference],
+    unmatched: Sequence[tuple[int | None, int | None]],
+) -> list[Difference]:
+    """The differences so far, less those that a reworded task explains, and what differs in the tables of tasks."""
+    tables = tuple(set(source.dataset.tasks) for source in sources)
+    only = (tables[0] - tables[1], tables[1] - tables[0])
+    kept: list[Difference] = []
+    reworded: dict[tuple[str, str], list[int]] = {}
+    for item in found:
+        pairs = item.details.get("texts", ()) if item.name == TASK and item.level == "rows" else ()
+        if pairs and all(x in only[0] and y in only[1] for x, y in pairs) and item.episodes is not None:
+            for pair in pairs:
+                reworded.setdefault(pair, []).append(item.episodes[0] or 0)
+        else:
+            kept.append(item)
+    for (x, y), episodes in sorted(reworded.items()):
+        kept.append(Difference(level="tasks", name=x, text=f"{x!r} is {y!r} in B", details={"b": y, "of": episodes}))
+    for side in (0, 1):
+        explained = {pair[side] for pair in reworded}
+        for item in kept:
+            explained |= {texts[side] for texts in item.details.get("texts", ())}
+        for episode in unmatched:
+            if (number := episode[side]) is not None:
+                explained |= set(sources[side].dataset.places[number].tasks)
+        for task in sorted(only[side] - explained):
+            kept.append(Difference(level="tasks", name=task, text=f"{task!r} is not in {'BA'[side]}"))
+    return kept
+
+
+def _info(sources: tuple[Source, Source]) -> Iterator[Difference]:
+    a, b = (source.info for source in sources)
+    others = [{name: value for name, value in info.other.items() if name not in _OLD_TOTALS} for info in (a, b)]
+    values = [{"fps": info.fps, "robot_type": info.robot_type, **other}
+              for info, other in zip((a, b), others, strict=True)]  # fmt: skip
+    yield from _fields("info", "", values)
+    for name in ("total_episodes", "total_frames", "total_tasks"):
+        claims = [getattr(info, name) for info in (a, b)]
+        counts = [_count(source, name) for source in sources]
+        if claims[0] - counts[0] != claims[1] - counts[1]:
+            text = f"{name} is {claims[0]} for {counts[0]} that are there, in B {claims[1]} for {counts[1]}"
+            yield Difference(level="info", name=name, text=text, details={"a": claims[0], "b": claims[1]})
+
+
+def _count(source: Source, total: str) -> int:
+    if total == "total_frames":
+        return sum(place.length for place in source.dataset.places)
+    return len(source.dataset.tasks if total == "total_tasks" else source.dataset)
+
+
+def _fields(level: Any, of: str, values: Sequence[Mapping[str, Any]]) -> Iterator[Difference]:
+    """What two objects have under the same names."""
+    a, b = values
+    for name in dict.fromkeys((*a, *b)):
+        if name in a and name in b and _is_equal(a[name], b[name]):
+            continue
+        shown = [repr(side[name]) if name in side else "not there" for side in (a, b)]
+        shown = [text if len(text) <= 120 else f"{text[:120]}..." for text in shown]
+        text = f"{of}{name} is {shown[0]}, in B {shown[1]}"
+        yield Difference(level=level, name=f"{of}{name}", text=text)
+
+
+def _is_equal(a: Any, b: Any) -> bool:
+    return bool(a == b) or (a != a and b != b)
+
+
+def _features(sources: tuple[Source, Source]) -> Iterator[Difference]:
+    a, b = (source.info.features for source in sources)
+    for name in dict.fromkeys((*a, *b)):
+        if name not in a or name not in b:
+            yield Difference(level="features", name=name, text=f"{name} is not in {'A' if name not in a else 'B'}")
+            continue
+        is_same_type = a[name].dtype == b[name].dtype
+        yield from _fields("features", f"{name}: ", [_described(entry[name], is_same_type) for entry in (a, b)])
+
+
+def _described(feature: DatasetFeature, with_encoding: bool) -> dict[str, Any]:
+    encoding = feature.info or {} if with_encoding else {}
+    return {"dtype": feature.dtype, "shape": feature.shape, "names": feature.names, **encoding}
+
+
+def _facts(
+    sources: tuple[Source, Source], pairs: Mapping[int, int], contents: Sequence[Sequence[EpisodeContent]]
+) -> Iterator[Difference]:
+    """What the tables of episodes and demorec's sidecar state of the same episode."""
+    rows = [[{**row, **facts} for row, facts in zip(source.columns(), source.facts, strict=True)] for source in sources]
+    names = [{name for row in side for name in row} - _FOLLOWS for side in rows]
+    for name in sorted(names[0] ^ names[1]):
+        side = 0 if name in names[0] else 1
+        if any(row.get(name) is not None for row in rows[side]):
+            yield Difference(level="episodes", name=name, text=f"the column {name} is not in {'BA'[side]}")
+    is_same_rate = sources[0].info.fps == sources[1].info.fps
+    for n, m in pairs.items():
+        one, other = rows[0][n], rows[1][m]
+        if one["tasks"] != other["tasks"] and contents[0][n].rows[TASK] == contents[1][m].rows[TASK]:
+            text = f"its tasks are {one['tasks']} in the table of episodes, {other['tasks']} in B"
+            yield Difference(level="episodes", name="tasks", text=text, episodes=(n, m))
+        is_same_length = one["length"] == other["length"] and is_same_rate
+        for name in sorted(names[0] & names[1] - (set() if is_same_length else {"duration_s"})):
+            if not _is_equal(one.get(name), other.get(name)):
+                text = f"{name} is {one.get(name)!r}, in B {other.get(name)!r}"
+                yield Difference(level="episodes", name=name, text=text, episodes=(n, m))
+
+
+def _statistics(
+    sources: tuple[Source, Source], found: Sequence[Difference], *, is_reordered: bool
+) -> Iterator[Difference]:
+    """Of features whose rows and images are all the same: else statistics differ as they should."""
+    tables = [_stats(source) for source in sources]
+    if any(not table and source.info.is_old for table, source in zip(tables, sources, strict=True)):
+        return  # v2.1 has those of each episode only
+    episodes = [item for item in found if item.level in ("episodes", "rows", "images") and item.episodes is not None]
+    if any(item.name in ("missing", "extra", "length") and item.level == "episodes" for item in episodes):
+        return
+    differing = {item.name for item in episodes if item.level in ("rows", "images")}
+    differing |= {item.name.partition(": ")[0] for item in found if item.level == "features"}
+    tasks = [source.dataset.tasks for source in sources]
+    if is_reordered:
+        differing |= set(_PLACES)
+    if tasks[0] != tasks[1] or TASK in differing:
+        differing.add("task_index")
+    for name in sources[0].info.features:
+        entries = [table.get(name) for table in tables]
+        if name in differing or name not in sources[1].info.features or entries == [None, None]:
+            continue
+        a, b = (entry if isinstance(entry, dict) else {} for entry in entries)
+        wrong = [key for key in dict.fromkeys((*a, *b)) if not _is_close(a, b, key)]
+        if wrong:
+            shown = f"{_numbers(a, wrong[0])} and {_numbers(b, wrong[0])}"
+            yield Difference(level="statistics", name=name, details={"of": wrong},
+                             text=f"{name} differs in {', '.join(wrong)}: {shown}")  # fmt: skip
+
+
+def _stats(source: Source) -> dict[str, Any]:
+    path = source.root / STATS_PATH
+    if not path.exists():
+        return {}
+    try:
+        found = read_json(path)
+        if not isinstance(found, dict):
+            raise ValueError("it is no object")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
+    return found
+
+
+def _is_close(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:
+    try:
+        x, y = (np.asarray(entry[key], dtype=np.float64).ravel() for entry in (a, b))
+        low, high = (np.asarray(a.get(name, 0.0), dtype=np.float64).ravel() for name in ("min", "max"))
+        scale = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(high - low))
+        near = (np.abs(x - y) <= _TOLERANCE * scale) | (np.isnan(x) & np.isnan(y)) | (x == y)
+        return x.shape == y.shape and bool(near.all())
+    except (KeyError, ValueError, TypeError):
+        return False
+
+
+def _numbers(entry: Mapping[str, Any], key: str) -> str:
+    if key not in entry:
+        return "nothing"
+    text = str(np.asarray(entry[key]).ravel().tolist())
+    return text if len(text) <= 80 else f"{text[:80]}..."
+
+
+def _notes(sources: tuple[Source, Source], result: DatasetDiff) -> Iterator[str]:
+    a, b = (source.info for source in sources)
+    if result.is_reordered:
+        moved = [f"{n} is {m}" for n, m in result.pairs.items() if n != m]
+        more = f" and {len(moved) - 8} more" if len(moved) > 8 else ""
+        yield f"The same episodes in another order, A to B: {', '.join(moved[:8])}{more}."
+    tasks = [source.dataset.tasks for source in sources]
+    if tasks[0] != tasks[1] and set(tasks[0]) == set(tasks[1]):
+        yield "The same tasks under other numbers."
+    if list(a.features) != list(b.features) and set(a.features) == set(b.features):
+        yield "The same features in another order."
+    for name in _STORAGE:
+        if getattr(a, name) != getattr(b, name):
+            yield f"Stored in another way: {name} is {getattr(a, name)}, in B {getattr(b, name)}."

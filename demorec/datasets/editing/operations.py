@@ -1,0 +1,199 @@
+"""Each operation makes a plan of a dataset: nothing is written here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from demorec.core.errors import ConfigError
+from demorec.core.registry import nearest_match
+from demorec.datasets.editing.plan import Plan, Source, Take
+from demorec.datasets.editing.where import Condition
+from demorec.datasets.editing.write import Rows
+from demorec.datasets.lerobot.files import column_numbers
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
+
+_SHARE_TOLERANCE = 1e-6
+
+
+def chosen(source: Source, where: str = "", episodes: Sequence[int] | None = None) -> list[int]:
+    """Numbers of the episodes for which a condition holds, and that are among some; ConfigError for impossible ones."""
+    rows = source.columns()
+    if episodes is not None and (wrong := [number for number in episodes if not 0 <= number < len(rows)]):
+        raise ConfigError(f"There is no episode {wrong[0]}: the dataset has 0 to {len(rows) - 1}: {source.root}")
+    found = list(range(len(rows))) if episodes is None else list(dict.fromkeys(episodes))
+    if where:
+        condition = Condition(where, _names(rows))
+        found = [number for number in found if condition.holds(rows[number])]
+    return found
+
+
+def _names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def select(source: Source, numbers: Sequence[int], *, drop: bool = False) -> Plan:
+    """Those episodes, in the dataset's order, or all others."""
+    plan = Plan.whole(source)
+    wanted = set(numbers)
+    return plan.with_cuts([cut for cut in plan.cuts if (cut.episode in wanted) != drop])
+
+
+def reorder(source: Source, by: str = "", order: Sequence[int] = (), *, descending: bool = False) -> Plan:
+    """All episodes, sorted by a column, those without a value last, or in a given order."""
+    plan = Plan.whole(source)
+    if bool(by) == bool(order):
+        raise ConfigError("Give either --by or --order.")
+    if order:
+        if sorted(order) != list(range(len(plan.cuts))):
+            raise ConfigError(f"--order names each of the {len(plan.cuts)} episodes once, from 0 on.")
+        return plan.with_cuts([plan.cuts[number] for number in order])
+    rows = source.columns()
+    if by not in (names := _names(rows)):
+        raise ConfigError(f"There is no column {by!r}.{nearest_match(by, names)}")
+    known = [number for number, row in enumerate(rows) if row.get(by) is not None]
+    try:
+        known.sort(key=lambda number: rows[number][by], reverse=descending)
+    except TypeError as error:
+        raise ConfigError(f"The values of {by} cannot be sorted.") from error
+    rest = [number for number in range(len(rows)) if rows[number].get(by) is None]
+    return plan.with_cuts([plan.cuts[number] for number in (*known, *rest)])
+
+
+def shuffle(source: Source, seed: int) -> Plan:
+    """All episodes in an order that the seed decides."""
+    plan = Plan.whole(source)
+    order = np.random.default_rng(seed).permutation(len(plan.cuts)).tolist()
+    return plan.with_cuts([plan.cuts[number] for number in order])
+
+
+def trim(source: Source, head: int, tail: int) -> Plan:
+    """Every episode without its first and last frames."""
+    if min(head, tail) < 0:
+        raise ConfigError("A number of frames is cut off, at least 0.")
+    plan = Plan.whole(source)
+    if short := [cut.episode for cut in plan.cuts if cut.last <= head + tail]:
+        raise ConfigError(f"Nothing would be left of {len(short)} episodes, {short[0]} among them: drop them first.")
+    return plan.with_cuts([replace(cut, first=head, last=cut.last - tail) for cut in plan.cuts])
+
+
+def trim_idle(source: Source, feature: str, threshold: float, margin: int) -> Plan:
+    """Every episode without the frames in which nothing moves at its beginning and end.
+
+    Args:
+        source: The dataset.
+        feature: Whose numbers are looked at.
+        threshold: Nothing moves where no number changes by more than this share of its range over the dataset.
+        margin: Frames that stay at either end.
+    """
+    if feature not in source.info.features or not source.info.features[feature].is_numeric:
+        numeric = [name for name, item in source.info.features.items() if item.is_numeric]
+        raise ConfigError(f"There are no numbers called {feature!r}.{nearest_match(feature, numeric)}")
+    if not threshold > 0 or margin < 0:
+        raise ConfigError("The threshold is a share above 0, the margin a number of frames of at least 0.")
+    plan = Plan.whole(source)
+    order = [cut.episode for cut in plan.cuts]
+
+    def numbers() -> Any:
+        rows = Rows(source, [feature], order, source.root)
+        for cut in plan.cuts:
+            yield cut, column_numbers(rows.read(cut.episode).column(feature).combine_chunks()).astype(np.float64)
+
+    low, high = np.inf, -np.inf
+    for _, values in numbers():
+        low, high = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0))
+    least = threshold * np.asarray(high - low)
+    cuts = []
+    for cut, values in numbers():
+        # Where it came to, against where it began and ends: slow motion counts as well.
+        away_from_start = np.flatnonzero((np.abs(values - values[0]) > least).any(axis=1))
+        away_from_end = np.flatnonzero((np.abs(values - values[-1]) > least).any(axis=1))
+        if not len(away_from_start):
+            cuts.append(cut)  # nothing moves at all: that is for `drop` to decide
+            continue
+        first = max(0, int(away_from_start[0]) - 1 - margin)
+        last = min(cut.last, int(away_from_end[-1]) + 2 + margin)
+        cuts.append(replace(cut, first=first, last=max(last, first + 1)))
+    return plan.with_cuts(cuts)
+
+
+def split(source: Source, shares: Mapping[str, float], seed: int, *, by: str = "") -> dict[str, Plan]:
+    """Name -> part of the dataset; each value of the column `by` is shared out alike, and every part has episodes.
+
+    Episodes stay in the dataset's order. Raises ConfigError for impossible shares.
+    """
+    if len(shares) < 2 or min(shares.values()) <= 0 or abs(sum(shares.values()) - 1) > _SHARE_TOLERANCE:
+        raise ConfigError("Shares are two or more numbers above 0 whose sum is 1, such as train=0.8 val=0.2.")
+    plan, rows = Plan.whole(source), source.columns()
+    if by and by not in (names := _names(rows)):
+        raise ConfigError(f"There is no column {by!r}.{nearest_match(by, names)}")
+    groups: dict[str, list[int]] = {}
+    for number, row in enumerate(rows):
+        groups.setdefault(str(row.get(by)) if by else "", []).append(number)
+    ends = np.cumsum(list(shares.values()))
+    found: dict[str, set[int]] = {name: set() for name in shares}
+    rng = np.random.default_rng(seed)
+    for group in groups.values():
+        order = rng.permutation(group)
+        begins = [0, *np.rint(ends * len(order)).astype(int).tolist()]
+        for name, begin, end in zip(shares, begins, begins[1:], strict=False):
+            found[name] |= set(order[begin:end].tolist())
+    if empty := [name for name, numbers in found.items() if not numbers]:
+        raise ConfigError(f"No episode would be in {empty[0]}: the dataset has {len(rows)}.")
+    return {name: plan.with_cuts([plan.cuts[number] for number in sorted(numbers)]) for name, numbers in found.items()}
+
+
+def set_task(source: Source, task: str, numbers: Sequence[int]) -> Plan:
+    """All episodes, some with another instruction."""
+    if not task.strip() or not task.isprintable():
+        raise ConfigError("An instruction is a line of text.")
+    plan = Plan.whole(source)
+    wanted = set(numbers)
+    return plan.with_cuts([replace(cut, task=task) if cut.episode in wanted else cut for cut in plan.cuts])
+
+
+def rename(source: Source, names: Mapping[str, str]) -> Plan:
+    """All episodes with features under other names; ConfigError for names that are not there, fixed or taken."""
+    plan = Plan.whole(source)
+    _check_features(source, names)
+    kept = [names.get(name, name) for name in plan.info.features]
+    for name in names.values():
+        if not name.isprintable() or "/" in name or not name or name.startswith(".") or ".." in name:
+            raise ConfigError(f"A feature cannot be called {name!r}: letters, digits, dots and underscores, no slash.")
+    if twice := [name for name in kept if kept.count(name) > 1]:
+        raise ConfigError(f"Two features would be called {twice[0]!r}.")
+    features = {names.get(name, name): feature for name, feature in plan.info.features.items()}
+    return plan.with_features(features, [{names.get(name, name): take for name, take in plan.takes[0].items()}])
+
+
+def drop_features(source: Source, names: Sequence[str]) -> Plan:
+    """All episodes without some features."""
+    plan = Plan.whole(source)
+    _check_features(source, names)
+    features = {name: feature for name, feature in plan.info.features.items() if name not in names}
+    if set(features) <= set(AUTOMATIC_FEATURES):
+        raise ConfigError("No feature would be left.")
+    return plan.with_features(features, [{name: take for name, take in plan.takes[0].items() if name in features}])
+
+
+def _check_features(source: Source, names: Mapping[str, str] | Sequence[str]) -> None:
+    for name in names:
+        if name in AUTOMATIC_FEATURES or source.info.features.get(name, None) is None:
+            own = [known for known in source.info.features if known not in AUTOMATIC_FEATURES]
+            raise ConfigError(f"There is no feature {name!r} that can be changed.{nearest_match(name, own)}")
+
+
+def joined(plans: Sequence[Plan]) -> Plan:
+    """Plans of one source each, with the same features, one after the other."""
+    sources = tuple(source for plan in plans for source in plan.sources)
+    cuts = [replace(cut, source=number) for number, plan in enumerate(plans) for cut in plan.cuts]
+    takes: tuple[Mapping[str, Take], ...] = tuple(take for plan in plans for take in plan.takes)
+    other = {
+        name: value
+        for name, value in plans[0].info.other.items()
+        if all(plan.info.other.get(name) == value for plan in plans)
+    }
+    return Plan(sources=sources, cuts=tuple(cuts), info=replace(plans[0].info, other=other), takes=takes)

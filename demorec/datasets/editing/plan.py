@@ -1,0 +1,194 @@
+"""What an edit makes: which frames of which episodes of which datasets, and which features they have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import ConfigError, ExportError
+from demorec.datasets.lerobot.episodes import LeRobotDataset
+from demorec.datasets.lerobot.files import open_table, read_json_lines, table_batches
+from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, DatasetFeature, DatasetInfo
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+
+_PLACED = ("stats/", "videos/", "data/", "meta/")
+_FIXED = frozenset(("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"))
+_BESIDE = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
+
+
+class Source:
+    """A dataset that is edited.
+
+    Attributes:
+        root, info: Its folder and what info.json says.
+        dataset: It, opened.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.dataset = LeRobotDataset(root)
+        self.info: DatasetInfo = self.dataset.info
+        if any(len(feature.shape) > 1 and feature.is_numeric for feature in self.info.features.values()):
+            raise ExportError(f"Features that are arrays of several dimensions are not edited yet: {root}")
+
+    @cached_property
+    def fact_types(self) -> Mapping[str, Any]:
+        """Columns of the table of episodes that state facts -> Arrow type; empty before v3.0."""
+        tables = sorted((self.root / "meta" / "episodes").glob("*/*.parquet"))
+        schema = open_table(tables[0]).schema_arrow if tables else ()
+        return {
+            item.name: item.type for item in schema if item.name not in _FIXED and not item.name.startswith(_PLACED)
+        }
+
+    @cached_property
+    def facts(self) -> list[dict[str, Any]]:
+        """The values of these columns, by episode in order."""
+        if self.info.is_old:
+            return [{} for _ in self.dataset.places]
+        return self._columns(self.root / "meta", tuple(self.fact_types))
+
+    def _columns(self, folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
+        tables = sorted((folder / "episodes").glob("*/*.parquet"))
+        found: list[dict[str, Any]] = []
+        for path in tables:
+            there = [name for name in ("episode_index", *names) if name in open_table(path).schema_arrow.names]
+            for batch in table_batches(path, there):
+                found += batch.to_pylist()
+        return found
+
+    @cached_property
+    def has_sidecar(self) -> bool:
+        """Whether demorec keeps something beside its episodes."""
+        return any((self.root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+
+    def columns(self) -> list[dict[str, Any]]:
+        """What episodes are chosen and ordered by: name -> value, by episode in order."""
+        found = [
+            {
+                "episode_index": place.episode_index,
+                "num_frames": place.length,
+                "length": place.length,
+                "duration_s": place.length / self.info.fps,
+                "task": "; ".join(place.tasks),
+                "tasks": list(place.tasks),
+            }
+            for place in self.dataset.places
+        ]
+        if self.info.is_old:
+            lines = read_json_lines(self.root / OLD_EPISODES_PATH)
+            for row, line in zip(found, lines, strict=True):
+                row |= {name: value for name, value in line.items() if name not in row}
+        beside = {row["episode_index"]: row for row in self._columns(self.root / SIDECAR_DIR, _BESIDE)}
+        for row, facts in zip(found, self.facts, strict=True):
+            known = {**beside.get(row["episode_index"], {}), **facts}
+            row |= {name: value for name, value in known.items() if name not in row}
+        return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Take:
+    """How a feature of the new dataset comes from one of a source.
+
+    Attributes:
+        feature: Its name there; "" for one that is filled with `fill`.
+        elements: For each element the number of the one that it comes from, -1 for `fill`; None for all as they are.
+        scale, offset: (D,) what numbers are multiplied by, and what is added then; None for neither.
+        fill: (D,) what elements have that come from nowhere.
+    """
+
+    feature: str
+    elements: tuple[int, ...] | None = None
+    scale: NDArray[np.float64] | None = None
+    offset: NDArray[np.float64] | None = None
+    fill: NDArray[np.float64] | None = None
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether every bit stays."""
+        return bool(self.feature) and self.elements is None and self.scale is None
+
+    def apply(self, values: NDArray[Any], dtype: str) -> NDArray[Any]:
+        """(T, D) of the new feature from (T, E) of the source's."""
+        if self.elements is None:
+            found = values.astype(np.float64)
+        else:
+            filled = np.zeros(len(self.elements)) if self.fill is None else self.fill
+            found = np.tile(filled, (len(values), 1))
+            chosen = np.array(self.elements)
+            found[:, chosen >= 0] = values[:, chosen[chosen >= 0]]
+        if self.scale is not None:
+            offset = 0.0 if self.offset is None else self.offset
+            converted = found * self.scale + offset
+            keeps = np.zeros(found.shape[1], np.bool_) if self.elements is None else np.array(self.elements) < 0
+            found = np.where(keeps, found, converted)
+        return found.astype(dtype)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cut:
+    """The frames from `first` to before `last` of an episode.
+
+    Attributes:
+        source: Number of the dataset.
+        episode: Number of the episode in it.
+        task: Instruction instead of its own; "" for its own.
+    """
+
+    source: int
+    episode: int
+    first: int
+    last: int
+    task: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """A dataset to be written.
+
+    Attributes:
+        sources: What it is made from.
+        cuts: Its episodes in order.
+        info: Of the new dataset: features, rate, robot, sizes of files.
+        takes: For each source: feature of the new dataset -> where it comes from, less the automatic ones.
+    """
+
+    sources: tuple[Source, ...]
+    cuts: tuple[Cut, ...]
+    info: DatasetInfo
+    takes: tuple[Mapping[str, Take], ...]
+    notes: tuple[str, ...] = field(default=())
+
+    @classmethod
+    def whole(cls, source: Source) -> Plan:
+        """All of a dataset as it is."""
+        from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, CODEBASE_VERSION, DATA_PATH, VIDEO_PATH
+
+        own = {name: feature for name, feature in source.info.features.items() if name not in AUTOMATIC_FEATURES}
+        spoken = {name: feature for name, feature in own.items() if feature.dtype == "language"}
+        features = {**{k: v for k, v in own.items() if k not in spoken}, **AUTOMATIC_FEATURES, **spoken}
+        info = replace(
+            source.info, features=features, version=CODEBASE_VERSION, data_path=DATA_PATH, video_path=VIDEO_PATH,
+            fps=int(source.info.fps), chunks_size=int(source.info.chunks_size),
+            other={} if source.info.is_old else source.info.other,
+        )  # fmt: skip
+        cuts = tuple(
+            Cut(source=0, episode=number, first=0, last=place.length)
+            for number, place in enumerate(source.dataset.places)
+        )
+        return cls(sources=(source,), cuts=cuts, info=info, takes=({name: Take(feature=name) for name in own},))
+
+    def with_cuts(self, cuts: Sequence[Cut]) -> Plan:
+        """Other episodes; ConfigError when none is left."""
+        if not cuts:
+            raise ConfigError("No episode would be left: choose others.")
+        return replace(self, cuts=tuple(cuts))
+
+    def with_features(self, features: Mapping[str, DatasetFeature], takes: Sequence[Mapping[str, Take]]) -> Plan:
+        """Other features."""
+        return replace(self, info=replace(self.info, features=dict(features)), takes=tuple(takes))

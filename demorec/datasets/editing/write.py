@@ -1,0 +1,328 @@
+"""Writes a planned dataset in one pass: rows and packets pass through, counters and statistics are made anew."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from demorec.core.errors import ExportError
+from demorec.datasets.editing.beside import Beside
+from demorec.datasets.editing.packets import PacketCutter
+from demorec.datasets.editing.plan import Cut, Plan, Source, Take
+from demorec.datasets.lerobot.files import column_numbers, read_json_lines, read_table
+from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
+from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.mp4 import EncodedVideo
+from demorec.datasets.lerobot.paths import CARD_PATH, DATASET
+from demorec.datasets.lerobot.reader import EpisodePlace, RowStream
+from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
+from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
+from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
+from demorec.datasets.options import ProgressCallback
+from demorec.datasets.staging import CODED, staged_folder
+
+_OLD_STATS = "meta/episodes_stats.jsonl"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditReport:
+    """What came out.
+
+    Attributes:
+        path: The dataset.
+        num_episodes, num_frames: In it.
+        decoded: Episodes of which images were decoded for their statistics.
+        lead: Images in front of cuts that stay in the videos, since later ones are decoded from them.
+        left_out: Files of the sources that were not taken over.
+    """
+
+    path: Path
+    num_episodes: int
+    num_frames: int
+    decoded: int
+    lead: int
+    left_out: tuple[str, ...] = ()
+
+
+def write_plan(
+    plan: Plan, out: Path, *, overwrite: bool = False, decode: bool = False, progress: ProgressCallback | None = None
+) -> EditReport:
+    """Write the dataset: whole, or not at all; its sources are not touched.
+
+    Args:
+        plan: What.
+        out: Its folder.
+        overwrite: Whether a dataset that is there is replaced.
+        decode: Decode all images for their statistics, also of episodes whose own are known.
+        progress: Called after every episode.
+
+    Raises:
+        ConfigError: Something is in the way at `out`.
+        ExportError: A source is damaged, or the disk is full; what was at `out` is still there then.
+    """
+    roots = [source.root for source in plan.sources]
+    with staged_folder(out, DATASET, replace=overwrite, sources=roots) as folder:
+        aside = folder.with_name(CODED)
+        aside.mkdir(exist_ok=True)
+        readers = [_Reader(plan, number, aside, decode=decode) for number in range(len(plan.sources))]
+        with (
+            DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
+            Beside(plan, folder, aside) as beside,
+        ):
+            lead = 0
+            for done, cut in enumerate(plan.cuts, start=1):
+                data = readers[cut.source].episode(cut)
+                lead += sum(video.lead for video in data.videos.values())
+                beside.add(cut, writer.add(data))
+                if progress is not None:
+                    progress(done, len(plan.cuts))
+            info = writer.finish()
+            left_out = beside.finish()
+        if len(roots) == 1 and (roots[0] / CARD_PATH).is_file():
+            shutil.copy2(roots[0] / CARD_PATH, folder / CARD_PATH)
+    return EditReport(
+        path=out,
+        num_episodes=info.total_episodes,
+        num_frames=info.total_frames,
+        decoded=sum(reader.num_decoded for reader in readers),
+        lead=lead,
+        left_out=left_out,
+    )
+
+
+def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
+    """Columns of facts of all sources; of two types for one name the first one's."""
+    found: dict[str, pa.DataType] = {}
+    for source in plan.sources:
+        found = {**source.fact_types, **found}
+    return found
+
+
+class _Reader:
+    """The episodes of one source as the plan wants them."""
+
+    def __init__(self, plan: Plan, number: int, aside: Path, *, decode: bool) -> None:
+        self.source: Source = plan.sources[number]
+        self.num_decoded = 0
+        self._features, self._fps = plan.info.features, plan.info.fps
+        self._takes: Mapping[str, Take] = plan.takes[number]
+        self._decode = decode
+        info = self.source.info
+        names = {take.feature for take in self._takes.values() if take.feature}
+        self._names = [name for name in info.features if name in names and not info.features[name].is_video]
+        order = [cut.episode for cut in plan.cuts if cut.source == number]
+        self._rows = Rows(self.source, [*self._names, "task_index"], order, aside / f"rows_{number}.arrow")
+        self._cutters = {key: PacketCutter(self.source.root, info, key) for key in info.video_keys if key in names}
+        self._known = _ImageStatistics(self.source) if not decode else None
+
+    def episode(self, cut: Cut) -> EpisodeData:
+        """Read an episode."""
+        place, source = self.source.dataset.places[cut.episode], self.source
+        rows = self._rows.read(cut.episode).slice(cut.first, cut.last - cut.first)
+        whole = (cut.first, cut.last) == (0, place.length)
+        columns: dict[str, Any] = {}
+        videos: dict[str, EncodedVideo] = {}
+        video_info: dict[str, dict[str, Any]] = {}
+        pixels: dict[str, PixelHistogram | Statistics] = {}
+        language = EpisodeLanguage()
+        num_decoded = 0
+        for name, take in self._takes.items():
+            feature = self._features[name]
+            if feature.dtype == "language":
+                language = self._language(rows, cut)
+                continue
+            if feature.is_video:
+                videos[name] = self._cutters[take.feature].cut(place, cut.first, cut.last)
+                video_info[name] = feature.info or self._cutters[take.feature].stream_info(place)
+            else:
+                columns[name] = self._column(rows, take, feature)
+            if feature.is_camera:
+                known = self._known.of(place, take.feature) if whole and self._known is not None else None
+                pixels[name] = known or pixel_histogram(source, take.feature, place, cut.first, cut.last)
+                num_decoded += known is None
+        self.num_decoded += num_decoded > 0
+        tasks = [cut.task] if cut.task else self._tasks(rows)
+        return EpisodeData(
+            task=tasks[0],
+            columns=columns,
+            videos=videos,
+            video_info=video_info,
+            pixels=pixels,
+            language=language,
+            facts=self._facts(cut, place),
+            row_tasks=tasks if len(set(tasks)) > 1 else (),
+        )
+
+    def _column(self, rows: pa.Table, take: Take, feature: DatasetFeature) -> Any:
+        if not take.feature:
+            return take.apply(np.zeros((rows.num_rows, 0)), feature.dtype)
+        array = rows.column(take.feature).combine_chunks()
+        array = array if isinstance(array, pa.Array) else pa.concat_arrays(array.chunks)
+        if not take.is_copy:
+            return take.apply(column_numbers(array), feature.dtype)
+        if feature.dtype == "image":
+            array = pa.StructArray.from_arrays(
+                [array.field("bytes"), array.field("path").cast(pa.string())], names=["bytes", "path"]
+            )
+        return array
+
+    def _tasks(self, rows: pa.Table) -> list[str]:
+        tasks, found = self.source.dataset.tasks, rows.column("task_index").to_pylist()
+        if any(not isinstance(index, int) or not 0 <= index < len(tasks) for index in found):
+            raise ExportError(f"A row names a task that is not in the table of tasks: {self.source.root}")
+        return [tasks[index] for index in found]
+
+    def _language(self, rows: pa.Table, cut: Cut) -> EpisodeLanguage:
+        """What is said in these rows, times counted from the first of them."""
+        spoken = spoken_of(rows.select(COLUMNS).to_batches(), self.source.root)
+        latest: dict[str, dict[str, Any]] = {}
+        kept = []
+        for row in spoken.persistent:
+            time = row.get("timestamp")
+            frame = None if time is None else round(time * self._fps) - cut.first
+            if frame is None or not cut.first:
+                kept.append(row)
+            elif frame <= 0:
+                latest[str(row.get("style"))] = {**row, "timestamp": 0.0}
+            elif frame < cut.last - cut.first:
+                kept.append({**row, "timestamp": frame / self._fps})
+        if cut.first == 0:
+            end = (cut.last - 0.5) / self._fps
+            kept = [row for row in kept if row.get("timestamp") is None or row["timestamp"] < end]
+        return EpisodeLanguage(persistent=[*latest.values(), *kept], events=spoken.events)
+
+    def _facts(self, cut: Cut, place: EpisodePlace) -> dict[str, Any]:
+        facts = {name: value for name, value in self.source.facts[cut.episode].items() if name != "episode_index"}
+        if "duration_s" in facts:
+            facts["duration_s"] = (cut.last - cut.first) / self._fps
+        if (cut.first, cut.last) != (0, place.length):
+            for head in ("sparse", "dense"):
+                facts |= _clipped_stages(facts, head, cut)
+        return facts
+
+
+def _clipped_stages(facts: Mapping[str, Any], head: str, cut: Cut) -> dict[str, Any]:
+    """The stages of an episode within a cut, frames counted from its first one."""
+    names, starts, ends = (facts.get(f"{head}_subtask_{part}") for part in ("names", "start_frames", "end_frames"))
+    if not names or not starts or not ends:
+        return {}
+    kept = [
+        (name, max(start, cut.first) - cut.first, min(end, cut.last - 1) - cut.first)
+        for name, start, end in zip(names, starts, ends, strict=True)
+        if start < cut.last and end >= cut.first
+    ]
+    parts = zip(*kept, strict=True)
+    return dict(zip((f"{head}_subtask_{part}" for part in ("names", "start_frames", "end_frames")), map(list, parts),
+                    strict=True))  # fmt: skip
+
+
+class Rows:
+    """Rows of a dataset's episodes in any order, in one pass over the files: set aside unless asked for in order."""
+
+    def __init__(self, source: Source, names: list[str], order: list[int], aside: Path) -> None:
+        self._source = source
+        self._stream = RowStream(source.root, source.info, names, rows=4096 if _is_narrow(source, names) else 64)
+        self._places: dict[int, list[int]] = {}
+        self._file: Any = None
+        if order != sorted(order):
+            self._set_aside(sorted(set(order)), aside)
+
+    def _set_aside(self, episodes: Iterable[int], path: Path) -> None:
+        writer, count = None, 0
+        for episode in episodes:
+            for batch in self._batches(episode):
+                writer = writer or pa.ipc.new_file(str(path), batch.schema)
+                writer.write_batch(batch)
+                self._places.setdefault(episode, []).append(count)
+                count += 1
+        if writer is not None:
+            writer.close()
+            self._file = pa.ipc.open_file(pa.memory_map(str(path)))
+
+    def _batches(self, episode: int) -> Iterator[pa.RecordBatch]:
+        return self._stream.batches(self._source.dataset.places[episode])
+
+    def read(self, episode: int) -> pa.Table:
+        """All rows of an episode."""
+        if self._file is None:
+            batches = list(self._batches(episode))
+        else:
+            batches = [self._file.get_batch(number) for number in self._places[episode]]
+        if not batches:
+            raise ExportError(f"Episode {episode} has no frames, drop it: {self._source.root}")
+        return pa.Table.from_batches(batches)
+
+
+def _is_narrow(source: Source, names: list[str]) -> bool:
+    return all(source.info.features[name].dtype not in ("string", "image", "language") for name in names)
+
+
+class _ImageStatistics:
+    """The statistics of images that a dataset keeps of each episode."""
+
+    def __init__(self, source: Source) -> None:
+        keys = [name for name, feature in source.info.features.items() if feature.is_camera]
+        self._found: dict[tuple[int, str], Statistics] = {}
+        for number, key, entry in _old_statistics(source, keys) if source.info.is_old else _entries(source, keys):
+            try:
+                part = Statistics.from_json(entry)
+            except (ValueError, TypeError):
+                part = None
+            if part is not None and all(np.isfinite(value).all() for value in part.values.values()):
+                self._found[number, key] = replace(part, is_camera=True)
+
+    def of(self, place: EpisodePlace, key: str) -> Statistics | None:
+        """Those of an episode, weighted by its frames; None where they are not kept."""
+        found = self._found.get((place.episode_index, key))
+        return None if found is None else replace(found, count=min(found.count, place.length))
+
+
+def _entries(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    for path in sorted((source.root / "meta" / "episodes").glob("*/*.parquet")):
+        from demorec.datasets.lerobot.files import open_table
+
+        there = open_table(path).schema_arrow.names
+        complete = [key for key in keys if all(f"stats/{key}/{name}" in there for name in NAMES)]
+        names = ["episode_index", *(f"stats/{key}/{name}" for key in complete for name in NAMES)]
+        for row in read_table(path, names).to_pylist():
+            for key in complete:
+                entry = {name: row[f"stats/{key}/{name}"] for name in NAMES}
+                if None not in entry.values():
+                    yield row["episode_index"], key, entry
+
+
+def _old_statistics(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    path = source.root / _OLD_STATS
+    for line in read_json_lines(path) if path.exists() else ():
+        stats = line.get("stats")
+        for key in keys:
+            entry = stats.get(key) if isinstance(stats, dict) else None
+            if isinstance(entry, dict) and isinstance(line.get("episode_index"), int):
+                yield line["episode_index"], key, entry
+
+
+def pixel_histogram(source: Source, key: str, place: EpisodePlace, first: int, last: int) -> PixelHistogram:
+    """Of the images of some frames, decoded, every pixel counted."""
+    feature = source.info.features[key]
+    video = EpisodeVideo(source.root, source.info, key, place) if feature.is_video else None
+    if feature.is_depth and video is not None:
+        levels = video.depth_scale.values() * (1000 if (feature.info or {}).get("depth_unit") == "mm" else 1)
+        counts = np.zeros((1, len(levels)), dtype=np.int64)
+        for _, codes in zip(range(last - first), video.codes(first), strict=False):
+            counts[0] += np.bincount(codes.ravel(), minlength=len(levels))
+        return PixelHistogram(counts=counts, level_values=levels, num_images=last - first)
+    counts = np.zeros((3, 256), dtype=np.int64)
+    images = StoredImages(source.root, source.info, key).read(place) if video is None else video.images(first)
+    for number, image in enumerate(images, start=0 if video is None else first):
+        if number >= last:
+            break
+        if number >= first:
+            for channel in range(3):
+                counts[channel] += np.bincount(image[:, :, channel].ravel(), minlength=256)
+    return PixelHistogram(counts=counts, level_values=colour_levels(), num_images=last - first)

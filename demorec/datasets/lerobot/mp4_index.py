@@ -1,0 +1,142 @@
+"""Where each encoded image lies in an mp4 file, by the tables in its `moov` box (ISO/IEC 14496-12)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import ExportError, in_words
+from demorec.core.files import open_regular
+from demorec.datasets.lerobot.files import check_video
+
+_MAX_MOOV = 256 << 20
+_PARENTS = (b"trak", b"mdia", b"minf", b"stbl", b"edts")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mp4Index:
+    """The images of the first video track in the order in which they are stored.
+
+    Attributes:
+        offsets, sizes: (N,) int64, bytes in the file.
+        is_keyframe: (N,) bool.
+        times: (N,) float64, when each is shown, s.
+    """
+
+    offsets: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    is_keyframe: NDArray[np.bool_]
+    times: NDArray[np.float64]
+
+
+def mp4_index(path: Path) -> Mp4Index:
+    """Read it; ExportError for what is no mp4 file, is cut off, or is fragmented."""
+    check_video(path)
+    try:
+        with open_regular(path) as file:
+            size = path.stat().st_size
+            place = 0
+            while place + 8 <= size:
+                file.seek(place)
+                length, kind = struct.unpack(">I4s", file.read(8))
+                head = 8
+                if length == 1:
+                    (length,), head = struct.unpack(">Q", file.read(8)), 16
+                length = length or size - place
+                if kind == b"moov":
+                    if length > _MAX_MOOV:
+                        raise ValueError("its index is very large")
+                    return _index(file.read(length - head), size)
+                place += max(length, 8)
+        raise ValueError("it has no index")
+    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
+        raise ExportError(f"The video cannot be read ({in_words(error)}): {path}") from error
+
+
+def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    place = 0
+    while place + 8 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, place)
+        head = 8
+        if length == 1:
+            (length,), head = struct.unpack_from(">Q", data, place + 8), 16
+        length = length or len(data) - place
+        if length < head:
+            raise ValueError("a box that is cut off")
+        yield kind, data[place + head : place + length]
+        place += length
+
+
+def _flat(data: bytes) -> dict[bytes, bytes]:
+    found: dict[bytes, bytes] = {}
+    for kind, content in _boxes(data):
+        found |= _flat(content) if kind in _PARENTS else {kind: content}
+    return found
+
+
+def _index(moov: bytes, size: int) -> Mp4Index:
+    tracks = [_flat(content) for kind, content in _boxes(moov) if kind == b"trak"]
+    track = next(track for track in tracks if track[b"hdlr"][8:12] == b"vide")
+    (timescale,) = struct.unpack_from(">I", track[b"mdhd"], 20 if track[b"mdhd"][0] else 12)
+    each, count = struct.unpack_from(">II", track[b"stsz"], 4)
+    sizes = _numbers(track[b"stsz"], 12, count) if not each else np.full(count, each, dtype=np.int64)
+    is_keyframe = np.ones(count, dtype=np.bool_)
+    if b"stss" in track:
+        is_keyframe[:] = False
+        is_keyframe[_numbers(track[b"stss"], 8, _count(track[b"stss"])) - 1] = True
+    steps = _repeated(track[b"stts"], count)
+    ticks = np.concatenate([[0], np.cumsum(steps)[:-1]])
+    if b"ctts" in track:
+        ticks = ticks + _repeated(track[b"ctts"], count, signed=True)
+    if b"elst" in track and _count(track[b"elst"]):
+        ticks = ticks - _edited(track[b"elst"])
+    offsets = _offsets(track, sizes)
+    if count and (offsets.min() < 0 or (offsets + sizes).max() > size):
+        raise ValueError("it is cut off")
+    return Mp4Index(offsets=offsets, sizes=sizes, is_keyframe=is_keyframe, times=ticks / timescale)
+
+
+def _count(box: bytes) -> int:
+    return int(struct.unpack_from(">I", box, 4)[0])
+
+
+def _numbers(box: bytes, start: int, count: int, kind: str = ">u4") -> NDArray[np.int64]:
+    return np.frombuffer(box, dtype=kind, offset=start, count=count).astype(np.int64)
+
+
+def _repeated(box: bytes, count: int, *, signed: bool = False) -> NDArray[np.int64]:
+    """The values of a table of runs (how often, value)."""
+    runs = _numbers(box, 8, 2 * _count(box), ">u4").reshape(-1, 2)
+    values = runs[:, 1].astype(np.uint32).astype(np.int32).astype(np.int64) if signed else runs[:, 1]
+    if int(runs[:, 0].sum()) != count:
+        raise ValueError("its tables contradict each other")
+    return np.repeat(values, runs[:, 0])
+
+
+def _edited(box: bytes) -> int:
+    """Ticks at which the first edit that shows anything begins."""
+    width, kind = (20, ">Qq") if box[0] else (12, ">Ii")
+    for number in range(_count(box)):
+        _, begin = struct.unpack_from(kind, box, 8 + number * width)
+        if begin >= 0:
+            return int(begin)
+    return 0
+
+
+def _offsets(track: dict[bytes, bytes], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each image begins, from the chunks that they lie in."""
+    name, kind = (b"co64", ">u8") if b"co64" in track else (b"stco", ">u4")
+    chunks = _numbers(track[name], 8, _count(track[name]), kind)
+    runs = _numbers(track[b"stsc"], 8, 3 * _count(track[b"stsc"])).reshape(-1, 3)
+    lasts = np.append(runs[1:, 0], len(chunks) + 1)
+    per_chunk = np.repeat(runs[:, 1], lasts - runs[:, 0])
+    if len(per_chunk) != len(chunks) or int(per_chunk.sum()) != len(sizes):
+        raise ValueError("its tables contradict each other")
+    before = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    firsts = np.concatenate([[0], np.cumsum(per_chunk)[:-1]])
+    return np.asarray(before + np.repeat(chunks - before[np.minimum(firsts, len(sizes) - 1)], per_chunk))

@@ -1,0 +1,179 @@
+"""`demorec dataset` on datasets that LeRobot wrote and on our own, with the installed LeRobot as the judge."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.check import checked
+from support.datasets import TOP, content, items, same, write_with_lerobot
+from support.export import data_table, export, info, make_run
+
+from demorec.cli import main
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+KINDS: dict[str, dict[str, Any]] = {
+    "video": {},
+    "images": {"video": False},
+    "streaming": {"streaming_encoding": True},
+}
+
+
+def edit(*words: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["dataset", *map(str, words)])
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_with_lerobot(tmp_path_factory.mktemp("made") / "d", **KINDS[request.param])
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_with_lerobot(tmp_path_factory.mktemp("small") / "d", episodes=5)
+
+
+def statistics_are_exact(root: Path) -> None:
+    """Those of numbers, against NumPy's of all rows."""
+    found = json.loads((root / "meta/stats.json").read_text())
+    for name in ("observation.state", "action", "index"):
+        values = np.array(data_table(root).column(name).to_pylist(), dtype=np.float64)
+        values = values.reshape(len(values), -1)
+        expected = {"mean": values.mean(0), "std": values.std(0), "min": values.min(0), "max": values.max(0)}
+        expected |= {f"q{q:02d}": np.quantile(values, q / 100, axis=0) for q in (1, 10, 50, 90, 99)}
+        for quantity, value in expected.items():
+            assert np.allclose(found[name][quantity], value, rtol=1e-9, atol=1e-12), (name, quantity)
+
+
+def test_what_is_kept_is_kept_bit_for_bit(dataset: Path, tmp_path: Path) -> None:
+    before = items(dataset)
+    edits: dict[str, tuple[list[object], list[tuple[int, int, int]]]] = {
+        "select": (["--where", 'num_frames < 16 and "there" in task'], [(0, 0, 12), (2, 0, 14)]),
+        "drop": (["--episodes", "0,2:4"], [(number, 0, 12 + number) for number in (1, 4, 5)]),
+        "trim": (["--head", 3, "--tail", 2], [(number, 3, 10 + number) for number in range(6)]),
+        "reorder": (["--order", "5,3,1,0,2,4"], [(number, 0, 12 + number) for number in (5, 3, 1, 0, 2, 4)]),
+    }
+    for command, (flags, expected) in edits.items():
+        out = tmp_path / command
+        assert edit(command, dataset, *flags, "--out", out) == 0
+        found = items(out)
+        assert len(found) == len(expected)
+        for episode, (number, first, last) in zip(found, expected, strict=True):
+            assert same(episode, before[number][first:last], but=("timestamp",)), (command, number)
+            assert [float(item["timestamp"]) for item in episode] == pytest.approx(np.arange(last - first) / 10)
+        statistics_are_exact(out)
+
+
+def test_the_results_are_clean(small: Path, tmp_path: Path) -> None:
+    assert edit("trim", small, "--head", 3, "--out", tmp_path / "trimmed", "--decode") == 0
+    assert edit("shuffle", small, "--seed", 3, "--out", tmp_path / "shuffled") == 0
+    for name in ("trimmed", "shuffled"):
+        results = checked(tmp_path / name, "dataset").results
+        assert not [result for result in results if result.level in ("fail", "warn")]
+
+
+def test_decoded_statistics_are_those_of_the_images(small: Path, tmp_path: Path) -> None:
+    assert edit("trim", small, "--head", 1, "--out", tmp_path / "t") == 0
+    pixels = np.stack([item[TOP] for episode in items(tmp_path / "t") for item in episode]) / 255
+    found = json.loads((tmp_path / "t/meta/stats.json").read_text())[TOP]
+    for name, value in {"mean": pixels.mean((0, 2, 3)), "std": pixels.std((0, 2, 3))}.items():
+        assert np.allclose(np.ravel(found[name]), value, atol=1e-6), name
+    assert np.allclose(np.ravel(found["q90"]), np.quantile(pixels, 0.9, axis=(0, 2, 3)), atol=1e-9)
+
+
+def test_idle_ends_are_cut_off(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert edit("trim", small, "--idle", "--idle-margin", 1, "--out", tmp_path / "t") == 0
+    assert "episode 0: 2 frames cut at the beginning, 2 at the end" in capsys.readouterr().out
+    assert [len(episode) for episode in items(tmp_path / "t")] == [8 + number for number in range(5)]
+
+
+def test_features_and_tasks(small: Path, tmp_path: Path) -> None:
+    before = items(small)
+    assert edit("rename", small, f"{TOP}=observation.images.front", "action=act", "--out", tmp_path / "a") == 0
+    assert edit("drop-features", tmp_path / "a", "act", "--out", tmp_path / "b") == 0
+    assert (
+        edit("set-task", tmp_path / "b", "--task", "push", "--where", "episode_index == 1", "--out", tmp_path / "c")
+        == 0
+    )
+    found = items(tmp_path / "c")
+    assert set(found[0][0]) == {"observation.state", "observation.images.front", "timestamp", "task"}
+    assert np.array_equal(found[2][3]["observation.images.front"], before[2][3][TOP])
+    assert [str(episode[0]["task"]) for episode in found[:3]] == ["put it there", "push", "put it there"]
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.permutations(range(5)), st.integers(0, 9), st.sampled_from([0.2, 0.4, 0.6]))
+def test_round_trips(
+    small: Path, tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int, share: float
+) -> None:
+    at, whole = tmp_path_factory.mktemp("trips"), small
+    assert edit("trim", small, "--head", 0, "--tail", 0, "--out", at / "no") == 2  # nothing to cut is no request
+    assert edit("reorder", small, "--order", ",".join(map(str, range(5))), "--out", at / "as_it_is") == 0
+    back = [order.index(number) for number in range(5)]
+    assert edit("reorder", small, "--order", ",".join(map(str, order)), "--out", at / "r") == 0
+    assert edit("reorder", at / "r", "--order", ",".join(map(str, back)), "--out", at / "back") == 0
+    assert edit("rename", small, "action=a", "--out", at / "n") == 0
+    assert edit("rename", at / "n", "a=action", "--out", at / "named") == 0
+    shares = (f"a={share}", f"b={1 - share}")
+    assert edit("split", small, "--shares", *shares, "--seed", seed, "--out", at / "parts") == 0
+    assert edit("merge", at / "parts/a", at / "parts/b", "--out", at / "merged") == 0
+    states = data_table(at / "merged").column("observation.state").to_pylist()
+    assert sorted(map(tuple, states)) == sorted(map(tuple, data_table(whole).column("observation.state").to_pylist()))
+    rows = data_table(at / "as_it_is").drop_columns(["task_index"]).to_pydict()
+    for name in ("back", "named"):
+        found = data_table(at / name).drop_columns(["task_index"])
+        assert found.to_pydict() == rows, name
+    assert content(at / "named") == content(at / "as_it_is")
+
+
+def test_all_differences_are_named_and_a_mapping_solves_them(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert edit("rename", small, "action=act", "--out", tmp_path / "b") == 0
+    capsys.readouterr()
+    assert edit("merge", small, tmp_path / "b", "--out", tmp_path / "m") == 2
+    told = capsys.readouterr().err
+    assert all(words in told for words in ("has no action", "has act, which the first one has not", "drop = "))
+    mapping = tmp_path / "m.toml"
+    mapping.write_text(
+        f'[[dataset]]\npath = "{tmp_path / "b"}"\n[dataset.feature.action]\nfrom = "act"\n'
+        '[dataset.feature."observation.state"]\nelements = ["z", "", "x"]\nfill = 7.0\nunit = "degree"\n'
+    )
+    assert edit("merge", small, tmp_path / "b", "--mapping", mapping, "--out", tmp_path / "m") == 0
+    found, before = items(tmp_path / "m"), items(small)
+    assert all(same(a, b) for a, b in zip(found, before, strict=False))
+    state, was = found[7][6]["observation.state"], before[2][6]["observation.state"]
+    assert state == pytest.approx([np.deg2rad(was[2]), 7, np.deg2rad(was[0])])
+    assert np.array_equal(found[7][6]["action"], before[2][6]["action"])
+
+
+def test_our_own_datasets_keep_what_stands_beside(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", (20, 15, 17))
+    export(run, tmp_path / "d")
+    assert edit("drop", tmp_path / "d", "--episodes", 1, "--out", tmp_path / "dropped") == 0
+    assert edit("trim", tmp_path / "d", "--head", 3, "--out", tmp_path / "trimmed") == 0
+    for name, lengths in {"dropped": [20, 17], "trimmed": [17, 12, 14]}.items():
+        assert [len(episode) for episode in items(tmp_path / name)] == lengths
+        results = {result.check: result.level for result in checked(tmp_path / name, "dataset").results}
+        assert results["dataset_sidecar"] == results["dataset_counts"] == results["dataset_videos"] == "pass"
+    assert info(tmp_path / "dropped")["features"] == info(tmp_path / "d")["features"]
+
+
+@pytest.mark.parametrize(
+    ("condition", "told"),
+    [("num_framse < 3", "num_frames"), ("__import__('os')", "nothing else"), ("length <", "no condition"),
+     ("task < 3", "cannot be compared"), ("[x for x in tasks]", "nothing else")],
+)  # fmt: skip
+def test_conditions_are_parsed_and_never_run(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], condition: str, told: str
+) -> None:
+    assert edit("select", small, "--where", condition, "--out", tmp_path / "o") == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()

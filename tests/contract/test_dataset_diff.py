@@ -1,0 +1,398 @@
+"""`demorec dataset diff` on a dataset that LeRobot wrote: it names what was changed, and nothing else."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from av.video.stream import VideoStream
+from PIL import Image
+from support.datasets import TOP, items, write_with_lerobot
+from support.export import data_table, export, files_of, make_run
+
+from demorec.cli import main
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+TASKS, INFO, STATS = "meta/tasks.parquet", "meta/info.json", "meta/stats.json"
+TASK_COLUMN = "task"
+VIDEO = f"videos/{TOP}/chunk-000/file-000.mp4"
+LENGTHS = (12, 13, 14, 15)
+Found = tuple[str, str, int | None, int | None]
+
+
+def run(*words: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["dataset", *map(str, words)])
+    return int(ended.value.code or 0)
+
+
+def compared(a: Path, b: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What `diff` says, whose exit code says the same."""
+    capsys.readouterr()
+    code = run("diff", a, b, "--json")
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert code == (0 if found["same"] else 1)
+    assert found["same"] == (not found["differences"])
+    return found
+
+
+def named(found: dict[str, Any]) -> list[Found]:
+    return [(one["level"], one["name"], one["episode_a"], one["episode_b"]) for one in found["differences"]]
+
+
+def edit_json(path: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    def edited(root: Path) -> None:
+        data = json.loads((root / path).read_text())
+        change(data)
+        (root / path).write_text(json.dumps(data))
+
+    return edited
+
+
+def edit_table(path: str, change: Callable[[pa.Table], pa.Table]) -> Callable[[Path], None]:
+    def edited(root: Path) -> None:
+        pq.write_table(change(pq.read_table(root / path)), root / path)
+
+    return edited
+
+
+def edit_column(path: str, name: str, change: Callable[[list[Any]], object]) -> Callable[[Path], None]:
+    def edited(table: pa.Table) -> pa.Table:
+        place, values = table.column_names.index(name), table.column(name).to_pylist()
+        change(values)
+        kind = table.schema.field(name)
+        return table.set_column(place, kind, pa.array(values, kind.type))
+
+    return edit_table(path, edited)
+
+
+def row(episode: int, frame: int) -> int:
+    return sum(LENGTHS[:episode]) + frame
+
+
+def put(episode: int, frame: int, value: Any, element: int | None = None) -> Callable[[list[Any]], None]:
+    """Set a value of a column, or of an element of it."""
+
+    def change(values: list[Any]) -> None:
+        if element is None:
+            values[row(episode, frame)] = value
+        else:
+            values[row(episode, frame)][element] = value
+
+    return change
+
+
+def both(*changes: Callable[[Path], None]) -> Callable[[Path], None]:
+    def edited(root: Path) -> None:
+        for change in changes:
+            change(root)
+
+    return edited
+
+
+def recode(root: Path, change: Callable[[list[Any]], object]) -> None:
+    """The video anew, each image by itself and without loss."""
+    with av.open(str(root / VIDEO)) as container:
+        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    change(images)
+    with av.open(str(root / VIDEO), "w") as out:
+        stream = out.add_stream("libx264rgb", rate=10, options={"qp": "0", "g": "1", "bf": "0"})
+        assert isinstance(stream, VideoStream)
+        stream.height, stream.width, stream.pix_fmt = 64, 96, "rgb24"
+        for image in images:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        out.mux(stream.encode(None))
+
+
+def paint(episode: int, frame: int, change: Callable[[Any], Any]) -> Callable[[Path], None]:
+    """Another image in a video."""
+
+    def changed(images: list[Any]) -> None:
+        images[row(episode, frame)] = change(images[row(episode, frame)].copy())
+
+    return lambda root: recode(root, changed)
+
+
+def paint_row(episode: int, frame: int, change: Callable[[Any], Any]) -> Callable[[Path], None]:
+    """Another image in a row."""
+
+    def changed(values: list[Any]) -> None:
+        number = row(episode, frame)
+        with Image.open(io.BytesIO(values[number]["bytes"])) as image:
+            pixels = change(np.asarray(image.convert("RGB")).copy())
+        data = io.BytesIO()
+        Image.fromarray(pixels).save(data, "PNG")
+        values[number] = {**values[number], "bytes": data.getvalue()}
+
+    return edit_column(DATA, TOP, changed)
+
+
+def dot(image: Any) -> Any:
+    image[40, 50] ^= 1
+    return image
+
+
+def cast_action(table: pa.Table) -> pa.Table:
+    place = table.column_names.index("action")
+    return table.set_column(place, "action", pa.array(table.column("action").to_pylist(), pa.list_(pa.float64(), 3)))
+
+
+def cut_last_row(root: Path) -> None:
+    edit_table(DATA, lambda table: table.slice(0, len(table) - 1))(root)
+    edit_column(EPISODES, "length", lambda values: values.__setitem__(3, 14))(root)
+    edit_json(INFO, lambda data: data.update(total_frames=data["total_frames"] - 1))(root)
+
+
+def swap_rows(values: list[Any]) -> None:
+    values[row(2, 4)], values[row(2, 5)] = values[row(2, 5)], values[row(2, 4)]
+
+
+def scale(values: list[Any]) -> None:
+    for frame in range(LENGTHS[1]):
+        values[row(1, frame)] = [2 * value for value in values[row(1, frame)]]
+
+
+def forget(values: list[Any]) -> None:
+    values[:] = ["put it away" if value == "put it here" else value for value in values]
+
+
+def forget_lists(values: list[Any]) -> None:
+    for tasks in values:
+        forget(tasks)
+
+
+def reword(root: Path) -> None:
+    """One task, wherever its text stands."""
+    edit_column(TASKS, TASK_COLUMN, forget)(root)
+    edit_column(EPISODES, "tasks", forget_lists)(root)
+
+
+def more_tasks(root: Path) -> None:
+    edit_table(TASKS, lambda t: pa.concat_tables([t, pa.table({"task_index": [2], TASK_COLUMN: ["dance"]}, t.schema)]))(
+        root
+    )
+    edit_json(INFO, lambda data: data.update(total_tasks=3))(root)
+
+
+def rewrite(root: Path) -> None:
+    """Every table and JSON file as it is: after that, bytes change only with content."""
+    for path in (DATA, EPISODES, TASKS):
+        edit_table(path, lambda table: table)(root)
+    for path in (INFO, STATS):
+        edit_json(path, lambda data: None)(root)
+    if (root / VIDEO).exists():
+        recode(root, lambda images: None)
+
+
+def state(name: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda data: data["features"][name]
+
+
+INJECTED: dict[str, tuple[str, Callable[[Path], None], Found]] = {
+    "robot": ("video", edit_json(INFO, lambda d: d.update(robot_type="so101")), ("info", "robot_type", None, None)),
+    "rate": ("images", edit_json(INFO, lambda d: d.update(fps=20)), ("info", "fps", None, None)),
+    "claimed frames": ("video", edit_json(INFO, lambda d: d.update(total_frames=7)),
+                       ("info", "total_frames", None, None)),
+    "claimed episodes": ("video", edit_json(INFO, lambda d: d.update(total_episodes=9)),
+                         ("info", "total_episodes", None, None)),
+    "a field of somebody's": ("video", edit_json(INFO, lambda d: d.update(operator="me")),
+                              ("info", "operator", None, None)),
+    "names": ("video", edit_json(INFO, lambda d: state("action")(d).update(names=["x", "y", "w"])),
+              ("features", "action: names", None, None)),
+    "no names": ("video", edit_json(INFO, lambda d: state("observation.state")(d).update(names=None)),
+                 ("features", "observation.state: names", None, None)),
+    "encoder": ("video", edit_json(INFO, lambda d: state(TOP)(d)["info"].update({"video.crf": 7})),
+                ("features", f"{TOP}: video.crf", None, None)),
+    "feature missing": ("video", edit_json(INFO, lambda d: d["features"].pop("action")),
+                        ("features", "action", None, None)),
+    "feature extra": ("images", both(edit_json(INFO, lambda d: d["features"].update(
+        reward={"dtype": "float32", "shape": [1], "names": None})), edit_table(DATA, lambda t: t.append_column(
+            "reward", pa.array(np.ones(len(t), np.float32))))), ("features", "reward", None, None)),
+    "type": ("video", both(edit_json(INFO, lambda d: state("action")(d).update(dtype="float64")),
+                           edit_table(DATA, cast_action)), ("features", "action: dtype", None, None)),
+    "task reworded": ("video", reword, ("tasks", "put it here", None, None)),
+    "task unused": ("video", more_tasks, ("tasks", "dance", None, None)),
+    "another task": ("video", edit_column(DATA, "task_index", put(2, 3, 1)), ("rows", "task", 2, 2)),
+    "no such task": ("video", edit_column(DATA, "task_index", put(2, 3, 77)), ("rows", "task", 2, 2)),
+    "tasks of an episode": ("video", edit_column(EPISODES, "tasks", lambda v: v.__setitem__(1, ["x"])),
+                            ("episodes", "tasks", 1, 1)),
+    "fact": ("video", edit_column(EPISODES, "quality", lambda v: v.__setitem__(2, 0.0)),
+             ("episodes", "quality", 2, 2)),
+    "facts missing": ("video", edit_table(EPISODES, lambda t: t.drop_columns(["quality"])),
+                      ("episodes", "quality", None, None)),
+    "a frame less": ("video", cut_last_row, ("episodes", "length", 3, 3)),
+    "one value": ("video", edit_column(DATA, "action", put(1, 5, 0.25, 2)), ("rows", "action", 1, 1)),
+    "one value by little": ("video", edit_column(DATA, "action", lambda v: v[row(3, 14)].__setitem__(
+        0, float(np.nextafter(np.float32(v[row(3, 14)][0]), np.float32(9))))), ("rows", "action", 3, 3)),
+    "no number": ("images", edit_column(DATA, "observation.state", put(0, 0, float("nan"), 0)),
+                  ("rows", "observation.state", 0, 0)),
+    "all values of an episode": ("video", edit_column(DATA, "action", scale), ("rows", "action", 1, 1)),
+    "two rows swapped": ("video", edit_column(DATA, "action", swap_rows), ("rows", "action", 2, 2)),
+    "time": ("video", edit_column(DATA, "timestamp", put(1, 6, 0.61)), ("rows", "timestamp", 1, 1)),
+    "frame number": ("video", edit_column(DATA, "frame_index", put(1, 6, 7)), ("rows", "frame_index", 1, 1)),
+    "row number": ("video", edit_column(DATA, "index", put(2, 0, 3)), ("rows", "index", 2, 2)),
+    "episode number": ("video", edit_column(DATA, "episode_index", put(2, 13, 3)), ("rows", "episode_index", 2, 2)),
+    "mean": ("video", edit_json(STATS, lambda d: d["action"]["mean"].__setitem__(1, 0.7)),
+             ("statistics", "action", None, None)),
+    "quantile": ("video", edit_json(STATS, lambda d: d["observation.state"]["q99"].__setitem__(0, 9.0)),
+                 ("statistics", "observation.state", None, None)),
+    "statistics missing": ("video", edit_json(STATS, lambda d: d.pop("action")), ("statistics", "action", None, None)),
+    "statistics of images": ("video", edit_json(STATS, lambda d: d[TOP]["std"].__setitem__(0, [[0.001]])),
+                             ("statistics", TOP, None, None)),
+    "one pixel": ("video", paint(1, 4, dot), ("images", TOP, 1, 1)),
+    "an image black": ("video", paint(3, 14, np.zeros_like), ("images", TOP, 3, 3)),
+    "an image inverted": ("video", paint(0, 0, lambda image: 255 - image), ("images", TOP, 0, 0)),
+    "a pixel in a row": ("images", paint_row(2, 13, dot), ("images", TOP, 2, 2)),
+    "an image in a row mirrored": ("images", paint_row(0, 7, lambda image: image[:, ::-1]), ("images", TOP, 0, 0)),
+}  # fmt: skip
+IN_IMAGES = {"one pixel": (1, 4), "an image black": (3, 14), "an image inverted": (0, 0), "a pixel in a row": (2, 13),
+             "an image in a row mirrored": (0, 7)}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Four episodes with their images in a video, and with their images in the rows; each has a fact of its own."""
+    made = {}
+    for name in ("video", "images"):
+        root = write_with_lerobot(tmp_path_factory.mktemp(name) / "d", video=name == "video", episodes=len(LENGTHS))
+        edit_table(EPISODES, lambda t: t.append_column("quality", pa.array([0.9, 0.8, 0.7, 0.6])))(root)
+        rewrite(root)
+        before = files_of(root)
+        rewrite(root)
+        assert files_of(root) == before
+        made[name] = root
+    return made
+
+
+@pytest.fixture
+def changed(bases: dict[str, Path], tmp_path: Path) -> Callable[[str], tuple[Path, Path]]:
+    def make(case: str) -> tuple[Path, Path]:
+        base, inject, _ = INJECTED[case]
+        root = Path(shutil.copytree(bases[base], tmp_path / "changed"))
+        inject(root)
+        assert files_of(root) != files_of(bases[base])
+        return bases[base], root
+
+    return make
+
+
+@pytest.mark.parametrize("case", INJECTED)
+def test_each_difference_is_named_and_nothing_else(
+    case: str, changed: Callable[[str], tuple[Path, Path]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    base, root = changed(case)
+    expected = INJECTED[case][2]
+    assert named(compared(base, root, capsys)) == [expected]
+    name = "put it away" if case == "task reworded" else expected[1]
+    assert named(compared(root, base, capsys)) == [(expected[0], name, *expected[2:])]
+    assert compared(root, root, capsys)["episodes_same"] == len(LENGTHS)
+
+
+@pytest.mark.parametrize("case", IN_IMAGES)
+def test_differences_of_images_are_in_one_frame(
+    case: str, changed: Callable[[str], tuple[Path, Path]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    base, root = changed(case)
+    episode, frame = IN_IMAGES[case]
+    a, b = (np.stack([item[TOP] for shown in items(path) for item in shown]) for path in (base, root))
+    assert np.flatnonzero((a != b).any(axis=(1, 2, 3))).tolist() == [row(episode, frame)]
+    (found,) = compared(base, root, capsys)["differences"]
+    number = row(episode, frame)
+    scale = 1 if a.dtype == np.uint8 else 255  # LeRobot gives stored images as 0..1
+    error = np.square(scale * (a[number].astype(float) - b[number])).mean()
+    assert (found["num_frames"], found["first_frame"]) == (1, frame)
+    assert found["worst"] == [{"frame": frame, "psnr_db": pytest.approx(10 * np.log10(255**2 / error), abs=0.006)}]
+
+
+def test_the_first_and_the_largest_difference_are_named(
+    bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(bases["video"], tmp_path / "d"))
+    before = data_table(root).column("action").to_pylist()[row(2, 9)][1]
+    edit_column(DATA, "action", put(2, 3, 0.125, 0))(root)
+    edit_column(DATA, "action", put(2, 9, 50.0, 1))(root)
+    (found,) = compared(bases["video"], root, capsys)["differences"]
+    assert (found["num_frames"], found["first_frame"], found["largest_frame"], found["element"]) == (2, 3, 9, "y")
+    assert (found["a"], found["b"]) == (pytest.approx(before), 50.0)
+    assert run("diff", bases["video"], root) == 1
+    said = capsys.readouterr().out
+    assert "rows: episode 2: action differs in 2 of 14 frames, first in frame 3, most in frame 9 (y)" in said
+    assert "1 difference: 3 of 4 and 4 episodes are the same." in said
+
+
+def test_episodes_are_found_by_their_content(
+    bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base, other = bases["images"], tmp_path / "other"
+    assert run("reorder", base, "--order", "2,0,3,1", "--out", tmp_path / "moved") == 0
+    assert run("reorder", base, "--order", "0,1,2,3", "--out", tmp_path / "copy") == 0
+    found = compared(tmp_path / "copy", tmp_path / "moved", capsys)
+    assert found["same"]
+    assert found["reordered"]
+    assert found["pairs"] == [[0, 1], [1, 3], [2, 0], [3, 2]]
+    assert "The same episodes in another order, A to B: 0 is 1, 1 is 3, 2 is 0, 3 is 2." in found["notes"]
+    assert run("drop", tmp_path / "moved", "--episodes", 3, "--out", other) == 0
+    edit_column(DATA, "action", lambda values: values[20].__setitem__(0, 9.0))(other)  # frame 6 of what was episode 0
+    expected = [("episodes", "missing", 1, None), ("rows", "action", 0, 1)]
+    assert named(compared(base, other, capsys)) == expected
+    assert named(compared(other, base, capsys)) == [("episodes", "extra", None, 1), ("rows", "action", 1, 0)]
+
+
+def test_cut_episodes_are_recognised(
+    bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("trim", bases["video"], "--head", 3, "--tail", 1, "--out", tmp_path / "cut") == 0
+    found = compared(bases["video"], tmp_path / "cut", capsys)
+    lines = [one["text"] for one in found["differences"] if one["name"] == "length"]
+    assert lines == [f"{n} frames, {n - 4} in B: B has frames 3 to {n - 2} of A" for n in LENGTHS]
+    assert len(found["differences"]) == len(lines) == len(LENGTHS)  # the images of these frames are equal
+
+
+@pytest.mark.parametrize("kind", ["video", "images"])
+def test_round_trips_leave_no_difference(
+    kind: str, bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Statistics, too, between datasets of one writer: LeRobot estimates quantiles."""
+    copy = tmp_path / "copy"
+    assert run("reorder", bases[kind], "--order", "0,1,2,3", "--out", copy) == 0
+    assert {one[0] for one in named(compared(bases[kind], copy, capsys))} <= {"statistics"}
+    assert run("split", copy, "--shares", "a=0.5", "b=0.5", "--seed", 1, "--out", tmp_path / "parts") == 0
+    assert run("merge", tmp_path / "parts/b", tmp_path / "parts/a", "--out", tmp_path / "merged") == 0
+    assert run("shuffle", copy, "--seed", 4, "--out", tmp_path / "shuffled") == 0
+    assert run("rename", copy, "action=a", "--out", tmp_path / "n") == 0
+    assert run("rename", tmp_path / "n", "a=action", "--out", tmp_path / "named") == 0
+    for name in ("merged", "shuffled", "named"):
+        found = compared(copy, tmp_path / name, capsys)
+        assert found["differences"] == [], name
+        assert found["reordered"] == (name != "named")
+
+
+def test_our_own_datasets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    export(make_run(tmp_path / "run", (20, 15, 17)), tmp_path / "d")
+    export(make_run(tmp_path / "again", (20, 15, 17)), tmp_path / "e")
+    assert compared(tmp_path / "d", tmp_path / "d", capsys)["same"]
+    assert {one["name"] for one in compared(tmp_path / "d", tmp_path / "e", capsys)["differences"]} <= {"source"}
+    assert run("drop", tmp_path / "d", "--episodes", 1, "--out", tmp_path / "less") == 0
+    assert named(compared(tmp_path / "d", tmp_path / "less", capsys)) == [("episodes", "missing", 1, None)]
+
+
+def test_what_cannot_be_compared_is_an_error(
+    bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(bases["video"], tmp_path / "d"))
+    (root / VIDEO).write_bytes((root / VIDEO).read_bytes()[:900])
+    for other, told in {root: "video", tmp_path / "none": "No LeRobot dataset"}.items():
+        assert run("diff", bases["video"], other) == 2
+        assert told in capsys.readouterr().err
+    assert run("diff", root) == 2
+    assert "Two datasets are compared, given are 1" in capsys.readouterr().err

@@ -1,0 +1,74 @@
+"""Datasets that LeRobot wrote, and whether two datasets hold the same episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from support.export import data_table, episode_rows
+
+TOP = "observation.images.top"
+
+
+def write_with_lerobot(root: Path, *, video: bool = True, episodes: int = 6, **arguments: Any) -> Path:
+    """Some episodes of 12, 13, ... frames at 10 Hz with a moving square; still at both ends; two tasks in turn."""
+    from lerobot.datasets import LeRobotDataset
+
+    rng = np.random.default_rng(0)
+    vector = {"dtype": "float32", "shape": (3,), "names": ["x", "y", "z"]}
+    camera = {"dtype": "video" if video else "image", "shape": (64, 96, 3), "names": ["height", "width", "channels"]}
+    features = {"observation.state": vector, "action": vector, TOP: camera}
+    dataset = LeRobotDataset.create("local/x", fps=10, features=features, root=root, use_videos=video, **arguments)
+    for episode in range(episodes):
+        length = 12 + episode
+        for t in range(length):
+            image = np.full((64, 96, 3), (episode * 20 + t * 3) % 255, np.uint8)
+            image[10:30, 5 + t : 25 + t] = rng.integers(0, 255, 3)
+            frame = {
+                "observation.state": rng.normal(size=3).astype(np.float32) * (3 < t < length - 4),
+                "action": rng.normal(size=3).astype(np.float32),
+                TOP: image,
+                "task": "put it here" if episode % 2 else "put it there",
+            }
+            dataset.add_frame(frame)
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def items(root: Path) -> list[list[dict[str, Any]]]:
+    """Every episode's frames as LeRobot reads them, less the counters: numbers, decoded images, task."""
+    from lerobot.datasets import LeRobotDataset
+
+    dataset = LeRobotDataset("local/test", root=root, video_backend="pyav", return_uint8=True)
+    found: list[list[dict[str, Any]]] = []
+    for index in range(len(dataset)):
+        item = {name: np.asarray(value) for name, value in dataset[index].items()}
+        number, frame = int(item.pop("episode_index")), int(item.pop("frame_index"))
+        assert int(item.pop("index")) == index
+        item.pop("task_index")
+        if frame == 0:
+            found.append([])
+        assert (len(found) - 1, len(found[-1])) == (number, frame)
+        found[-1].append(item)
+    return found
+
+
+def same(a: list[dict[str, Any]], b: list[dict[str, Any]], *, but: tuple[str, ...] = ()) -> bool:
+    """Whether two episodes, as `items` has them, are equal bit for bit."""
+    return len(a) == len(b) and all(
+        set(x) - set(but) == set(y) - set(but)
+        and all(x[name].dtype == y[name].dtype and np.array_equal(x[name], y[name]) for name in set(x) - set(but))
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+def content(root: Path) -> tuple[Any, list[Any]]:
+    """Rows and the episodes' table, for a comparison with another dataset."""
+    rows = [
+        {name: value for name, value in row.items() if not name.startswith(("videos/", "data/", "meta/"))}
+        for row in episode_rows(root)
+    ]
+    return data_table(root).to_pydict(), rows
