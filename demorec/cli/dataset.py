@@ -39,7 +39,7 @@ class Dataset:
       demorec dataset trim cups --idle --out moving
       demorec dataset split cups --shares train=0.8 val=0.2 --by task --out parts
       demorec dataset merge monday tuesday --out both
-      demorec dataset rename cups observation.image=observation.images.top --out named
+      demorec dataset rename cups image=observation.images.top --out named
       demorec dataset set-task cups --task 'pick up the cup' --out told
       demorec dataset reorder cups --by num_frames --out sorted
     """
@@ -93,6 +93,7 @@ class Dataset:
         if not self.words:
             raise ConfigError(f"No dataset is given: demorec dataset {self.command} DATASET --out NEW.")
         refuse_inside([self.out])
+        from demorec.datasets.editing.left_out import left_out
         from demorec.datasets.editing.plan import Source
         from demorec.datasets.editing.write import write_plan
 
@@ -106,8 +107,11 @@ class Dataset:
             out = self.out / name
             self._tell(plan)
             frames = sum(cut.last - cut.first for cut in plan.cuts)
+            missing = left_out(plan)
             if self.dry_run:
                 say(f"Would be {counted(len(plan.cuts), 'episode')}, {frames} frames: {out}")
+                for text in missing:
+                    say(f"Would not be taken over: {text}.")
                 continue
             with ProgressBar("writing") as bar:
                 report = write_plan(plan, out, overwrite=self.overwrite, decode=self.decode, progress=bar.set)
@@ -116,9 +120,8 @@ class Dataset:
                 say(f"{counted(report.lead, 'image')} before cuts stay in the videos, since later ones need them.")
             if report.decoded:
                 say(f"Images of {counted(report.decoded, 'episode')} were decoded for their statistics.")
-            if report.left_out:
-                more = f" and {len(report.left_out) - 5} more" if len(report.left_out) > 5 else ""
-                say(f"Not taken over: {', '.join(report.left_out[:5])}{more}.")
+            for text in missing:
+                say(f"Not taken over: {text}.")
         return 0
 
     def _plan(self, sources: Sequence[Source]) -> Plan:
