@@ -197,7 +197,7 @@ class _Reader:
             elif frame <= 0:
                 latest[str(row.get("style"))] = {**row, "timestamp": 0.0}
             elif frame < cut.last - cut.first:
-                kept.append({**row, "timestamp": frame / self._fps})
+                kept.append({**row, "timestamp": float(np.float32(frame / self._fps))})
         if cut.first == 0:
             end = (cut.last - 0.5) / self._fps
             kept = [row for row in kept if row.get("timestamp") is None or row["timestamp"] < end]
