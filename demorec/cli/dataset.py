@@ -103,6 +103,7 @@ class Dataset:
                 f"Give a dataset and where the new one goes: demorec dataset {self.command} DATASET --out NEW."
             )
         refuse_inside([self.out])
+        from demorec.datasets.editing.left_out import left_out
         from demorec.datasets.editing.plan import Source
         from demorec.datasets.editing.write import write_plan
 
@@ -116,8 +117,11 @@ class Dataset:
             out = self.out / name
             self._tell(plan)
             frames = sum(cut.last - cut.first for cut in plan.cuts)
+            missing = left_out(plan)
             if self.dry_run:
                 say(f"Would be {counted(len(plan.cuts), 'episode')}, {frames} frames: {out}")
+                for text in missing:
+                    say(f"Would not be taken over: {text}.")
                 continue
             with ProgressBar("writing") as bar:
                 report = write_plan(plan, out, overwrite=self.overwrite, decode=self.decode, progress=bar.set)
@@ -126,9 +130,8 @@ class Dataset:
                 say(f"{counted(report.lead, 'image')} before cuts stay in the videos, since later ones need them.")
             if report.decoded:
                 say(f"Images of {counted(report.decoded, 'episode')} were decoded for their statistics.")
-            if report.left_out:
-                more = f" and {len(report.left_out) - 5} more" if len(report.left_out) > 5 else ""
-                say(f"Not taken over: {', '.join(report.left_out[:5])}{more}.")
+            for text in missing:
+                say(f"Not taken over: {text}.")
         return 0
 
     def _diff(self) -> int:

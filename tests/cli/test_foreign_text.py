@@ -146,6 +146,10 @@ def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
         ["report", path, "--out", tmp_path / "report.html"],
         ["export", "lerobot", hostile / "good.mcap", "--out", path, "--append", "--no-verify"],
         ["reproduce", path, "--out", tmp_path / NAME],
+        ["dataset", "rename", path, f"observation.state={HOSTILE}", "--out", tmp_path / "new"],
+        ["dataset", "merge", path, hostile / "dataset", "--out", tmp_path / NAME],
+        ["dataset", "select", path, "--where", f"task == {HOSTILE!r}", "--out", tmp_path / NAME],
+        ["dataset", "trim", path, "--head", "1", "--out", tmp_path / NAME],
     ):  # fmt: skip
         _spoken(arguments)
 

@@ -7,7 +7,8 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -84,46 +85,47 @@ def files_of(folder: Path) -> dict[str, bytes]:
     }
 
 
-def export_in_child(run: Path, out: Path, options: dict[str, Any], *, size_limit: int = 0, kill_at: int = 0) -> None:
-    """Target of a process that may die: exit code 3 for an ExportError.
+@contextmanager
+def calls_counted(kill_at: int = 0) -> Iterator[list[int]]:
+    """Count calls of any function, C functions included; at number `kill_at` the process kills itself with SIGKILL.
 
-    `size_limit` bounds the size of its files; at call number `kill_at` of any function, C functions included, the
-    process kills itself with SIGKILL: a moment that does not depend on how busy the machine is.
+    That is a moment that does not depend on how busy the machine is.
     """
-    if size_limit:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size_limit, size_limit))
-    calls = 0
+    calls = [0]
 
     def count(frame: object, event: str, argument: object) -> None:
-        nonlocal calls
-        calls += event in ("call", "c_call")
-        if calls == kill_at:
+        calls[0] += event in ("call", "c_call")
+        if calls[0] == kill_at > 0:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    if kill_at:
-        sys.setprofile(count)
+    sys.setprofile(count)
     try:
-        export(run, out, **options)
-    except ExportError:
-        raise SystemExit(3) from None
+        yield calls
     finally:
         sys.setprofile(None)
+
+
+def in_child(action: Callable[[], object], *, size_limit: int = 0, kill_at: int = 0) -> None:
+    """Target of a process that may die: exit code 3 for an ExportError; `size_limit` bounds the size of its files."""
+    if size_limit:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size_limit, size_limit))
+    try:
+        with calls_counted(kill_at) if kill_at else nullcontext():
+            action()
+    except ExportError:
+        raise SystemExit(3) from None
+
+
+def export_in_child(run: Path, out: Path, options: dict[str, Any], **limits: int) -> None:
+    """An export as `in_child`."""
+    in_child(lambda: export(run, out, **options), **limits)
 
 
 def count_calls(run: Path, out: Path, options: dict[str, Any]) -> int:
     """How many calls such an export makes."""
-    calls = 0
-
-    def count(frame: object, event: str, argument: object) -> None:
-        nonlocal calls
-        calls += event in ("call", "c_call")
-
-    sys.setprofile(count)
-    try:
+    with calls_counted() as calls:
         export(run, out, **options)
-    finally:
-        sys.setprofile(None)
-    return calls
+    return calls[0]
 
 
 def rewrite_video(dataset: Path, key: str, change: Callable[[list[Any]], list[Any]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.files import open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
+from demorec.episode.features import ACTION, STATE
 
 _PLACED = ("stats/", "videos/", "data/", "meta/")
 _FIXED = frozenset(("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"))
@@ -67,6 +69,11 @@ class Source:
         """Whether demorec keeps something beside its episodes."""
         return any((self.root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
 
+    @cached_property
+    def beside(self) -> dict[int, dict[str, Any]]:
+        """What demorec keeps beside the episodes: episode_index -> row of its table."""
+        return {row["episode_index"]: row for row in self._columns(self.root / SIDECAR_DIR, EPISODE_SCHEMA.names)}
+
     def columns(self) -> list[dict[str, Any]]:
         """What episodes are chosen and ordered by: name -> value, by episode in order."""
         found = [
@@ -84,9 +91,11 @@ class Source:
             lines = read_json_lines(self.root / OLD_EPISODES_PATH)
             for row, line in zip(found, lines, strict=True):
                 row |= {name: value for name, value in line.items() if name not in row}
-        beside = {row["episode_index"]: row for row in self._columns(self.root / SIDECAR_DIR, _BESIDE)}
-        for row, facts in zip(found, self.facts, strict=True):
-            known = {**beside.get(row["episode_index"], {}), **facts}
+        beside = {
+            index: {name: value for name, value in row.items() if name in _BESIDE} for index, row in self.beside.items()
+        }
+        for place, row, facts in zip(self.dataset.places, found, self.facts, strict=True):
+            known = {**beside.get(place.episode_index, {}), **facts}
             row |= {name: value for name, value in known.items() if name not in row}
         return found
 
@@ -162,7 +171,6 @@ class Plan:
     cuts: tuple[Cut, ...]
     info: DatasetInfo
     takes: tuple[Mapping[str, Take], ...]
-    notes: tuple[str, ...] = field(default=())
 
     @classmethod
     def whole(cls, source: Source) -> Plan:
@@ -182,6 +190,14 @@ class Plan:
             for number, place in enumerate(source.dataset.places)
         )
         return cls(sources=(source,), cuts=cuts, info=info, takes=({name: Take(feature=name) for name in own},))
+
+    def keeps_scene(self, cut: Cut) -> bool:
+        """Whether an episode is still what its scene describes: all its frames, with its own states and actions."""
+        source, takes = self.sources[cut.source], self.takes[cut.source]
+        return (cut.first, cut.last) == (0, source.dataset.places[cut.episode].length) and all(
+            name not in source.info.features or (name in takes and takes[name].is_copy and takes[name].feature == name)
+            for name in (STATE, ACTION)
+        )
 
     def with_cuts(self, cuts: Sequence[Cut]) -> Plan:
         """Other episodes; ConfigError when none is left."""

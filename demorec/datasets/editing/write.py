@@ -13,13 +13,14 @@ import pyarrow as pa
 
 from demorec.core.errors import ExportError
 from demorec.datasets.editing.beside import Beside
+from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
 from demorec.datasets.editing.packets import PacketCutter
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
-from demorec.datasets.lerobot.files import column_numbers, read_json_lines, read_table
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, read_table
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
-from demorec.datasets.lerobot.paths import CARD_PATH, DATASET
+from demorec.datasets.lerobot.paths import DATASET
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
@@ -28,6 +29,7 @@ from demorec.datasets.options import ProgressCallback
 from demorec.datasets.staging import CODED, staged_folder
 
 _OLD_STATS = "meta/episodes_stats.jsonl"
+_OF_THE_END = ("next.done", "next.success", "next.reward")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +41,6 @@ class EditReport:
         num_episodes, num_frames: In it.
         decoded: Episodes of which images were decoded for their statistics.
         lead: Images in front of cuts that stay in the videos, since later ones are decoded from them.
-        left_out: Files of the sources that were not taken over.
     """
 
     path: Path
@@ -47,7 +48,6 @@ class EditReport:
     num_frames: int
     decoded: int
     lead: int
-    left_out: tuple[str, ...] = ()
 
 
 def write_plan(
@@ -73,7 +73,7 @@ def write_plan(
         readers = [_Reader(plan, number, aside, decode=decode) for number in range(len(plan.sources))]
         with (
             DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
-            Beside(plan, folder, aside) as beside,
+            Beside(plan, folder) as beside,
         ):
             lead = 0
             for done, cut in enumerate(plan.cuts, start=1):
@@ -83,16 +83,17 @@ def write_plan(
                 if progress is not None:
                     progress(done, len(plan.cuts))
             info = writer.finish()
-            left_out = beside.finish()
-        if len(roots) == 1 and (roots[0] / CARD_PATH).is_file():
-            shutil.copy2(roots[0] / CARD_PATH, folder / CARD_PATH)
+            beside.finish()
+        for name in ABOUT_THE_WHOLE:
+            if len(roots) == 1 and (roots[0] / name).is_file():
+                (folder / name).parent.mkdir(exist_ok=True)
+                shutil.copyfile(roots[0] / name, folder / name)
     return EditReport(
         path=out,
         num_episodes=info.total_episodes,
         num_frames=info.total_frames,
         decoded=sum(reader.num_decoded for reader in readers),
         lead=lead,
-        left_out=left_out,
     )
 
 
@@ -124,7 +125,8 @@ class _Reader:
     def episode(self, cut: Cut) -> EpisodeData:
         """Read an episode."""
         place, source = self.source.dataset.places[cut.episode], self.source
-        rows = self._rows.read(cut.episode).slice(cut.first, cut.last - cut.first)
+        all_rows = self._rows.read(cut.episode)
+        rows = all_rows.slice(cut.first, cut.last - cut.first)
         whole = (cut.first, cut.last) == (0, place.length)
         columns: dict[str, Any] = {}
         videos: dict[str, EncodedVideo] = {}
@@ -142,6 +144,8 @@ class _Reader:
                 video_info[name] = feature.info or self._cutters[take.feature].stream_info(place)
             else:
                 columns[name] = self._column(rows, take, feature)
+                if take.feature in _OF_THE_END and cut.last != place.length:
+                    columns[name] = _with_end(columns[name], self._column(all_rows, take, feature))
             if feature.is_camera:
                 known = self._known.of(place, take.feature) if whole and self._known is not None else None
                 pixels[name] = known or pixel_histogram(source, take.feature, place, cut.first, cut.last)
@@ -184,6 +188,8 @@ class _Reader:
         latest: dict[str, dict[str, Any]] = {}
         kept = []
         for row in spoken.persistent:
+            if cut.task and row.get("style") == "task_aug":
+                continue  # wordings of the old instruction, which LeRobot would say in place of the new one
             time = row.get("timestamp")
             frame = None if time is None else round(time * self._fps) - cut.first
             if frame is None or not cut.first:
@@ -191,7 +197,7 @@ class _Reader:
             elif frame <= 0:
                 latest[str(row.get("style"))] = {**row, "timestamp": 0.0}
             elif frame < cut.last - cut.first:
-                kept.append({**row, "timestamp": frame / self._fps})
+                kept.append({**row, "timestamp": float(np.float32(frame / self._fps))})
         if cut.first == 0:
             end = (cut.last - 0.5) / self._fps
             kept = [row for row in kept if row.get("timestamp") is None or row["timestamp"] < end]
@@ -205,6 +211,13 @@ class _Reader:
             for head in ("sparse", "dense"):
                 facts |= _clipped_stages(facts, head, cut)
         return facts
+
+
+def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
+    """A cut column in whose last row stands what only the last row of the whole episode states: how it ended."""
+    if column_numbers(column)[:-1].any():
+        return kept
+    return pa.concat_arrays([kept[:-1], column[-1:]])
 
 
 def _clipped_stages(facts: Mapping[str, Any], head: str, cut: Cut) -> dict[str, Any]:
@@ -285,8 +298,6 @@ class _ImageStatistics:
 
 def _entries(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[str, Any]]]:
     for path in sorted((source.root / "meta" / "episodes").glob("*/*.parquet")):
-        from demorec.datasets.lerobot.files import open_table
-
         there = open_table(path).schema_arrow.names
         complete = [key for key in keys if all(f"stats/{key}/{name}" in there for name in NAMES)]
         names = ["episode_index", *(f"stats/{key}/{name}" for key in complete for name in NAMES)]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from demorec.annotate.grounding import SeenObject
 from demorec.core.errors import ExportError, in_words
@@ -19,8 +21,24 @@ from demorec.datasets.staging import sync_file
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
 
 
-SeenByCamera = tuple[int, int, tuple[SeenObject, ...]]
+BoxEntry = tuple[int, str, Mapping[str, Any]]
+"""Row of a box in its episode, its category, and its other values as the file has them."""
+SeenByCamera = tuple[int, int, tuple[BoxEntry, ...]]
 """Width and height of a camera's images in an episode, px, and what is seen in them, row by row."""
+
+
+def box_entry(item: SeenObject, *, width: int, height: int) -> BoxEntry:
+    """What an image of that size (px) shows of one object."""
+    values = {
+        "bbox": list(item.box),
+        "area": item.area,
+        "iscrowd": 0,
+        "segmentation": {"size": [height, width], "counts": coco_string(item.counts)},
+        "object": item.name,
+        "color": item.color,
+        "visible_fraction": item.visible_fraction,
+    }
+    return item.row, item.noun, values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,19 +56,86 @@ def read_boxes(path: Path) -> Iterator[ReadBox]:
     Raises:
         ExportError: It is missing, or no such file.
     """
+    with _box_errors(path), open_regular(path) as file:
+        for raw in file:
+            line = _line(raw)
+            if line == "]":
+                return
+            if line.startswith('{"id"'):
+                item = parse_json(line)
+                x, y, width, height = (float(number) for number in item["bbox"])
+                yield ReadBox(index=int(item["image_id"]), object=str(item["object"]), box=(x, y, width, height))
+        raise ValueError("its end is missing")
+
+
+def _line(raw: bytes) -> str:
+    return raw.decode().strip().rstrip(",")
+
+
+@contextmanager
+def _box_errors(path: Path) -> Iterator[None]:
     try:
-        with open_regular(path) as file:
+        yield
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ExportError(f"The boxes cannot be read ({in_words(error)}): {path}") from error
+
+
+class StoredBoxes:
+    """A file of ours by episode, read in one pass for where its lines are.
+
+    Args:
+        path: The file.
+        starts: First row over the dataset of each episode.
+
+    Raises:
+        ExportError: It is missing, or no such file.
+    """
+
+    def __init__(self, path: Path, starts: Sequence[int]) -> None:
+        self._path, self._starts = path, list(starts)
+        self._parts: dict[int, tuple[int, int]] = {}
+        self._sizes: dict[int, tuple[int, int]] = {}
+        self._nouns: dict[int, str] | None = None
+        with _box_errors(path), open_regular(path) as file:
+            in_images, offset = False, 0
             for raw in file:
-                line = raw.decode().strip().rstrip(",")
-                if line == "]":
-                    return
+                line = _line(raw)
                 if line.startswith('{"id"'):
                     item = parse_json(line)
-                    x, y, width, height = (float(number) for number in item["bbox"])
-                    yield ReadBox(index=int(item["image_id"]), object=str(item["object"]), box=(x, y, width, height))
-        raise ValueError("its end is missing")
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ExportError(f"The boxes cannot be read ({in_words(error)}): {path}") from error
+                    episode = self._episode(int(item["id" if in_images else "image_id"]))
+                    if in_images:
+                        self._sizes.setdefault(episode, (int(item["width"]), int(item["height"])))
+                    else:
+                        begin, _ = self._parts.get(episode, (offset, 0))
+                        self._parts[episode] = (begin, offset + len(raw))
+                elif line == "]":
+                    in_images = True
+                elif line.startswith('"categories"'):
+                    self._nouns = {item["id"]: str(item["name"]) for item in parse_json("{" + line)["categories"]}
+                offset += len(raw)
+            if self._nouns is None:
+                raise ValueError("its end is missing")
+
+    def _episode(self, index: int) -> int:
+        return bisect_right(self._starts, index) - 1
+
+    def read(self, episode: int, first: int, last: int) -> SeenByCamera | None:
+        """Those of the frames from `first` to before `last`; None for an episode whose boxes nobody made."""
+        if episode not in self._sizes:
+            return None
+        (width, height), start = self._sizes[episode], self._starts[episode] + first
+        begin, end = self._parts.get(episode, (0, 0))
+        kept = []
+        with _box_errors(self._path), open_regular(self._path) as file:
+            file.seek(begin)
+            for raw in file.read(end - begin).splitlines():
+                item = parse_json(_line(raw))
+                row = int(item.pop("image_id")) - start
+                noun = (self._nouns or {})[item.pop("category_id")]
+                if 0 <= row < last - first:
+                    del item["id"]
+                    kept.append((row, noun, item))
+        return width, height, tuple(kept)
 
 
 class BoxWriter:
@@ -114,20 +199,14 @@ class _CameraFile:
             }
             self._images.write((",\n" if self._num_images else "") + json.dumps(image))
             self._num_images += 1
-        for item in objects:
-            category = self._categories.setdefault(item.noun, len(self._categories) + 1)
+        for row, noun, values in objects:
+            category = self._categories.setdefault(noun, len(self._categories) + 1)
             self._num_annotations += 1
             annotation = {
                 "id": self._num_annotations,
-                "image_id": first_index + item.row,
+                "image_id": first_index + row,
                 "category_id": category,
-                "bbox": list(item.box),
-                "area": item.area,
-                "iscrowd": 0,
-                "segmentation": {"size": [height, width], "counts": coco_string(item.counts)},
-                "object": item.name,
-                "color": item.color,
-                "visible_fraction": item.visible_fraction,
+                **values,
             }
             self._annotations.write((",\n" if self._num_annotations > 1 else "") + json.dumps(annotation))
 

@@ -17,7 +17,7 @@ from demorec.annotate.tries import story_of
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
-from demorec.datasets.lerobot.boxes import SeenByCamera
+from demorec.datasets.lerobot.boxes import SeenByCamera, box_entry
 from demorec.datasets.lerobot.depth import depth_info, depth_video
 from demorec.datasets.lerobot.facts import EpisodeProgress, episode_facts
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
@@ -143,7 +143,9 @@ def episode_boxes(episode: ExportEpisode) -> dict[str, SeenByCamera]:
         for camera in simulated.info.scene.cameras:
             if camera.name in taken and simulated.has_segmentation(camera.name):
                 seen = seen_objects(simulated, episode.columns, episode.rows, camera)
-                boxes[IMAGE_PREFIX + camera.name] = camera.width, camera.height, tuple(seen)
+                width, height = camera.width, camera.height
+                entries = tuple(box_entry(item, width=width, height=height) for item in seen)
+                boxes[IMAGE_PREFIX + camera.name] = width, height, entries
     if not boxes:
         raise ConfigError(
             "Boxes need recordings with segmentation (generate --segmentation), leave them out: "

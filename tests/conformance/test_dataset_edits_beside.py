@@ -1,0 +1,121 @@
+"""What stands beside the rows of a dataset goes along with `demorec dataset`, or is named with the reason."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.check import checked
+from support.export import data_table, export, make_run
+
+from demorec.cli import main
+
+BOXES = "demorec/boxes/observation.images.front.json"
+
+
+def edit(*words: object) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["dataset", *map(str, words)])
+    assert ended.value.code == 0
+
+
+def table(root: Path, name: str) -> list[dict[str, Any]]:
+    return [row for path in sorted((root / name).glob("*/*.parquet")) for row in pq.read_table(path).to_pylist()]
+
+
+def poses(root: Path, episode: int) -> np.ndarray[Any, Any]:
+    return np.array([row["wrist"] for row in table(root, "demorec/camera_poses") if row["episode_index"] == episode])
+
+
+def boxes(root: Path) -> dict[tuple[int, int], list[tuple[Any, ...]]]:
+    """(episode, frame) of each image of the front camera -> what is seen there."""
+    told = json.loads((root / BOXES).read_text())
+    nouns = {item["id"]: item["name"] for item in told["categories"]}
+    ids = {image["id"]: (image["episode_index"], image["frame_index"]) for image in told["images"]}
+    assert [*ids] == data_table(root).column("index").to_pylist()
+    found: dict[tuple[int, int], list[tuple[Any, ...]]] = {place: [] for place in ids.values()}
+    for item in told["annotations"]:
+        kept = (item["object"], nouns[item["category_id"]], *item["bbox"], item["segmentation"]["counts"])
+        found[ids[item["image_id"]]].append(kept)
+    return found
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated")
+    run = make_run(folder / "run", (12, 10, 11), failures=(1, 2, 7), segmentation=True)
+    export(run, folder / "d", boxes=True, progress=True, language=("task_aug", "subtask"))
+    return folder / "d"
+
+
+def failing(root: Path) -> set[str]:
+    """Checks of the dataset that fail; motion and images of these episodes are made up."""
+    results = checked(root, "dataset", pictures=False).results
+    assert {result.check: result.level for result in results}["dataset_sidecar"] == "pass"
+    return {result.check for result in results if result.level == "fail" and result.check.startswith("dataset")}
+
+
+def test_attempts_boxes_and_poses_follow_their_episodes(
+    simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit("reorder", simulated, "--order", "2,0,1", "--out", tmp_path / "r")
+    assert "failed attempts" not in capsys.readouterr().out
+    edit("select", tmp_path / "r", "--episodes", "0,2", "--out", tmp_path / "s")
+    told = capsys.readouterr().out
+    assert "Not taken over: failed attempts: 1 (at episodes that are not in the result)" in told
+    edit("trim", tmp_path / "s", "--head", 3, "--tail", 2, "--out", tmp_path / "t")
+    before, origin = boxes(simulated), {0: 2, 1: 1}  # episode of s -> of the first
+    assert any(before.values())
+    for root, first, lost in ((tmp_path / "s", 0, 0), (tmp_path / "t", 3, 5)):
+        found = boxes(root)
+        for new, old in origin.items():
+            length = {1: 10, 2: 11}[old] - lost
+            assert np.array_equal(poses(root, new), poses(simulated, old)[first : first + length])
+            assert [found[new, t] for t in range(length)] == [before[old, first + t] for t in range(length)]
+        attempts = [(row["run_episode_index"], row["in_dataset"]) for row in table(root, "demorec/attempts")]
+        assert sorted(attempts) == [(1, False), (1, True), (2, False), (2, True)]
+        assert failing(root) <= failing(simulated)
+
+
+def test_a_new_instruction_keeps_the_scene(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit("set-task", simulated, "--task", "do it", "--episodes", "1", "--out", tmp_path / "d")
+    assert "other wordings (task_aug) in episodes: 1 (" in capsys.readouterr().out
+    old, new = table(simulated, "demorec/episodes"), table(tmp_path / "d", "demorec/episodes")
+    was, now = (json.loads(rows[1]["episode_info"]) for rows in (old, new))
+    assert was.pop("instruction") != now.pop("instruction") == "do it"
+    assert was == now
+    assert [old[n] for n in (0, 2)] == [new[n] for n in (0, 2)]
+    assert failing(tmp_path / "d") <= failing(simulated)
+
+
+def test_what_does_not_go_along_is_named_before_and_after(
+    simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for flags in (("--dry-run",), ()):
+        edit("trim", simulated, "--head", 2, "--out", tmp_path / "d", *flags)
+        told = capsys.readouterr().out
+        assert "taken over: demorec/thumbnails.jpg (it shows the episodes of the source)" in told
+        assert "taken over: scenes of simulated episodes: 3 (" in told
+        assert (tmp_path / "d").exists() == (flags == ())
+
+
+def test_progress_of_a_policy_and_files_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_run(tmp_path / "run", (6, 7, 5))
+    source = tmp_path / "d"
+    export(run, source)
+    index = np.arange(18)
+    counters = {name: data_table(source).column(name) for name in ("index", "episode_index", "frame_index")}
+    pq.write_table(pa.table({**counters, "progress_sparse": index / 18}), source / "sarm_progress.parquet")
+    (source / "meta/modality.json").write_text("{}")
+    edit("reorder", source, "--order", "1,2,0", "--out", tmp_path / "r")
+    assert "taken over: meta/modality.json (of a kind that" in capsys.readouterr().out
+    edit("trim", tmp_path / "r", "--head", 1, "--out", tmp_path / "t")
+    assert pq.read_table(tmp_path / "t/sarm_progress.parquet").to_pydict() == {
+        **{name: data_table(tmp_path / "t").column(name).to_pylist() for name in counters},
+        "progress_sparse": [number / 18 for number in (*range(7, 13), *range(14, 18), *range(1, 6))],
+    }
