@@ -20,10 +20,10 @@ _NAMED = 5
 
 def left_out(plan: Plan) -> tuple[str, ...]:
     """One phrase each, with the reason in brackets; what the user chose to leave out is none."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, set[str]] = {}
     for number, source in enumerate(plan.sources):
         for name, reason in _files(plan, number, source.root):
-            found.setdefault(reason, []).append(name)
+            found.setdefault(reason, set()).add(name)
     phrases = []
     for reason, names in found.items():
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
