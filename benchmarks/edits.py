@@ -128,8 +128,9 @@ def main() -> None:
                 cpu, wall = (statistics.median(values) for values in zip(*spent[work, who], strict=True))
                 own[who] = max(cpu - idle[who][0], 0.0)
                 cells.append(f"{who} {cpu:.2f} ({wall:.2f})")
-        ratio = own["lerobot"] / max(own["demorec"], 0.01) if "lerobot" in own else float("nan")
-        print(f"{work:8} {'  '.join(cells)}  lerobot/demorec {ratio:.1f}")
+        if "lerobot" in own:
+            cells.append(f"lerobot/demorec {own['lerobot'] / max(own['demorec'], 0.01):.1f}")
+        print(f"{work:8} {'  '.join(cells)}")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,9 @@ def edit(*words: object) -> int:
     return int(ended.value.code or 0)
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(
+    scope="module", params=["video", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("images", "streaming"))]
+)
 def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_with_lerobot(tmp_path_factory.mktemp("made") / "d", **KINDS[request.param])
 
@@ -71,11 +73,12 @@ def test_what_is_kept_is_kept_bit_for_bit(dataset: Path, tmp_path: Path) -> None
         statistics_are_exact(out)
 
 
-def test_the_results_are_clean(small: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("pictures", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_results_are_clean(small: Path, tmp_path: Path, pictures: bool) -> None:
     assert edit("trim", small, "--head", 3, "--out", tmp_path / "trimmed", "--decode") == 0
     assert edit("shuffle", small, "--seed", 3, "--out", tmp_path / "shuffled") == 0
     for name in ("trimmed", "shuffled"):
-        results = checked(tmp_path / name, "dataset").results
+        results = checked(tmp_path / name, "dataset", pictures=pictures).results
         assert not [result for result in results if result.level in ("fail", "warn")]
 
 
@@ -108,12 +111,20 @@ def test_features_and_tasks(small: Path, tmp_path: Path) -> None:
     assert [str(episode[0]["task"]) for episode in found[:3]] == ["put it there", "push", "put it there"]
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.permutations(range(5)), st.integers(0, 9), st.sampled_from([0.2, 0.4, 0.6]))
 def test_round_trips(
     small: Path, tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int, share: float
 ) -> None:
-    at, whole = tmp_path_factory.mktemp("trips"), small
+    round_trips(small, tmp_path_factory.mktemp("trips"), order, seed, share)
+
+
+def test_one_round_trip(small: Path, tmp_path: Path) -> None:
+    round_trips(small, tmp_path, [3, 0, 4, 2, 1], seed=1, share=0.4)
+
+
+def round_trips(small: Path, at: Path, order: list[int], seed: int, share: float) -> None:
     assert edit("trim", small, "--head", 0, "--tail", 0, "--out", at / "no") == 2  # nothing to cut is no request
     assert edit("reorder", small, "--order", ",".join(map(str, range(5))), "--out", at / "as_it_is") == 0
     back = [order.index(number) for number in range(5)]
@@ -125,7 +136,7 @@ def test_round_trips(
     assert edit("split", small, "--shares", *shares, "--seed", seed, "--out", at / "parts") == 0
     assert edit("merge", at / "parts/a", at / "parts/b", "--out", at / "merged") == 0
     states = data_table(at / "merged").column("observation.state").to_pylist()
-    assert sorted(map(tuple, states)) == sorted(map(tuple, data_table(whole).column("observation.state").to_pylist()))
+    assert sorted(map(tuple, states)) == sorted(map(tuple, data_table(small).column("observation.state").to_pylist()))
     rows = data_table(at / "as_it_is").drop_columns(["task_index"]).to_pydict()
     for name in ("back", "named"):
         found = data_table(at / name).drop_columns(["task_index"])
@@ -154,6 +165,7 @@ def test_all_differences_are_named_and_a_mapping_solves_them(
     assert np.array_equal(found[7][6]["action"], before[2][6]["action"])
 
 
+@pytest.mark.slow  # test_dataset_edits_beside.py has the quick ones
 def test_our_own_datasets_keep_what_stands_beside(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (20, 15, 17))
     export(run, tmp_path / "d")
