@@ -41,13 +41,19 @@ def available_cores() -> int:
 class _Process(SpawnProcess):
     def start(self) -> None:
         _start_tracker()
-        with _main_hidden():
-            super().start()
+        # The new process inherits the mask: Ctrl-C waits until `run` can catch it, also while modules are imported.
+        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            with _main_hidden():
+                super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
 
     def run(self) -> None:
-        threading.Thread(target=_end_with_parent, daemon=True).start()
-        sys.unraisablehook = _interrupt_again
         try:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            threading.Thread(target=_end_with_parent, daemon=True).start()
+            sys.unraisablehook = _interrupt_again
             super().run()
         except KeyboardInterrupt:  # Ctrl-C reaches the whole process group; the parent is the one who tells
             os._exit(130)
