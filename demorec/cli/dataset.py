@@ -21,6 +21,21 @@ if TYPE_CHECKING:
 _COMMANDS = (
     "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle", "diff",
 )  # fmt: skip
+_FLAGS = {
+    "where": ("select", "drop", "set-task"),
+    "episodes": ("select", "drop", "set-task"),
+    **dict.fromkeys(("head", "tail", "idle", "idle_feature", "idle_threshold", "idle_margin"), ("trim",)),
+    "shares": ("split",),
+    "by": ("split", "reorder"),
+    "descending": ("reorder",),
+    "order": ("reorder",),
+    "seed": ("split", "shuffle"),
+    "task": ("set-task",),
+    "mapping": ("merge",),
+    "json": ("diff",),
+    **dict.fromkeys(("out", "decode", "overwrite", "dry_run"), _COMMANDS[:-1]),
+}
+"""The commands that each flag is for."""
 _SHOWN = 20
 """Differences of each level that are printed."""
 
@@ -96,6 +111,10 @@ class Dataset:
     def run(self) -> int:
         """Plan, write, and say what came out."""
         check_choice("command of demorec dataset", self.command, _COMMANDS)
+        for flag, commands in _FLAGS.items():
+            if self.command not in commands and getattr(self, flag) != getattr(Dataset, flag):
+                name = flag.replace("_", "-")
+                raise ConfigError(f"--{name} means nothing to {self.command}: it is for {', '.join(commands)}.")
         if self.command == "diff":
             return self._diff()
         if not self.words or self.out is None:
