@@ -74,6 +74,6 @@ quietly "$uv" pip install -p .venv -c constraints.txt -e . --group dev "${argume
 quietly .venv/bin/python -c "import pybullet"
 echo "Compiling the renderer for this machine"
 echo "Warming" >>"$log"
-quietly .venv/bin/python -c "from demorec.render.warm import warm_up_renderer; warm_up_renderer('raster')"
+quietly .venv/bin/python -c "from demorec.render.raster import warm_up; warm_up()"
 touch .venv/.stamp-"$pybullet"
 printf 'Set up in %d:%02d min.\n' $((SECONDS / 60)) $((SECONDS % 60))

@@ -1,10 +1,11 @@
-"""`make setup` with and without a C++ compiler; a stand-in for uv notes what it is asked to do."""
+"""`make setup` with and without a C++ compiler; with a stand-in for uv; the new environment's Python is this one."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,13 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = ("bash", "awk", "cat", "cut", "getconf", "head", "make", "mkdir", "mktemp", "rm", "sleep", "sort", "touch")
-UV = """#!/bin/bash
+UV = f"""#!/bin/bash
 case $1 in
   --version) echo "uv 9.9.9" ;;
-  venv) mkdir -p .venv/bin; printf '#!/bin/bash\\n' >.venv/bin/python; chmod +x .venv/bin/python ;;
+  venv)
+    mkdir -p .venv/bin
+    printf '#!/bin/bash\\nexec {sys.executable} "$@"\\n' >.venv/bin/python
+    chmod +x .venv/bin/python ;;
   pip) echo "$*" >>asked; for word; do case $word in *.override) cat "$word" >>override ;; esac; done ;;
 esac
 """
