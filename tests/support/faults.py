@@ -15,7 +15,8 @@ from demorec.check.cells import CellGrid, ImageKind
 from demorec.check.drawn import PictureComparison
 from demorec.check.episode import CheckedEpisode, PictureSummary
 from demorec.core.tables import CHECKS
-from demorec.episode.episode import Outcome, SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import Columns, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
 
 Rows = NDArray[Any]
@@ -75,8 +76,8 @@ class Good:
 class Changed:
     """What is put in a recording's place; None leaves it."""
 
-    columns: SimulatedColumns
-    info: SimulatedInfo
+    columns: Columns
+    info: EpisodeInfo
     outcome: Outcome
 
     def with_columns(self, **arrays: Any) -> Changed:
