@@ -29,6 +29,9 @@ MISTAKEN_PHASE, CORRECTED_PHASE = "mistake", "correct"
 INTERJECTION_EVENT = "interjection"
 """Event between these two: "NAME is meant, not NAME"."""
 
+TIME_LIMIT = "time_limit"
+"""Reason of a failure that had not ended when its time was over."""
+
 FORMAT_VERSION = 2
 """Of the recordings. A reader knows every version up to this one; `recordings/sample/` holds a file of each."""
 
@@ -228,6 +231,16 @@ class Outcome:
     num_retries: int = 0
     final_state_digest: str = ""
     drops: Mapping[str, int] = field(default_factory=dict)
+
+
+def gave_up(outcome: Outcome, events: Sequence[Event], info: SimulatedInfo) -> bool:
+    """Whether a recording shows the reason of a failure, whatever the conditions say: an event of its name, or the end
+    of the time."""
+    limit = info.config.get("max_episode_seconds")
+    is_over = isinstance(limit, int | float) and outcome.num_frames + 1 > limit * info.fps
+    return (outcome.failure_reason == TIME_LIMIT and is_over) or any(
+        event.name == outcome.failure_reason and event.level != "info" for event in events
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
