@@ -40,6 +40,8 @@ from demorec.robots.urdf import Urdf, UrdfLink, read_links
 
 LIMIT = 0.001
 """Of depth and slip, metres."""
+MAX_FORCE = 100.0
+"""N of both fingers together."""
 Cell = tuple[str, str, str]
 
 
@@ -50,6 +52,7 @@ class Row:
     Attributes:
         grasps: How often something was lifted.
         depth, deepest: Of the deepest finger, and where: phase and object.
+        force: The largest of the fingers' forces at a frame, of both together, N.
         slip: The largest motion of a lifted object in the hand.
         cpu, simulated: CPU time of reset and control loop, and simulated time.
         other_depth, other_cpu, other_simulated: The same with the other URDF; 0 without `--against`.
@@ -66,12 +69,18 @@ class Row:
     grasps: int = 0
     depth: float = 0.0
     deepest: str = ""
+    force: float = 0.0
     slip: float = 0.0
     cpu: float = 0.0
     simulated: float = 0.0
     other_depth: float = 0.0
     other_cpu: float = 0.0
     other_simulated: float = 0.0
+
+    @property
+    def is_crushed(self) -> bool:
+        """Whether no real hand could have done it."""
+        return self.depth > LIMIT or self.force > MAX_FORCE
 
 
 def run_episode(config: GenerateConfig, index: int, against: str = "") -> Row:
@@ -100,6 +109,7 @@ def run_episode(config: GenerateConfig, index: int, against: str = "") -> Row:
         grasps=grasps,
         depth=depth,
         deepest=deepest,
+        force=max((frame.observation.contact_force for frame in frames), default=0.0),
         slip=slip,
         cpu=cpu,
         simulated=len(frames) / config.fps,
@@ -224,14 +234,18 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
     cells: dict[Cell, list[Row]] = defaultdict(list)
     for row in rows:
         cells[row.task, row.robot, row.variation].append(row)
-    yield "| task | robot | variation | success | first try | grasps | depth mm (median / max) | over 1 mm | slips |"
-    yield "|---|---|---|---|---|---|---|---|---|"
+    yield (
+        "| task | robot | variation | success | first try | grasps | depth mm (median / max) | force N (max) "
+        "| crushed: all / successes | slips |"
+    )
+    yield "|---|---|---|---|---|---|---|---|---|---|"
     for name, members in [*sorted(cells.items()), (("all", "", ""), list(rows))]:
         depths = 1e3 * np.array([row.depth for row in members])
         yield (
             f"| {' | '.join(name)} | {sum(r.success for r in members)}/{len(members)} "
             f"| {sum(r.first_try for r in members)} | {sum(r.grasps for r in members)} "
-            f"| {np.median(depths):.2f} / {depths.max():.2f} | {sum(r.depth > LIMIT for r in members)} episodes "
+            f"| {np.median(depths):.2f} / {depths.max():.2f} | {max(r.force for r in members):.0f} "
+            f"| {sum(r.is_crushed for r in members)} / {sum(r.is_crushed and r.success for r in members)} "
             f"| {sum(r.slip > LIMIT for r in members)} episodes |"
         )
 
@@ -265,7 +279,7 @@ def main() -> None:
     ]
     for row in portion(jobs, args):
         rows.append(row)
-        if row.depth > LIMIT or row.slip > LIMIT or not row.success:
+        if row.is_crushed or row.slip > LIMIT or not row.success:
             print(json.dumps(asdict(row)), flush=True)
         if args.out:
             with args.out.open("a") as file:

@@ -173,6 +173,13 @@ def motions_of_dataset(
         yield motion if spec is None else replace(motion, tcp_link=spec.tcp_link)
 
 
+def motion_of_features(
+    features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]], fps: float, urdf: str = ""
+) -> Motion:
+    """Of arrays alone, one an element of `names`; by the URDF, or by the robot whose joints the state's names are."""
+    return _motion("", fps, features, names, arm=_arm(names[STATE], urdf))
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Arm:
     """What is known of the robot: its joint tree, the joints of the state's elements, a model with its masses."""

@@ -12,6 +12,7 @@ from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Found, Measurement, NotMeasured, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import matrices
+from demorec.episode.episode import gave_up
 
 
 @outcome_check(
@@ -30,6 +31,8 @@ def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
         wrong.append(f"success, but with the failure reason {outcome.failure_reason!r}")
     if not outcome.success and not outcome.failure_reason:
         wrong.append("a failure without a reason")
+    elif not outcome.success and not failed and not gave_up(outcome, [e for _, e in episode.events], episode.info):
+        wrong.append("a failure, but all conditions passed, and nothing shows that the expert gave up")
     if outcome.failure_reason in {condition.name for condition in outcome.checks if condition.passed}:
         wrong.append(f"failed by {outcome.failure_reason}, which passed")
     if outcome.num_frames != episode.num_frames:

@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Send recorded actions back into the simulator and compare every state with the recorded one.
+    """Send recorded actions back into the simulator and compare everything sensed, and the outcome, with the recording.
 
-    Recordings must replay bit-exactly (on the same type of machine). Datasets hold float32 actions without the
+    Recordings must replay bit-exactly (on the same type of machine); labels, phases and images are for
+    demorec check --deep. Datasets hold float32 actions without the
     exploration noise that was executed; for them success and deviations are reported. Exit code 0: as recorded
     (bit-exact; for a dataset or with --noise, --delay or --export-hz: the recorded outcome); 1: not as recorded.
 
@@ -107,6 +108,7 @@ class Replay:
                 say_json([to_plain(report) for report in reports])
             else:
                 say(_summary(reports, sum(good)))
+                say(_compared(reports))
                 if self.out is not None:
                     say(f"Recordings of the replays: {self.out}")
             if self.view:
@@ -188,10 +190,19 @@ def told(report: ReplayReport) -> str:
         if report.object_error_name:
             how += f", {report.object_error_name} {report.object_error * 1e3:.3g} mm at step {report.object_error_step}"
     outcome = {None: "", True: ", succeeds", False: f", fails ({', '.join(report.failed_checks)})"}[report.success]
-    if report.success is not None and report.recorded_success is not None and report.success != report.recorded_success:
+    if not report.is_outcome_as_recorded:
         outcome += f" where the recording {'succeeded' if report.recorded_success else 'failed'}"
     lost = f", {report.unreachable} poses out of reach" if report.unreachable else ""
     return f"{report.name}: {how}{outcome}{lost}"
+
+
+def _compared(reports: Sequence[ReplayReport]) -> str:
+    """What "identical" means."""
+    names = [name for name in dict.fromkeys(name for r in reports for name in r.compared) if " pose of " not in name]
+    objects = ["poses of objects"] if any(report.compares_objects for report in reports) else []
+    return (
+        f"Compared: {', '.join([name.removeprefix('the ') for name in names] + objects)}; not labels, phases, images."
+    )
 
 
 def _summary(reports: Sequence[ReplayReport], good: int) -> str:

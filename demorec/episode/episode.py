@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import NotSimulatedError
 from demorec.core.geometry import Array, Pose
+from demorec.episode.info import EpisodeInfo
 
 POLICY_PHASE = "policy"
 """Phase of the frames in which a policy acts, or somebody else who tells no phase; all others are the expert's."""
@@ -27,6 +28,9 @@ MISTAKEN_PHASE, CORRECTED_PHASE = "mistake", "correct"
 """Phases of an episode with an interjection: the wrong thing is gone for; what was said is listened to."""
 INTERJECTION_EVENT = "interjection"
 """Event between these two: "NAME is meant, not NAME"."""
+
+TIME_LIMIT = "time_limit"
+"""Reason of a failure that had not ended when its time was over."""
 
 NO_PICTURE = -1
 """Stands for the number of an image where a frame has none."""
@@ -184,6 +188,16 @@ class Outcome:
     num_retries: int = 0
     final_state_digest: str = ""
     drops: Mapping[str, int] = field(default_factory=dict)
+
+
+def gave_up(outcome: Outcome, events: Sequence[Event], info: EpisodeInfo) -> bool:
+    """Whether a recording shows the reason of a failure, whatever the conditions say: an event of its name, or the end
+    of the time."""
+    limit = info.config.get("max_episode_seconds")
+    is_over = isinstance(limit, int | float) and outcome.num_frames + 1 > limit * info.fps
+    return (outcome.failure_reason == TIME_LIMIT and is_over) or any(
+        event.name == outcome.failure_reason and event.level != "info" for event in events
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

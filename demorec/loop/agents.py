@@ -114,14 +114,24 @@ class ScriptAgent:
             )
 
     def _steps(self, expert: Expert) -> Iterator[Step]:
-        """The script; when the expert gives up, one step more, which carries the events that say why."""
+        """The script; when the expert gives up, one step more, which carries the events that say why.
+
+        It goes on only as long as the hand does what a real one could: a demonstration that crushes things is none.
+        """
         try:
-            if self._episode.interjection is not None:
-                yield from mistake(expert, self._episode.interjection)
-            yield from self._episode.task.script(expert)
+            for step in self._script(expert):
+                yield step
+                if name := expert.world.crushed():
+                    expert.note("crush", f"pressed on {name} harder than a hand can", trouble=True)
+                    raise GaveUp(*expert.trouble)
         except GaveUp as error:
             self._gave_up = error
             yield expert.step()
+
+    def _script(self, expert: Expert) -> Iterator[Step]:
+        if self._episode.interjection is not None:
+            yield from mistake(expert, self._episode.interjection)
+        yield from self._episode.task.script(expert)
 
     def failure(self, failed: Sequence[str]) -> tuple[str, str]:
         """See `Agent`."""

@@ -7,7 +7,16 @@ from collections.abc import Iterator, Mapping
 from typing import Self
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Action, CameraImages, Frame, Observation, Outcome, SuccessCheck, frame_time_ns
+from demorec.episode.episode import (
+    TIME_LIMIT,
+    Action,
+    CameraImages,
+    Frame,
+    Observation,
+    Outcome,
+    SuccessCheck,
+    frame_time_ns,
+)
 from demorec.episode.scene import Scene
 from demorec.loop.agents import Agent, Decision
 from demorec.loop.prepare import Episode
@@ -108,7 +117,7 @@ class Session:
         stopped = ("", "")
         for decision in agent.decide(self.world):
             if self.frame_index == self._max_frames:
-                stopped = (decision.phase, "time_limit")
+                stopped = (decision.phase, TIME_LIMIT)
                 break
             frame = self.frame(decision)
             yield frame

@@ -6,14 +6,14 @@ Datasets have float32 actions of any kind; their scenes come from the sidecar.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option
 from demorec.core.geometry import Array
-from demorec.episode.episode import Action, Frame, SuccessCheck
+from demorec.episode.episode import Action, Columns, Frame, Observation, SuccessCheck, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, open_recording
@@ -66,9 +66,9 @@ class Demonstration:
         actions: (T, D) what to send is decoded from these; of a dataset.
         action_kind: What `actions` mean; None where `commands` tell.
         joint_position: (T, n) recorded before each command; n = n_joints, or n_arm of a dataset.
-        joint_velocity: (T, n_joints), or None.
         gripper_width: (T,) m.
         object_poses: name -> (T, 7); empty for a dataset.
+        sensed: Words for what else is compared, "joint efforts" -> (T, D) recorded.
         recorded_success: Whether the episode succeeded when it was recorded; None if that is not known.
         final_state_digest: Of the recording, or "".
         tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.
@@ -76,15 +76,16 @@ class Demonstration:
         digest: Of its content.
         recorded: The recorded frames, without pictures, where every one of them is replayed.
         recorded_checks: Conditions of the task as recorded.
+        gave_up: Whether the recording shows why it failed whatever the conditions say (`gave_up`).
     """
 
     name: str
     info: EpisodeInfo
     fps: int
     joint_position: Array
-    joint_velocity: Array | None
     gripper_width: Array
     object_poses: Mapping[str, Array]
+    sensed: Mapping[str, Array] = field(default_factory=dict)
     recorded_success: bool | None
     commands: tuple[Action, ...] = ()
     actions: Array | None = None
@@ -95,6 +96,7 @@ class Demonstration:
     digest: str = ""
     recorded: tuple[Frame, ...] = ()
     recorded_checks: tuple[SuccessCheck, ...] = ()
+    gave_up: bool = False
 
     @property
     def num_steps(self) -> int:
@@ -127,9 +129,9 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         fps=fps,
         commands=tuple(action_at(columns, int(row), "command") for row in sent),
         joint_position=columns.joint_position[rows],
-        joint_velocity=None if options.states else columns.joint_velocity[rows],
         gripper_width=columns.gripper_width[rows],
         object_poses={name: poses[rows] for name, poses in columns.object_poses.items()},
+        sensed={name: table[rows] for name, table in _sensed(columns, is_moved=not options.states).items()},
         recorded_success=None if outcome is None else outcome.success,
         final_state_digest="" if outcome is None or stride > 1 else outcome.final_state_digest,
         # Placing a body normalises its quaternion once more.
@@ -137,7 +139,32 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         digest=recording.digest(),
         recorded=tuple(frames_of(recording, columns)) if stride == 1 else (),
         recorded_checks=() if outcome is None else outcome.checks,
+        gave_up=outcome is not None and gave_up(outcome, [event for _, event in recording.events()], info),
     )
+
+
+def _sensed(columns: Columns, *, is_moved: bool) -> dict[str, Array]:
+    """What is recorded beside the states that a world can be put in; without physics only what follows from these."""
+    if not is_moved:
+        return {"the EE pose": columns.base_from_tcp}
+    return {
+        "joint velocities": columns.joint_velocity,
+        "joint efforts": columns.joint_effort,
+        "the contact force": columns.contact_force[:, None],
+        "the EE pose": columns.base_from_tcp,
+        **{f"the {name}": table for name, table in columns.sensed.items()},
+    }
+
+
+def sensed_now(observation: Observation) -> dict[str, Array]:
+    """The same words -> (D,) of what is sensed in a replay."""
+    return {
+        "joint velocities": observation.joint_velocity,
+        "joint efforts": observation.joint_effort,
+        "the contact force": np.array([observation.contact_force]),
+        "the EE pose": observation.base_from_tcp.vector(),
+        **{f"the {name}": values for name, values in observation.sensed.items()},
+    }
 
 
 def open_file(path: Path, options: ReplayOptions) -> Demonstration:
@@ -185,7 +212,6 @@ def dataset_demonstrations(
             actions=rows[ACTION].astype(np.float64),
             action_kind=kind,
             joint_position=state[:, :arm],
-            joint_velocity=None,
             gripper_width=state[:, arm],
             object_poses={},
             recorded_success=bool(row["success"]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import chain, repeat
+from itertools import chain, repeat, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,13 @@ from demorec.core.geometry import Array
 from demorec.core.plain import from_plain
 from demorec.core.seeding import generator
 from demorec.core.tables import TASKS
-from demorec.episode.episode import Action, Frame, Observation, Outcome
+from demorec.episode.episode import Action, Frame, Observation, Outcome, SuccessCheck
 from demorec.loop import Decision, Session, SimulatorCache
 from demorec.loop.actions import ActionDecoder
 from demorec.mcap import SimulatedWriter
 from demorec.mcap.streams import pose_of
 from demorec.render.painter import Painter
-from demorec.replay.demonstration import Demonstration, ReplayOptions
+from demorec.replay.demonstration import Demonstration, ReplayOptions, sensed_now
 from demorec.replay.rerender import recorded_view, view_behaviour, view_painter
 from demorec.robots.assets import allow_models
 from demorec.sim.world import World
@@ -37,14 +37,17 @@ class ReplayReport:
         name: What was replayed.
         num_steps: Commands sent.
         is_bitwise: Whether full float64 states were compared, so that nothing may differ.
-        is_identical: No bit of any compared state differs, the final state's digest included (float32 datasets: no
-            more than rounding).
+        compared: What of each frame was compared, in words.
+        is_identical: No bit of any of this differs, nor of the final state's digest and the conditions of a recording's
+            outcome (float32 datasets: no more than rounding).
         first_difference: First step with another state, and what differed there; None when none does.
         joint_error, joint_error_step: Largest difference of an arm joint, rad, and where.
         gripper_error: Largest difference of the opening, m.
         object_error, object_error_step, object_error_name: Largest distance of an object from its recorded place, m.
         compares_objects: Whether the places of objects were recorded; a dataset has none.
         recorded_success, success: Of the task, then and now; None where that is not known or not judged.
+        is_outcome_as_recorded: Both are the same, or one is not known. A failure whose reason the recording shows (the
+            expert gave up) stays one though the conditions hold.
         failed_checks: Conditions that do not hold now.
         unreachable: Steps whose pose inverse kinematics did not reach (the arm held its last target).
     """
@@ -52,6 +55,7 @@ class ReplayReport:
     name: str
     num_steps: int
     is_bitwise: bool
+    compared: tuple[str, ...]
     is_identical: bool
     first_difference: tuple[int, str] | None
     joint_error: float
@@ -63,6 +67,7 @@ class ReplayReport:
     compares_objects: bool
     recorded_success: bool | None
     success: bool | None
+    is_outcome_as_recorded: bool
     failed_checks: tuple[str, ...] = ()
     unreachable: int = 0
 
@@ -206,16 +211,20 @@ def _report(
         first = step, list(off)[int(differs[:, step].argmax())]
     elif is_judged and d.final_state_digest not in ("", outcome.final_state_digest):
         first = d.num_steps, "the final state"
+    elif is_judged and d.final_state_digest and outcome.checks != d.recorded_checks:
+        first = d.num_steps, _other_condition(outcome.checks, d.recorded_checks)
     arm = np.abs(off["joint positions"][:, : len(d.info.robot.arm_joints)]).max(axis=1)
     distances = np.array([np.linalg.norm(off[f"the pose of {name}"][:, :3], axis=1) for name in d.object_poses])
     number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
     distance = float(distances[number, step]) if len(distances) else 0.0
     checks = outcome.checks if is_judged else ()
     failed = tuple(check.name for check in checks if not check.passed)
+    success = not failed if checks else None
     return ReplayReport(
         name=d.name,
         num_steps=len(seen),
-        is_bitwise=bool(d.object_poses) or d.joint_velocity is not None,
+        is_bitwise=bool(d.sensed),
+        compared=tuple(off),
         is_identical=first is None,
         first_difference=first,
         joint_error=float(arm.max()),
@@ -226,10 +235,19 @@ def _report(
         object_error_name="" if distance == 0.0 else list(d.object_poses)[number],
         compares_objects=bool(d.object_poses),
         recorded_success=d.recorded_success,
-        success=not failed if checks else None,
+        success=success,
+        is_outcome_as_recorded=None in (success, d.recorded_success)
+        or success == d.recorded_success
+        or (d.gave_up and not d.recorded_success),
         failed_checks=failed,
         unreachable=unreachable,
     )
+
+
+def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessCheck]) -> str:
+    """The first condition that is not the recorded one."""
+    pairs = zip_longest(now, recorded)
+    return next(f"the condition {(one or other).name}" for one, other in pairs if one != other)
 
 
 def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Array]:
@@ -239,8 +257,8 @@ def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Arr
         "joint positions": np.array([now.joint_position[:width] for now in seen]) - d.joint_position[:num_steps],
         "gripper opening": (np.array([now.gripper_width for now in seen]) - d.gripper_width[:num_steps])[:, None],
     }
-    if d.joint_velocity is not None:
-        off["joint velocities"] = np.array([now.joint_velocity for now in seen]) - d.joint_velocity[:num_steps]
+    for name, recorded in d.sensed.items():
+        off[name] = np.array([sensed_now(now)[name] for now in seen]) - recorded[:num_steps]
     for name, poses in d.object_poses.items():
         off[f"the pose of {name}"] = np.array([now.object_poses[name].vector() for now in seen]) - poses[:num_steps]
     return off
@@ -255,12 +273,9 @@ def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: boo
         bitwise: Whether the states must be the same; otherwise (changed commands) the outcome alone counts.
     """
     if not report.is_bitwise or not bitwise:
-        return report.success is None or report.recorded_success is None or report.success == report.recorded_success
-    return report.is_identical or (
-        tolerance > 0.0
-        and max(report.joint_error, report.gripper_error, report.object_error) <= tolerance
-        and report.success == report.recorded_success
-    )
+        return report.is_outcome_as_recorded
+    errors = report.joint_error, report.gripper_error, report.object_error
+    return report.is_outcome_as_recorded and (report.is_identical or 0.0 < max(errors) <= tolerance)
 
 
 def replay_all(

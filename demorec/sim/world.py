@@ -24,6 +24,8 @@ from demorec.sim.client import connect
 
 SETTLE_SECONDS = 0.1
 """Physics time before the first frame, so that objects rest on their support."""
+MAX_PRESS_FORCE, MAX_PRESS_DEPTH = 100.0, 1e-3
+"""N and metres: where a link of the robot presses on an object harder, or sinks in deeper, no real hand would do it."""
 
 
 class World:
@@ -107,7 +109,10 @@ class World:
         """Advance by one control step; the joint targets move linearly from the last command to this one."""
         start, end = self.arm.target, np.asarray(command.joint_target, dtype=np.float64)
         if self._hold is not None:
-            self._hold.update(opens=command.gripper_target > self.arm.gripper_target + 1e-6)
+            self._hold.update(
+                opens=command.gripper_target > self.arm.gripper_target + 1e-6,
+                closes=command.gripper_target < self.arm.gripper_width(),
+            )
         self.arm.command(command)
         samples = []
         for substep in range(1, self._substeps + 1):
@@ -208,6 +213,16 @@ class World:
         contacts = self.client.getContactPoints(self.arm.body, self._bodies[name])
         return any(abs(contact[7][2]) > 0.7 and contact[9] > force for contact in contacts)
 
+    def crushed(self) -> str:
+        """The movable body that a link of the robot presses on harder than a real hand could; "" for none."""
+        for body in self.scene.movable:
+            forces: dict[int, float] = {}
+            for contact in self.client.getContactPoints(self.arm.body, self._bodies[body.name]):
+                forces[contact[3]] = forces.get(contact[3], 0.0) + contact[9]
+                if contact[8] < -MAX_PRESS_DEPTH or forces[contact[3]] > MAX_PRESS_FORCE:
+                    return body.name
+        return ""
+
     def touches_robot(self, name: str) -> bool:
         """Whether any part of the robot touches a body of the scene."""
         return bool(self.client.getContactPoints(self.arm.body, self._bodies[name]))
@@ -276,7 +291,7 @@ def _set_engine(client: Any, physics: Physics) -> None:
 
 
 class ConstraintHold:
-    """Fixes a body to the hand while both fingers press on it, until the gripper is told to open.
+    """Fixes a body to the hand once both closing fingers press on it, until the gripper is told to open.
 
     The shortcut of many PyBullet tutorials, instead of friction. What happens depends on the world's state and the
     commands alone, so that a recording replays without being told when the constraint was made.
@@ -293,13 +308,18 @@ class ConstraintHold:
         self._bodies = tuple(bodies)
         self._constraint: int | None = None
 
-    def update(self, *, opens: bool) -> None:
-        """Make or release the constraint; called before each command with whether it opens the gripper further."""
+    def update(self, *, opens: bool, closes: bool) -> None:
+        """Make or release the constraint; called before each command.
+
+        Args:
+            opens: Whether the command opens the gripper further than the last one.
+            closes: Whether it asks for less than the present opening; fingers that have not yet left an object do not.
+        """
         if opens:
             if self._constraint is not None:
                 self._client.removeConstraint(self._constraint)
                 self._constraint = None
-        elif self._constraint is None:
+        elif closes and self._constraint is None:
             body = next((body for body in self._bodies if self._is_pressed(body)), None)
             if body is not None:
                 self._constraint = self._fix(body)

@@ -149,8 +149,9 @@ class Tutorial(Task):
         release = expert.reachable_place(RELEASE_POINT)
         yield from expert.move(release, speed=0.5)
         expert.phase = "release"
-        # For a while: at the moment of landing the cube can be as slow as at rest.
-        rests = lasting(lambda: self._rests(world), steps=max(1, round(REST_SECONDS * world.fps)))
+        # For a while: at the moment of landing the cube can be as slow as at rest. The last state has no frame; at rest
+        # are that one and two recorded ones, at any rate.
+        rests = lasting(lambda: self._rests(world), steps=max(3, round(REST_SECONDS * world.fps)))
         yield from expert.set_gripper(expert.open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:

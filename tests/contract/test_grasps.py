@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pytest
-from support.sim import episode
+from support.sim import episode, run
 
 from demorec.core.tables import ROBOTS
 from demorec.episode.scene import Shape
@@ -52,3 +54,29 @@ def test_fingers_stay_outside_of_cubes_that_are_sorted() -> None:
     made = episode(10, task="sort_by_color", seed=4)
     side = min(min(body.shape.size) for body in made.info.scene.movable)
     assert smallest_opening(made) > side - 2 * SINKING
+
+
+def test_an_episode_that_crushes_something_is_a_failure_and_the_next_attempt_does_better() -> None:
+    """Here the hand brushes the tower on its way down to the third cube."""
+    options: dict[str, Any] = {"task": "stack_three", "robot": "iiwa", "variation": "full", "seed": 71013}
+    frames, outcome = run(episode(0, **options))
+    assert max(frame.observation.contact_force for frame in frames) > 100  # N, as recorded
+    assert (outcome.success, outcome.failure_phase, outcome.failure_reason) == (False, "approach", "crush")
+    assert frames[-1].events[-1].message == "pressed on blue_cube harder than a hand can"
+    frames, outcome = run(episode(0, attempt=1, **options))
+    assert outcome.success
+    assert max(frame.observation.contact_force for frame in frames) < 100
+
+
+def test_a_hand_that_opens_lets_go_at_any_rate() -> None:
+    """At 60 frames a second the fingers still touch the cube one frame after they began to open."""
+    frames, outcome = run(episode(0, task="tutorial", robot="iiwa", variation="full", fps=60, seed=72008))
+    assert outcome.success
+    assert frames[-1].observation.object_poses["red_cube"].position[2] < 0.3  # on the table, not in the hand at 0.8 m
+
+
+def test_what_was_dropped_rests_in_the_last_recorded_frames() -> None:
+    frames, outcome = run(episode(0, task="tutorial", variation="full", fps=10, seed=72019))
+    before, last = (frame.observation.object_poses["red_cube"].position for frame in frames[-2:])
+    assert outcome.success
+    assert np.linalg.norm(last - before) * 10 < 0.01  # m/s, what a success allows

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import Spoilt, simulate, simulate_run
+from support.check import Spoilt, level_of, simulate, simulate_run
 from support.commands import exit_code
 from support.recording import make_episode
 from support.tasks import tasks_with_slow_ones
@@ -18,6 +18,7 @@ from support.tasks import tasks_with_slow_ones
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.episode.episode import Event
 from demorec.mcap import Recording, SimulatedWriter
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
 
@@ -76,6 +77,58 @@ def test_another_final_state_is_found(recorded: Path, tmp_path: Path) -> None:
     assert report.first_difference == (report.num_steps, "the final state")
 
 
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("joint_velocity", "joint velocities"),
+        ("joint_effort", "joint efforts"),
+        ("contact_force", "the contact force"),
+        ("base_from_tcp", "the EE pose"),
+        ("sensed", "the wrench"),
+    ],
+)
+def test_a_sensed_value_that_was_changed_is_found(recorded: Path, tmp_path: Path, name: str, what: str) -> None:
+    spoilt = Spoilt(recorded)
+    table = spoilt.columns.sensed["wrench"] if name == "sensed" else getattr(spoilt.columns, name)
+    changed = table.copy()
+    changed[40:50] += 1e-6
+    spoilt.set(**{name: {"wrench": changed} if name == "sensed" else changed})
+    path = spoilt.write(tmp_path / "s.mcap")
+    report = _replay(path)
+    assert report.first_difference is not None
+    assert report.first_difference[1] == what
+    assert 40 <= report.first_difference[0] < 50
+    assert exit_code("replay", path) == 1
+
+
+def test_an_outcome_that_was_changed_is_found(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoilt = Spoilt(recorded)
+    outcome = spoilt.outcome
+    assert outcome is not None
+    spoilt.outcome = replace(outcome, success=False, failure_phase="lift", failure_reason="drop")
+    assert exit_code("replay", spoilt.write(tmp_path / "relabelled.mcap")) == 1
+    assert "identical, succeeds where the recording failed" in capsys.readouterr().out
+    assert level_of(tmp_path / "relabelled.mcap", "outcome_consistent") == "fail"
+    tilt = next(check for check in outcome.checks if check.name == "tilt")
+    others = tuple(replace(check, limit=2 * check.limit) if check is tilt else check for check in outcome.checks)
+    spoilt.outcome = replace(outcome, checks=others)
+    report = _replay(spoilt.write(tmp_path / "limit.mcap"))
+    assert report.first_difference == (report.num_steps, "the condition tilt")
+
+
+def test_an_expert_that_gave_up_is_a_failure_whatever_the_conditions_say(recorded: Path, tmp_path: Path) -> None:
+    """As with a thing that was misplaced three times and comes to rest after that."""
+    spoilt = Spoilt(recorded)
+    assert spoilt.outcome is not None
+    spoilt.outcome = replace(spoilt.outcome, success=False, failure_phase="verify", failure_reason="misplaced_speed")
+    spoilt.events[spoilt.frames[-1]] = (Event(name="misplaced_speed", message="", level="warning"),)
+    path = spoilt.write(tmp_path / "s.mcap")
+    assert exit_code("replay", path) == 0
+    assert level_of(path, "outcome_consistent") == "pass"
+
+
 @pytest.mark.slow
 def test_noise_delay_and_rate_change_the_motion(recorded: Path) -> None:
     plain = _replay(recorded)
@@ -122,7 +175,9 @@ def test_a_recording_of_the_replay(tmp_path: Path) -> None:
 
 def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("replay", recorded) == 0
-    assert "identical, succeeds" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "identical, succeeds" in said
+    assert "Compared: joint positions, gripper opening, joint velocities, joint efforts, contact force, EE pose" in said
     assert exit_code("replay", recorded, "--json") == 0
     assert json.loads(capsys.readouterr().out)[0]["is_identical"] is True
     assert exit_code("replay", recorded, "--states") == 0

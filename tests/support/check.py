@@ -19,7 +19,7 @@ import pytest
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.episode.episode import CameraImages, Columns, Frame, Outcome
+from demorec.episode.episode import CameraImages, Columns, Event, Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.mcap import Recording, SimulatedWriter
@@ -84,6 +84,7 @@ class Spoilt:
         info, columns, outcome: Of the recording; replace them or write into the arrays.
         pictures: Camera name -> images of every frame, decoded; empty without cameras.
         frames: Numbers of the frames to be written, in order.
+        events: Frame -> what happened then, instead of what is recorded.
     """
 
     def __init__(self, path: Path) -> None:
@@ -95,6 +96,7 @@ class Spoilt:
             self._frames = list(frames_of(recording, self.columns))
             self.joint_samples = [frame.joint_samples for frame in self._frames]
         self._source = path
+        self.events: dict[int, tuple[Event, ...]] = {}
         self.frames = list(range(len(self._frames)))
 
     def set(self, **arrays: Any) -> None:
@@ -148,7 +150,7 @@ class Spoilt:
         }
         return replace(
             frame, frame_index=number, time_ns=frame_time_ns(number, self.info.fps), images=images,
-            joint_samples=self.joint_samples[index],
+            joint_samples=self.joint_samples[index], events=self.events.get(index, frame.events),
         )  # fmt: skip
 
 

@@ -10,10 +10,10 @@ from demorec.loop import Episode, ScriptAgent, Session, make_renderer, make_worl
 from demorec.sim.world import World
 
 
-def episode(index: int = 0, **config: Any) -> Episode:
+def episode(index: int = 0, *, attempt: int = 0, **config: Any) -> Episode:
     """Prepare an episode; no cameras by default."""
     config.setdefault("cameras", ())
-    return prepare(EpisodePlan(config=GenerateConfig(**config), episode_index=index))
+    return prepare(EpisodePlan(config=GenerateConfig(**config), episode_index=index, attempt=attempt))
 
 
 def first_frame(prepared: Episode) -> Frame:

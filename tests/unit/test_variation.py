@@ -165,7 +165,7 @@ def test_train_and_eval_layouts_never_overlap(sampling: str) -> None:
 
 
 def test_train_and_eval_seeds_never_overlap() -> None:
-    config = {"cameras": (), "ranges": Ranges(held_out_x=(0.35, 0.65), held_out_y=(-0.25, 0.25))}
+    config: dict[str, Any] = {"ranges": Ranges(held_out_x=(0.35, 0.65), held_out_y=(-0.25, 0.25))}
     everywhere = {episode(i, split="eval", **config).info.scene.body("red_cube").mass for i in range(50)}
     same_seed = {episode(i, split="all", **config).info.scene.body("red_cube").mass for i in range(50)}
     assert len(everywhere) == 50
