@@ -224,7 +224,7 @@ class Dataset:
     def _tell(self, plan: Plan) -> None:
         """List what is cut off of episodes."""
         for cut in plan.cuts:
-            length = plan.sources[cut.source].dataset.places[cut.episode].length
+            length = plan.sources[cut.source].places[cut.episode].length
             if (cut.first, cut.last) != (0, length):
                 say(f"episode {cut.episode}: {cut.first} frames cut at the beginning, {length - cut.last} at the end")
 

@@ -7,7 +7,6 @@ from typing import Any
 
 from demorec.core.errors import ExportError, in_words
 from demorec.core.plain import parse_json, to_json
-from demorec.datasets.editing.attempts import Attempts, kept_homeless
 from demorec.datasets.editing.carried import (
     Boxes,
     CameraPoses,
@@ -16,11 +15,13 @@ from demorec.datasets.editing.carried import (
     write_kept_progress,
 )
 from demorec.datasets.editing.plan import Cut, Plan
+from demorec.datasets.editing.rows import RowsBeside
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.robots import read_robot
 from demorec.datasets.lerobot.sidecar import (
     ATTEMPT_SCHEMA,
     CONFIGS_PATH,
+    EPISODE_SCHEMA,
     EXPORT_PATH,
     EpisodeRecord,
     SidecarWriter,
@@ -32,19 +33,30 @@ _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "goa
 
 
 class Beside:
-    """Context manager; `add` takes the episodes as they are written, `finish` completes the files."""
+    """Context manager; `add` takes the episodes as they are written, `finish` completes the files.
 
-    def __init__(self, plan: Plan, folder: Path) -> None:
-        self._plan, self._folder = plan, folder
-        self._attempts = [Attempts(source) for source in plan.sources]
+    Args:
+        plan: What is written.
+        folder: Of the new dataset.
+        aside: Folder for rows until they are asked for.
+    """
+
+    def __init__(self, plan: Plan, folder: Path, aside: Path) -> None:
+        self._plan, self._folder, self._aside = plan, folder, aside
         limits: dict[str, Any] = {"limit_mb": plan.info.data_files_size_in_mb, "chunks_size": plan.info.chunks_size}
         configs: dict[str, Any] = {}
         for source in plan.sources:
             if (source.root / CONFIGS_PATH).exists():
                 configs |= read_json(source.root / CONFIGS_PATH)
-        has_any = any(source.has_sidecar for source in plan.sources)
+        has_any = any(source.sidecar_tables for source in plan.sources)
         self._sidecar = SidecarWriter(folder, configs, **limits) if has_any else None
-        self._poses = [CameraPoses(source) for source in plan.sources] if poses_are_kept(plan) else []
+        self._rows, self._poses = [], []
+        keeps_poses = poses_are_kept(plan)
+        for number, source in enumerate(plan.sources if has_any else ()):
+            path = aside / f"episodes_{number}.arrow"
+            self._rows.append(RowsBeside(source.sidecar_tables, path, EPISODE_SCHEMA, rows=64))
+            if keeps_poses:
+                self._poses.append(CameraPoses(source, aside / f"poses_{number}.arrow"))
         self._boxes = Boxes(plan, folder)
 
     def __enter__(self) -> Beside:
@@ -61,8 +73,9 @@ class Beside:
         if self._sidecar is None:
             return
         source = self._plan.sources[cut.source]
-        index = source.dataset.places[cut.episode].episode_index
-        found = source.beside.get(index, {})
+        index = source.places[cut.episode].episode_index
+        table = self._rows[cut.source].read(index)
+        found: dict[str, Any] = {} if table is None else table.to_pylist()[-1]
         digest = found.get("robot_digest")
         row = {name: value for name, value in found.items() if name not in ("episode_index", "content_digest")}
         row.setdefault("source", source.root.name)
@@ -71,7 +84,7 @@ class Beside:
             row |= _cut_frames(row, cut)
         elif cut.task and row.get("episode_info") is not None:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
-        attempts = self._attempts[cut.source]
+        attempts = source.attempts
         for attempt in attempts.failed(index):
             self._sidecar.add_attempt(attempt, in_dataset=False)
         attempt = attempts.of(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names if name != "in_dataset"}
@@ -88,13 +101,13 @@ class Beside:
         """Complete the files."""
         self._boxes.finish()
         if self._sidecar is not None:
-            for number, attempts in enumerate(self._attempts):
-                for attempt in kept_homeless(self._plan, number, attempts):
+            for number, source in enumerate(self._plan.sources):
+                for attempt in source.attempts.homeless() if self._plan.takes_all_of(number) else ():
                     self._sidecar.add_attempt(attempt, in_dataset=False)
             found = next((s.root for s in self._plan.sources if (s.root / EXPORT_PATH).exists()), None)
             self._sidecar.finish(read_json(found / EXPORT_PATH) if found else {})
         if progress_is_kept(self._plan):
-            write_kept_progress(self._plan, self._folder)
+            write_kept_progress(self._plan, self._folder, self._aside)
 
 
 def _reworded(info: str, task: str, root: Path) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +11,15 @@ import pyarrow.parquet as pq
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
 from demorec.datasets.editing.plan import Cut, Plan, Source
+from demorec.datasets.editing.rows import RowsBeside
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, SeenByCamera, StoredBoxes
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, STAGE_COLUMNS, read_progress, write_progress
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_table
+from demorec.datasets.lerobot.files import column_numbers, open_table
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.staging import sync_file
 
 _COUNTERS = ("index", "episode_index", "frame_index")
+_ROWS_AT_ONCE = 4096
 
 
 def moving_cameras(source: Source) -> tuple[str, ...] | None:
@@ -39,33 +40,17 @@ def poses_are_kept(plan: Plan) -> bool:
     return len(found) <= 1 and None not in found
 
 
-class _ByEpisode:
-    """Rows of tables with `episode_index` and `frame_index`, in order, found by episode."""
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        tables = [read_table(path) for path in paths]
-        self._table = pa.concat_tables(tables).sort_by([(name, "ascending") for name in _COUNTERS[1:]])
-        self._episodes = self._table.column("episode_index").to_numpy()
-
-    def read(self, episode: int, first: int, last: int) -> pa.Table:
-        """Those of an episode's frames from `first` to before `last`."""
-        begin, end = np.searchsorted(self._episodes, [episode, episode + 1])
-        rows = self._table.slice(begin, end - begin)
-        frames = rows.column("frame_index").to_numpy()
-        return rows.filter(pa.array((frames >= first) & (frames < last)))
-
-
 class CameraPoses:
     """Those of one source."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, aside: Path) -> None:
         self._root = source.root
         self._names = moving_cameras(source) or ()
-        self._rows = _ByEpisode(_pose_files(source)) if self._names else None
+        self._rows = RowsBeside(_pose_files(source), aside, rows=_ROWS_AT_ONCE) if self._names else None
 
     def of(self, episode_index: int, cut: Cut) -> dict[str, Array]:
         """Camera -> (T, 7) world_from_camera; none for an episode without; ExportError where frames lack."""
-        rows = self._rows.read(episode_index, cut.first, cut.last) if self._rows is not None else None
+        rows = self._rows.frames(episode_index, cut.first, cut.last) if self._rows is not None else None
         if rows is None or not rows.num_rows:
             return {}
         if rows.num_rows != cut.last - cut.first:
@@ -81,7 +66,7 @@ class Boxes:
         self._writer = BoxWriter(folder, fps=plan.info.fps)
         self._files = [
             {
-                name: StoredBoxes(path, [place.from_index for place in source.dataset.places])
+                name: StoredBoxes(path, [place.from_index for place in source.places])
                 for name, take in takes.items()
                 if (path := source.root / BOXES_DIR / f"{take.feature}.json").is_file()
             }
@@ -108,7 +93,7 @@ class Boxes:
 def has_stages(plan: Plan) -> bool:
     """Whether progress is computed anew, from the stages that demorec wrote."""
     needed = {*STAGE_COLUMNS, "num_goals"}
-    return all(source.has_sidecar and needed <= set(source.fact_types) for source in plan.sources)
+    return all(source.sidecar_tables and needed <= set(source.fact_types) for source in plan.sources)
 
 
 def progress_is_kept(plan: Plan) -> bool:
@@ -122,22 +107,35 @@ def progress_is_kept(plan: Plan) -> bool:
     )
 
 
-def write_kept_progress(plan: Plan, folder: Path) -> None:
+def write_kept_progress(plan: Plan, folder: Path, aside: Path) -> None:
     """Write the progress of the new dataset's rows: from stages, else as the sources have it of each frame."""
     if has_stages(plan):
         write_progress(folder, read_progress(folder))
         return
-    sources = [_ByEpisode([source.root / PROGRESS_PATH]) for source in plan.sources]
-    parts, total = [], 0
-    for episode, cut in enumerate(plan.cuts):
-        index = plan.sources[cut.source].dataset.places[cut.episode].episode_index
-        rows = sources[cut.source].read(index, cut.first, cut.last)
-        frames = rows.column("frame_index").to_numpy() - cut.first
-        counted = {"index": frames + total, "episode_index": np.full(len(frames), episode), "frame_index": frames}
-        for name, values in counted.items():
-            number = rows.schema.get_field_index(name)
-            rows = rows.set_column(number, rows.schema.field(name), pa.array(values, rows.schema.field(name).type))
-        parts.append(rows)
-        total += cut.last - cut.first
-    pq.write_table(pa.concat_tables(parts), folder / PROGRESS_PATH)
-    sync_file(folder / PROGRESS_PATH)
+    path, total = folder / PROGRESS_PATH, 0
+    sources = [
+        RowsBeside([source.root / PROGRESS_PATH], aside / f"progress_{number}.arrow", rows=_ROWS_AT_ONCE)
+        for number, source in enumerate(plan.sources)
+    ]
+    schema = open_table(plan.sources[0].root / PROGRESS_PATH).schema_arrow
+    waiting: list[pa.Table] = []
+    with pq.ParquetWriter(path, schema) as writer:
+        for episode, cut in enumerate(plan.cuts):
+            index = plan.sources[cut.source].places[cut.episode].episode_index
+            if (rows := sources[cut.source].frames(index, cut.first, cut.last)) is not None:
+                waiting.append(_counted(rows, cut, episode, total))
+            total += cut.last - cut.first
+            if sum(rows.num_rows for rows in waiting) >= _ROWS_AT_ONCE or cut is plan.cuts[-1]:
+                writer.write_table(pa.concat_tables([schema.empty_table(), *waiting]))
+                waiting.clear()
+    sync_file(path)
+
+
+def _counted(rows: pa.Table, cut: Cut, episode: int, index: int) -> pa.Table:
+    """Rows of a cut with their numbers in the new dataset, in which `index` is that of its first frame."""
+    frames = rows.column("frame_index").to_numpy() - cut.first
+    counted = {"index": frames + index, "episode_index": np.full(len(frames), episode), "frame_index": frames}
+    for name, values in counted.items():
+        number = rows.schema.get_field_index(name)
+        rows = rows.set_column(number, rows.schema.field(name), pa.array(values, rows.schema.field(name).type))
+    return rows

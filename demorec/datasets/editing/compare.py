@@ -84,7 +84,7 @@ class EpisodeComparer:
         """
         one, other = self._readers[0].columns(a), self._readers[1].columns(b)
         stored = [name for name in self._shared.cameras if name in one and name in other]
-        lengths = tuple(source.dataset.places[n].length for source, n in zip(self._sources, (a, b), strict=True))
+        lengths = tuple(source.places[n].length for source, n in zip(self._sources, (a, b), strict=True))
         starts, count = (0, 0), lengths[0]
         if lengths[0] != lengths[1]:
             difference, starts, count = _lengths(one, other, lengths)
@@ -160,7 +160,7 @@ class EpisodeComparer:
 
     def _decoded(self, side: int, name: str, number: int, start: int) -> Iterator[NDArray[Any]]:
         source = self._sources[side]
-        place, feature = source.dataset.places[number], source.info.features[name]
+        place, feature = source.places[number], source.info.features[name]
         if not feature.is_video:
             return islice(self._stored[side][name].read(place), start, None)
         video = EpisodeVideo(source.root, source.info, name, place)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import ExportError, in_words
 from demorec.datasets.editing.packets import PacketCutter
 from demorec.datasets.editing.plan import Source
-from demorec.datasets.editing.write import Rows
+from demorec.datasets.editing.rows import Rows
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.reader import EpisodePlace, column_values
@@ -108,7 +108,7 @@ class ContentReader:
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
         """Column -> (T, D) numbers, or (T, 1) texts; of language and stored images digests of each row."""
-        place, table = self._source.dataset.places[number], self._rows.read(number)
+        place, table = self._source.places[number], self._rows.read(number)
         features, found = self._source.info.features, {}
         for name in (*self._shared.columns, *self._stored):
             values = _values(table.column(name).combine_chunks(), features[name], self._source.root)
@@ -120,7 +120,7 @@ class ContentReader:
         return found
 
     def _texts(self, indices: NDArray[Any]) -> NDArray[np.str_]:
-        tasks = self._source.dataset.tasks
+        tasks = self._source.tasks
         texts = [
             tasks[int(index)] if np.isfinite(index) and 0 <= index < len(tasks) else f"no task {index}"
             for index in indices.ravel()
@@ -129,7 +129,7 @@ class ContentReader:
 
     def read(self, number: int) -> EpisodeContent:
         """The digests of an episode; ExportError when it cannot be read."""
-        place, columns = self._source.dataset.places[number], self.columns(number)
+        place, columns = self._source.places[number], self.columns(number)
         stored = {name: columns.pop(name) for name in self._stored}
         rows = {}
         for name, values in columns.items():

@@ -110,12 +110,12 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
 def _contents(
     sources: tuple[Source, Source], shared: Shared, folder: Path, progress: ProgressCallback | None
 ) -> list[list[EpisodeContent]]:
-    total, done = sum(len(source.dataset) for source in sources), 0
+    total, done = sum(len(source.places) for source in sources), 0
     found: list[list[EpisodeContent]] = []
     for source in sources:
-        reader = ContentReader(source, shared, range(len(source.dataset)), folder / "none")
+        reader = ContentReader(source, shared, range(len(source.places)), folder / "none")
         found.append([])
-        for number in range(len(source.dataset)):
+        for number in range(len(source.places)):
             found[-1].append(reader.read(number))
             done += 1
             if progress is not None:
@@ -145,7 +145,7 @@ def _one_sided(sources: tuple[Source, Source], episode: tuple[int | None, int | 
     side = 0 if episode[1] is None else 1
     number = episode[side]
     assert number is not None
-    length = sources[side].dataset.places[number].length
+    length = sources[side].places[number].length
     name = "missing" if side == 0 else "extra"
     return Difference(level="episodes", name=name, episodes=episode, details={"frames": length},
                       text=f"episode {number} of {'AB'[side]}, {length} frames, is not in {'BA'[side]}")  # fmt: skip
@@ -157,7 +157,7 @@ def _tasks(
     unmatched: Sequence[tuple[int | None, int | None]],
 ) -> list[Difference]:
     """The differences so far, less those that a reworded task explains, and what differs in the tables of tasks."""
-    tables = tuple(set(source.dataset.tasks) for source in sources)
+    tables = tuple(set(source.tasks) for source in sources)
     only = (tables[0] - tables[1], tables[1] - tables[0])
     kept: list[Difference] = []
     reworded: dict[tuple[str, str], list[int]] = {}
@@ -176,7 +176,7 @@ def _tasks(
             explained |= {texts[side] for texts in item.details.get("texts", ())}
         for episode in unmatched:
             if (number := episode[side]) is not None:
-                explained |= set(sources[side].dataset.places[number].tasks)
+                explained |= set(sources[side].places[number].tasks)
         for task in sorted(only[side] - explained):
             kept.append(Difference(level="tasks", name=task, text=f"{task!r} is not in {'BA'[side]}"))
     return kept
@@ -198,8 +198,8 @@ def _info(sources: tuple[Source, Source]) -> Iterator[Difference]:
 
 def _count(source: Source, total: str) -> int:
     if total == "total_frames":
-        return sum(place.length for place in source.dataset.places)
-    return len(source.dataset.tasks if total == "total_tasks" else source.dataset)
+        return sum(place.length for place in source.places)
+    return len(source.tasks if total == "total_tasks" else source.places)
 
 
 def _fields(level: Any, of: str, values: Sequence[Mapping[str, Any]]) -> Iterator[Difference]:
@@ -268,7 +268,7 @@ def _statistics(
         return
     differing = {item.name for item in episodes if item.level in ("rows", "images")}
     differing |= {item.name.partition(": ")[0] for item in found if item.level == "features"}
-    tasks = [source.dataset.tasks for source in sources]
+    tasks = [source.tasks for source in sources]
     if is_reordered:
         differing |= set(_PLACES)
     if tasks[0] != tasks[1] or TASK in differing:
@@ -322,7 +322,7 @@ def _notes(sources: tuple[Source, Source], result: DatasetDiff) -> Iterator[str]
         moved = [f"{n} is {m}" for n, m in result.pairs.items() if n != m]
         more = f" and {len(moved) - 8} more" if len(moved) > 8 else ""
         yield f"The same episodes in another order, A to B: {', '.join(moved[:8])}{more}."
-    tasks = [source.dataset.tasks for source in sources]
+    tasks = [source.tasks for source in sources]
     if tasks[0] != tasks[1] and set(tasks[0]) == set(tasks[1]):
         yield "The same tasks under other numbers."
     if list(a.features) != list(b.features) and set(a.features) == set(b.features):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from demorec.datasets.editing.attempts import lost_attempts
 from demorec.datasets.editing.carried import has_stages, poses_are_kept, progress_is_kept
 from demorec.datasets.editing.plan import Plan
 from demorec.datasets.lerobot.boxes import BOXES_DIR
@@ -60,9 +59,8 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
 def _scenes(plan: Plan) -> Iterator[str]:
     lost = 0
     for cut in plan.cuts:
-        index = plan.sources[cut.source].dataset.places[cut.episode].episode_index
-        row = plan.sources[cut.source].beside.get(index, {})
-        lost += row.get("episode_info") is not None and not plan.keeps_scene(cut)
+        source = plan.sources[cut.source]
+        lost += source.has_scene(source.places[cut.episode].episode_index) and not plan.keeps_scene(cut)
     if lost:
         yield f"scenes of simulated episodes: {lost} (they describe the episode as it was recorded)"
 
@@ -74,7 +72,13 @@ def _told(plan: Plan) -> Iterator[str]:
 
 
 def _attempts(plan: Plan) -> Iterator[str]:
-    if lost := sum(lost_attempts(plan, number) for number in range(len(plan.sources))):
+    lost = 0
+    for number, source in enumerate(plan.sources):
+        kept = {cut.episode for cut in plan.cuts if cut.source == number}
+        gone = [place.episode_index for episode, place in enumerate(source.places) if episode not in kept]
+        lost += sum(map(source.attempts.num_failed, gone))
+        lost += 0 if plan.takes_all_of(number) else source.attempts.num_homeless
+    if lost:
         yield f"failed attempts: {lost} (at episodes that are not in the result)"
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from demorec.core.errors import ConfigError
 from demorec.core.registry import nearest_match
 from demorec.datasets.editing.plan import Plan, Source, Take
+from demorec.datasets.editing.rows import Rows
 from demorec.datasets.editing.where import Condition
-from demorec.datasets.editing.write import Rows
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 

@@ -12,16 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.lerobot.episodes import LeRobotDataset
+from demorec.datasets.editing.attempts import Attempts
 from demorec.datasets.lerobot.files import open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
+from demorec.datasets.lerobot.reader import episode_places, read_tasks
 from demorec.episode.features import ACTION, STATE
 
 _PLACED = ("stats/", "videos/", "data/", "meta/")
 _FIXED = frozenset(("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"))
 _BESIDE = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
+_SCENE = "root_seed"
+"""Stands in the sidecar for each episode whose scene does."""
 
 
 class Source:
@@ -29,15 +31,25 @@ class Source:
 
     Attributes:
         root, info: Its folder and what info.json says.
-        dataset: It, opened.
+        places: Where its episodes lie, in order.
+
+    Raises:
+        ExportError: There is none, or it is damaged.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.dataset = LeRobotDataset(root)
-        self.info: DatasetInfo = self.dataset.info
+        self.info = DatasetInfo.load(root)
+        self.places = tuple(episode_places(root, self.info))
+        if missing := [name for name in ("timestamp", "task_index") if name not in self.info.features]:
+            raise ExportError(f"The dataset has no {', '.join(missing)}: {root}")
         if any(len(feature.shape) > 1 and feature.is_numeric for feature in self.info.features.values()):
             raise ExportError(f"Features that are arrays of several dimensions are not edited yet: {root}")
+
+    @cached_property
+    def tasks(self) -> list[str]:
+        """Instructions."""
+        return read_tasks(self.root)
 
     @cached_property
     def fact_types(self) -> Mapping[str, Any]:
@@ -52,7 +64,7 @@ class Source:
     def facts(self) -> list[dict[str, Any]]:
         """The values of these columns, by episode in order."""
         if self.info.is_old:
-            return [{} for _ in self.dataset.places]
+            return [{} for _ in self.places]
         return self._columns(self.root / "meta", tuple(self.fact_types))
 
     def _columns(self, folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
@@ -64,15 +76,25 @@ class Source:
                 found += batch.to_pylist()
         return found
 
-    @cached_property
-    def has_sidecar(self) -> bool:
-        """Whether demorec keeps something beside its episodes."""
-        return any((self.root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+    @property
+    def sidecar_tables(self) -> list[Path]:
+        """The tables of what demorec keeps beside the episodes."""
+        return sorted((self.root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
 
     @cached_property
     def beside(self) -> dict[int, dict[str, Any]]:
-        """What demorec keeps beside the episodes: episode_index -> row of its table."""
-        return {row["episode_index"]: row for row in self._columns(self.root / SIDECAR_DIR, EPISODE_SCHEMA.names)}
+        """What demorec keeps beside the episodes: episode_index -> name -> value, as far as it is short."""
+        rows = self._columns(self.root / SIDECAR_DIR, (*_BESIDE, _SCENE))
+        return {row.pop("episode_index"): row for row in rows}
+
+    def has_scene(self, episode_index: int) -> bool:
+        """Whether a scene stands beside an episode."""
+        return self.beside.get(episode_index, {}).get(_SCENE) is not None
+
+    @cached_property
+    def attempts(self) -> Attempts:
+        """Those that stand beside the episodes."""
+        return Attempts(self.root, sorted(self.beside))
 
     def columns(self) -> list[dict[str, Any]]:
         """What episodes are chosen and ordered by: name -> value, by episode in order."""
@@ -85,16 +107,16 @@ class Source:
                 "task": "; ".join(place.tasks),
                 "tasks": list(place.tasks),
             }
-            for place in self.dataset.places
+            for place in self.places
         ]
         if self.info.is_old:
             lines = read_json_lines(self.root / OLD_EPISODES_PATH)
             for row, line in zip(found, lines, strict=True):
                 row |= {name: value for name, value in line.items() if name not in row}
         beside = {
-            index: {name: value for name, value in row.items() if name in _BESIDE} for index, row in self.beside.items()
+            index: {name: value for name, value in row.items() if name != _SCENE} for index, row in self.beside.items()
         }
-        for place, row, facts in zip(self.dataset.places, found, self.facts, strict=True):
+        for place, row, facts in zip(self.places, found, self.facts, strict=True):
             known = {**beside.get(place.episode_index, {}), **facts}
             row |= {name: value for name, value in known.items() if name not in row}
         return found
@@ -186,17 +208,22 @@ class Plan:
             other={} if source.info.is_old else source.info.other,
         )  # fmt: skip
         cuts = tuple(
-            Cut(source=0, episode=number, first=0, last=place.length)
-            for number, place in enumerate(source.dataset.places)
+            Cut(source=0, episode=number, first=0, last=place.length) for number, place in enumerate(source.places)
         )
         return cls(sources=(source,), cuts=cuts, info=info, takes=({name: Take(feature=name) for name in own},))
 
     def keeps_scene(self, cut: Cut) -> bool:
         """Whether an episode is still what its scene describes: all its frames, with its own states and actions."""
         source, takes = self.sources[cut.source], self.takes[cut.source]
-        return (cut.first, cut.last) == (0, source.dataset.places[cut.episode].length) and all(
+        return (cut.first, cut.last) == (0, source.places[cut.episode].length) and all(
             name not in source.info.features or (name in takes and takes[name].is_copy and takes[name].feature == name)
             for name in (STATE, ACTION)
+        )
+
+    def takes_all_of(self, number: int) -> bool:
+        """Whether all episodes of a source go along."""
+        return {cut.episode for cut in self.cuts if cut.source == number} == set(
+            range(len(self.sources[number].places))
         )
 
     def with_cuts(self, cuts: Sequence[Cut]) -> Plan:

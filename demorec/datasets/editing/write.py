@@ -4,31 +4,36 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.datasets.editing.beside import Beside
 from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
 from demorec.datasets.editing.packets import PacketCutter
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, read_table
+from demorec.datasets.editing.rows import Rows
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.paths import DATASET
-from demorec.datasets.lerobot.reader import EpisodePlace, RowStream
+from demorec.datasets.lerobot.reader import EpisodePlace
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
 from demorec.datasets.staging import CODED, staged_folder
+from demorec.mcap.video import Rgb
 
 _OLD_STATS = "meta/episodes_stats.jsonl"
+_NUMBERS = tuple(name for name in NAMES if name != "count")
 _OF_THE_END = ("next.done", "next.success", "next.reward")
 
 
@@ -73,7 +78,7 @@ def write_plan(
         readers = [_Reader(plan, number, aside, decode=decode) for number in range(len(plan.sources))]
         with (
             DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
-            Beside(plan, folder) as beside,
+            Beside(plan, folder, aside) as beside,
         ):
             lead = 0
             for done, cut in enumerate(plan.cuts, start=1):
@@ -120,11 +125,13 @@ class _Reader:
         order = [cut.episode for cut in plan.cuts if cut.source == number]
         self._rows = Rows(self.source, [*self._names, "task_index"], order, aside / f"rows_{number}.arrow")
         self._cutters = {key: PacketCutter(self.source.root, info, key) for key in info.video_keys if key in names}
+        stored = [name for name in self._names if info.features[name].dtype == "image"]
+        self._stored = {key: StoredImages(self.source.root, info, key) for key in stored}
         self._known = _ImageStatistics(self.source) if not decode else None
 
     def episode(self, cut: Cut) -> EpisodeData:
         """Read an episode."""
-        place, source = self.source.dataset.places[cut.episode], self.source
+        place = self.source.places[cut.episode]
         all_rows = self._rows.read(cut.episode)
         rows = all_rows.slice(cut.first, cut.last - cut.first)
         whole = (cut.first, cut.last) == (0, place.length)
@@ -148,7 +155,7 @@ class _Reader:
                     columns[name] = _with_end(columns[name], self._column(all_rows, take, feature))
             if feature.is_camera:
                 known = self._known.of(place, take.feature) if whole and self._known is not None else None
-                pixels[name] = known or pixel_histogram(source, take.feature, place, cut.first, cut.last)
+                pixels[name] = known or self._counted(take.feature, cut, rows)
                 num_decoded += known is None
         self.num_decoded += num_decoded > 0
         tasks = [cut.task] if cut.task else self._tasks(rows)
@@ -162,6 +169,14 @@ class _Reader:
             facts=self._facts(cut, place),
             row_tasks=tasks if len(set(tasks)) > 1 else (),
         )
+
+    def _counted(self, key: str, cut: Cut, rows: pa.Table) -> PixelHistogram:
+        """Every pixel of a camera in a cut, whose rows have been read."""
+        place, feature = self.source.places[cut.episode], self.source.info.features[key]
+        if feature.is_video:
+            video = EpisodeVideo(self.source.root, self.source.info, key, place)
+            return _video_histogram(video, feature, cut.first, cut.last)
+        return _histogram(self._stored[key].decode(place, rows.column(key).chunks))
 
     def _column(self, rows: pa.Table, take: Take, feature: DatasetFeature) -> Any:
         if not take.feature:
@@ -177,7 +192,7 @@ class _Reader:
         return array
 
     def _tasks(self, rows: pa.Table) -> list[str]:
-        tasks, found = self.source.dataset.tasks, rows.column("task_index").to_pylist()
+        tasks, found = self.source.tasks, rows.column("task_index").to_pylist()
         if any(not isinstance(index, int) or not 0 <= index < len(tasks) for index in found):
             raise ExportError(f"A row names a task that is not in the table of tasks: {self.source.root}")
         return [tasks[index] for index in found]
@@ -235,65 +250,27 @@ def _clipped_stages(facts: Mapping[str, Any], head: str, cut: Cut) -> dict[str, 
                     strict=True))  # fmt: skip
 
 
-class Rows:
-    """Rows of a dataset's episodes in any order, in one pass over the files: set aside unless asked for in order."""
-
-    def __init__(self, source: Source, names: list[str], order: list[int], aside: Path) -> None:
-        self._source = source
-        self._stream = RowStream(source.root, source.info, names, rows=4096 if _is_narrow(source, names) else 64)
-        self._places: dict[int, list[int]] = {}
-        self._file: Any = None
-        if order != sorted(order):
-            self._set_aside(sorted(set(order)), aside)
-
-    def _set_aside(self, episodes: Iterable[int], path: Path) -> None:
-        writer, count = None, 0
-        for episode in episodes:
-            for batch in self._batches(episode):
-                writer = writer or pa.ipc.new_file(str(path), batch.schema)
-                writer.write_batch(batch)
-                self._places.setdefault(episode, []).append(count)
-                count += 1
-        if writer is not None:
-            writer.close()
-            self._file = pa.ipc.open_file(pa.memory_map(str(path)))
-
-    def _batches(self, episode: int) -> Iterator[pa.RecordBatch]:
-        return self._stream.batches(self._source.dataset.places[episode])
-
-    def read(self, episode: int) -> pa.Table:
-        """All rows of an episode."""
-        if self._file is None:
-            batches = list(self._batches(episode))
-        else:
-            batches = [self._file.get_batch(number) for number in self._places[episode]]
-        if not batches:
-            raise ExportError(f"Episode {episode} has no frames, drop it: {self._source.root}")
-        return pa.Table.from_batches(batches)
-
-
-def _is_narrow(source: Source, names: list[str]) -> bool:
-    return all(source.info.features[name].dtype not in ("string", "image", "language") for name in names)
-
-
 class _ImageStatistics:
     """The statistics of images that a dataset keeps of each episode."""
 
     def __init__(self, source: Source) -> None:
         keys = [name for name, feature in source.info.features.items() if feature.is_camera]
-        self._found: dict[tuple[int, str], Statistics] = {}
+        self._found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
         for number, key, entry in _old_statistics(source, keys) if source.info.is_old else _entries(source, keys):
             try:
                 part = Statistics.from_json(entry)
+                values = np.stack([part.values[name] for name in _NUMBERS]) if part is not None else np.array(np.nan)
             except (ValueError, TypeError):
-                part = None
-            if part is not None and all(np.isfinite(value).all() for value in part.values.values()):
-                self._found[number, key] = replace(part, is_camera=True)
+                continue
+            if part is not None and np.isfinite(values).all():
+                self._found[number, key] = part.count, values
 
     def of(self, place: EpisodePlace, key: str) -> Statistics | None:
         """Those of an episode, weighted by its frames; None where they are not kept."""
-        found = self._found.get((place.episode_index, key))
-        return None if found is None else replace(found, count=min(found.count, place.length))
+        if (found := self._found.get((place.episode_index, key))) is None:
+            return None
+        values = dict(zip(_NUMBERS, found[1], strict=True))
+        return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
 
 
 def _entries(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[str, Any]]]:
@@ -301,11 +278,12 @@ def _entries(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[s
         there = open_table(path).schema_arrow.names
         complete = [key for key in keys if all(f"stats/{key}/{name}" in there for name in NAMES)]
         names = ["episode_index", *(f"stats/{key}/{name}" for key in complete for name in NAMES)]
-        for row in read_table(path, names).to_pylist():
-            for key in complete:
-                entry = {name: row[f"stats/{key}/{name}"] for name in NAMES}
-                if None not in entry.values():
-                    yield row["episode_index"], key, entry
+        for batch in table_batches(path, names):
+            for row in batch.to_pylist():
+                for key in complete:
+                    entry = {name: row[f"stats/{key}/{name}"] for name in NAMES}
+                    if None not in entry.values():
+                        yield row["episode_index"], key, entry
 
 
 def _old_statistics(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[str, Any]]]:
@@ -318,22 +296,21 @@ def _old_statistics(source: Source, keys: list[str]) -> Iterator[tuple[int, str,
                 yield line["episode_index"], key, entry
 
 
-def pixel_histogram(source: Source, key: str, place: EpisodePlace, first: int, last: int) -> PixelHistogram:
-    """Of the images of some frames, decoded, every pixel counted."""
-    feature = source.info.features[key]
-    video = EpisodeVideo(source.root, source.info, key, place) if feature.is_video else None
-    if feature.is_depth and video is not None:
-        levels = video.depth_scale.values() * (1000 if (feature.info or {}).get("depth_unit") == "mm" else 1)
-        counts = np.zeros((1, len(levels)), dtype=np.int64)
-        for _, codes in zip(range(last - first), video.codes(first), strict=False):
-            counts[0] += np.bincount(codes.ravel(), minlength=len(levels))
-        return PixelHistogram(counts=counts, level_values=levels, num_images=last - first)
-    counts = np.zeros((3, 256), dtype=np.int64)
-    images = StoredImages(source.root, source.info, key).read(place) if video is None else video.images(first)
-    for number, image in enumerate(images, start=0 if video is None else first):
-        if number >= last:
-            break
-        if number >= first:
-            for channel in range(3):
-                counts[channel] += np.bincount(image[:, :, channel].ravel(), minlength=256)
-    return PixelHistogram(counts=counts, level_values=colour_levels(), num_images=last - first)
+def _video_histogram(video: EpisodeVideo, feature: DatasetFeature, first: int, last: int) -> PixelHistogram:
+    """Of the images of some frames of a video, decoded, every pixel counted."""
+    if not feature.is_depth:
+        return _histogram(islice(video.images(first), last - first))
+    levels = video.depth_scale.values() * (1000 if (feature.info or {}).get("depth_unit") == "mm" else 1)
+    counts = np.zeros((1, len(levels)), dtype=np.int64)
+    for codes in islice(video.codes(first), last - first):
+        counts[0] += np.bincount(codes.ravel(), minlength=len(levels))
+    return PixelHistogram(counts=counts, level_values=levels, num_images=last - first)
+
+
+def _histogram(images: Iterable[Rgb]) -> PixelHistogram:
+    counts, num_images = np.zeros((3, 256), dtype=np.int64), 0
+    for image in images:
+        num_images += 1
+        for channel in range(3):
+            counts[channel] += np.bincount(image[:, :, channel].ravel(), minlength=256)
+    return PixelHistogram(counts=counts, level_values=colour_levels(), num_images=num_images)

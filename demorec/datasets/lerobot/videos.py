@@ -7,7 +7,7 @@ needs, where no image is shown in another order than it was encoded in.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import cached_property
@@ -16,6 +16,7 @@ from typing import Any, Literal, cast
 
 import av
 import numpy as np
+import pyarrow as pa
 from av.bitstream import BitStreamFilterContext
 from numpy.typing import NDArray
 from PIL import Image
@@ -309,13 +310,18 @@ class StoredImages:
 
     def read(self, place: EpisodePlace) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of every frame of an episode; ExportError when they cannot be read."""
+        yield from self.decode(place, (batch.column(self._key) for batch in self._stream.batches(place)))
+
+    def decode(self, place: EpisodePlace, columns: Iterable[pa.Array]) -> Iterator[Rgb]:
+        """(H, W, 3) uint8 RGB of some rows of an episode, whose column was read already; ExportError as `read`."""
         path = self._root / place.data.path(self._info.data_path)
         if path not in self._counted and path.is_file():
             self._counted.add(path)
             self._allowed += _FILE_RATIO * path.stat().st_size
         shape: tuple[int, ...] | None = None
-        for batch in self._stream.batches(place):
-            for value in batch.column(self._key).to_pylist():
+        for column in columns:
+            for item in column:
+                value = item.as_py()
                 data = value.get("bytes") if isinstance(value, dict) else None
                 try:
                     image = self._decoded(data or b"")
