@@ -1,11 +1,13 @@
 """Editing a dataset: `demorec dataset` against LeRobot's own tool and a plain copy, in one interleaved run.
 
-    python benchmarks/edits.py                                   less than two minutes
-    python benchmarks/edits.py --episodes 200 --rounds 1         the same with a dataset ten times as large
+    python benchmarks/edits.py                          200 episodes of 100 frames, less than five minutes
+    python benchmarks/edits.py --episodes 20 --frames 50
+    python benchmarks/edits.py --copies 1 10 --without-lerobot     how demorec's cost grows with the dataset
 
-Deletes a twentieth of the episodes, splits 80 to 20, merges 5 copies, trims two frames off every episode (LeRobot has
-no trim). One camera of 64x48, as LeRobot's default writer encodes it (AV1), 10 frames an episode. CPU seconds count
-child processes; what loading the libraries costs is measured first and taken off.
+Deletes a twentieth of the episodes, splits 80 to 20, merges 5 datasets, trims a frame off either end of every episode
+(LeRobot has no trim). Two cameras of 96x96, as LeRobot's default writer encodes them (AV1), in a dataset of a tenth
+of the episodes, which is merged ten times: that keeps its packets. CPU seconds count child processes. What starting
+and loading libraries costs is measured first, and stated beside.
 """
 
 from __future__ import annotations
@@ -28,25 +30,38 @@ BIN = Path(sys.executable).parent
 ENVIRONMENT = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
 
 
-def written_by_lerobot(root: Path, episodes: int, frames: int) -> Path:
+def written_by_lerobot(root: Path, episodes: int, frames: int, size: int) -> Path:
     from lerobot.datasets import LeRobotDataset
 
     rng = np.random.default_rng(0)
-    vector = {"dtype": "float32", "shape": (3,), "names": ["x", "y", "z"]}
-    camera = {"dtype": "video", "shape": (48, 64, 3), "names": ["height", "width", "channels"]}
-    features = {"observation.state": vector, "action": vector, "observation.images.top": camera}
-    dataset = LeRobotDataset.create("local/x", fps=10, features=features, root=root)
+    vector = {"dtype": "float32", "shape": (7,), "names": [f"joint_{number}" for number in range(7)]}
+    camera = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    cameras = ("observation.images.top", "observation.images.wrist")
+    features = {"observation.state": vector, "action": vector, **dict.fromkeys(cameras, camera)}
+    dataset = LeRobotDataset.create("local/x", fps=30, features=features, root=root)
+    y, x = np.mgrid[:size, :size]
     for episode in range(episodes):
         for t in range(frames):
-            image = np.full((48, 64, 3), (episode * 7 + t * 3) % 255, np.uint8)
-            image[10:30, 5 + t : 25 + t] = 200
-            numbers = rng.normal(size=(2, 3)).astype(np.float32)
-            dataset.add_frame(
-                {"observation.state": numbers[0], "action": numbers[1], "observation.images.top": image, "task": "go"}
-            )
+            image = np.stack([x + 3 * t + 7 * episode, 2 * y + t, x * y // 16 + 5 * episode], axis=-1).astype(np.uint8)
+            begin = 10 + t % (size - 40)
+            image[begin : begin + 20, begin : begin + 20] = 200
+            numbers = rng.normal(size=(2, 7)).astype(np.float32)
+            frame = {"observation.state": numbers[0], "action": numbers[1], "task": "go"}
+            dataset.add_frame({**frame, cameras[0]: image, cameras[1]: np.ascontiguousarray(image[::-1])})
         dataset.save_episode()
     dataset.finalize()
     return root
+
+
+def multiplied(root: Path, times: int, out: Path) -> Path:
+    """The episodes of a dataset again and again, their packets as they are."""
+    copies = [Path(shutil.copytree(root, out.with_name(f"{out.name}_{number}"))) for number in range(times)]
+    if times == 1:
+        return copies[0]
+    seconds(BIN / "demorec", "dataset", "merge", *copies, "--out", out)
+    for copy in copies:
+        shutil.rmtree(copy)
+    return out
 
 
 def seconds(*command: object) -> tuple[float, float]:
@@ -96,41 +111,65 @@ def commands(root: Path, copies: Sequence[Path], out: Path, episodes: int) -> di
     }
 
 
+def start_costs(root: Path) -> dict[str, float]:
+    """CPU s of starting each: of demorec and LeRobot with all that an edit loads."""
+    dry = (BIN / "demorec", "dataset", "select", root, "--episodes", 0, "--out", "x", "--dry-run")
+    return {
+        "demorec": seconds(*dry)[0],
+        "lerobot": seconds(sys.executable, "-c", "import lerobot.scripts.lerobot_edit_dataset")[0],
+        "copy": seconds("cp", "--version")[0],
+    }
+
+
+def measured(folder: Path, root: Path, episodes: int, rounds: int, without: str) -> None:
+    """Run everything on a dataset, and print a row for each kind of work."""
+    copies = [Path(shutil.copytree(root, folder / f"d{number}")) for number in range(5)]
+    idle = start_costs(root)
+    spent: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for _ in range(rounds):
+        for work, by in commands(root, copies, folder / "out", episodes).items():
+            (folder / "out").mkdir()
+            for who, calls in by.items():
+                if who != without:
+                    costs = [seconds(*call) for call in calls]
+                    spent.setdefault((work, who), []).append((sum(c for c, _ in costs), sum(w for _, w in costs)))
+            shutil.rmtree(folder / "out")
+    size = sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
+    print(
+        f"{episodes} episodes, {size / 1e6:.1f} MB; start, CPU s: " + ", ".join(f"{k} {v:.2f}" for k, v in idle.items())
+    )
+    print("work       CPU s (wall s) with start; ratios of CPU with start / without")
+    for work in dict.fromkeys(work for work, _ in spent):
+        cells, cpu = [], {}
+        for who in (who for who in idle if (work, who) in spent):
+            cpu[who], wall = (statistics.median(values) for values in zip(*spent[work, who], strict=True))
+            cells.append(f"{who} {cpu[who]:.2f} ({wall:.2f})")
+        own = {who: max(value - idle[who], 0.01) for who, value in cpu.items()}
+        for a, b in (("lerobot", "demorec"), ("demorec", "copy")):
+            if a in cpu:
+                cells.append(f"{a}/{b} {cpu[a] / max(cpu[b], 0.01):.1f} / {own[a] / own[b]:.1f}")
+        print(f"{work:9}  {'  '.join(cells)}")
+    for copy in copies:
+        shutil.rmtree(copy)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--frames", type=int, default=10, help="of each episode")
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--frames", type=int, default=100, help="of each episode")
+    parser.add_argument("--size", type=int, default=96, help="width and height of the images")
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--copies", type=int, nargs="+", default=[1], help="datasets so many times as large")
+    parser.add_argument("--without-lerobot", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="demorec-benchmark-") as name:
         folder = Path(name)
-        root = written_by_lerobot(folder / "d", args.episodes, args.frames)
-        copies = [Path(shutil.copytree(root, folder / f"d{number}")) for number in range(5)]
-        idle = {
-            "demorec": seconds(BIN / "demorec", "dataset", "select", root, "--episodes", 0, "--out", "x", "--dry-run"),
-            "lerobot": seconds(sys.executable, "-c", "import lerobot.scripts.lerobot_edit_dataset"),
-            "copy": seconds("cp", "--version"),
-        }
-        print("loading, CPU s: " + ", ".join(f"{who} {cpu:.2f}" for who, (cpu, _) in idle.items()))
-        spent: dict[tuple[str, str], list[tuple[float, float]]] = {}
-        for _ in range(args.rounds):
-            for work, by in commands(root, copies, folder / "out", args.episodes).items():
-                (folder / "out").mkdir()
-                for who, calls in by.items():
-                    costs = [seconds(*call) for call in calls]
-                    spent.setdefault((work, who), []).append((sum(c for c, _ in costs), sum(w for _, w in costs)))
-                shutil.rmtree(folder / "out")
-    print(f"{args.episodes} episodes of {args.frames} frames; CPU s (wall s), with loading; CPU ratio without loading")
-    for work in dict.fromkeys(work for work, _ in spent):
-        cells, own = [], {}
-        for who in ("demorec", "lerobot", "copy"):
-            if (work, who) in spent:
-                cpu, wall = (statistics.median(values) for values in zip(*spent[work, who], strict=True))
-                own[who] = max(cpu - idle[who][0], 0.0)
-                cells.append(f"{who} {cpu:.2f} ({wall:.2f})")
-        if "lerobot" in own:
-            cells.append(f"lerobot/demorec {own['lerobot'] / max(own['demorec'], 0.01):.1f}")
-        print(f"{work:8} {'  '.join(cells)}")
+        few = written_by_lerobot(folder / "few", max(1, args.episodes // 10), args.frames, args.size)
+        base = multiplied(few, 10, folder / "base")
+        for times in args.copies:
+            root = multiplied(base, times, folder / f"times_{times}")
+            without = "lerobot" if args.without_lerobot else ""
+            measured(folder, root, args.episodes // 10 * 10 * times, args.rounds, without)
 
 
 if __name__ == "__main__":

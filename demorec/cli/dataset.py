@@ -145,8 +145,8 @@ class Dataset:
             with ProgressBar("writing") as bar:
                 report = write_plan(plan, out, overwrite=self.overwrite, decode=self.decode, progress=bar.set)
             say(f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames: {out}")
-            if report.lead:
-                say(f"{counted(report.lead, 'image')} before cuts stay in the videos, since later ones need them.")
+            if report.around:
+                say(f"{counted(report.around, 'image')} beside cuts stay in the videos, since others need them.")
             if report.decoded:
                 say(f"Images of {counted(report.decoded, 'episode')} were decoded for their statistics.")
             for text in missing:

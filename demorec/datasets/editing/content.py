@@ -150,7 +150,9 @@ class ContentReader:
         except ExportError:  # packets that cannot be told apart by episode; whether there are any, decoding shows
             return None
         assert isinstance(video.samples, bytes)
-        head = f"{video.codec} {video.width} {video.height} {video.lead} {video.sizes.tolist()} {len(sets)}"
+        head = (
+            f"{video.codec} {video.width} {video.height} {video.lead} {video.tail} {video.sizes.tolist()} {len(sets)}"
+        )
         return hashlib.sha256(b"".join((head.encode(), sets, video.samples))).digest()
 
 

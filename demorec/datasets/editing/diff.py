@@ -237,7 +237,9 @@ def _facts(
     sources: tuple[Source, Source], pairs: Mapping[int, int], contents: Sequence[Sequence[EpisodeContent]]
 ) -> Iterator[Difference]:
     """What the tables of episodes and demorec's sidecar state of the same episode."""
-    rows = [[{**row, **facts} for row, facts in zip(source.columns(), source.facts, strict=True)] for source in sources]
+    rows = [
+        [{**row, **facts} for row, facts in zip(source.columns(), source.facts(), strict=True)] for source in sources
+    ]
     names = [{name for row in side for name in row} - _FOLLOWS for side in rows]
     for name in sorted(names[0] ^ names[1]):
         side = 0 if name in names[0] else 1

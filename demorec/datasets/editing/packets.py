@@ -8,6 +8,7 @@ from typing import Any
 
 import av
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
@@ -17,111 +18,143 @@ from demorec.datasets.lerobot.reader import EpisodePlace
 from demorec.datasets.lerobot.videos import access_units, codec_of, opened_video
 
 _MP4_NAMES = {"h265": "hevc"}
+_MOST_REORDERED = 32
+"""Images by which one is stored before it is shown; codecs allow 16."""
+_MOST_FILES = 16
+"""Of which the tables are kept: a file of 15 minutes has one MB of them."""
+
+
+class _VideoFile:
+    """One mp4 file, opened.
+
+    Attributes:
+        index: Of its images.
+        frames: (N,) int64, number of the frame at which each is shown.
+        codec, size, pixels: As libav describes it; size is (width, height).
+    """
+
+    def __init__(self, path: Path, fps: int) -> None:
+        self._path = path
+        self.index: Mp4Index = mp4_index(path)
+        self.frames: NDArray[np.int64] = np.rint(self.index.times * fps).astype(np.int64)
+        with opened_video(path) as (_, stream):
+            context = stream.codec_context
+            self.codec = codec_of(stream)
+            self.size, self.pixels = (context.width, context.height), context.pix_fmt
+            extra = context.extradata or b""
+            length_size = extra[4] if self.codec == "h264" else extra[21] if len(extra) > 21 else 3
+            if self.codec != "av1" and (length_size & 3) != 3:
+                raise ExportError(f"The video has lengths of less than four bytes, which are not copied: {path}")
+        self._head = b""
+
+    def first_image(self, sample: bytes) -> bytes:
+        """A first image as it was encoded: behind the parameter sets, which of H.264 and HEVC are those of the file."""
+        if self.codec == "av1":
+            return b"\x12\x00" + sample
+        if not self._head:
+            with opened_video(self._path) as (_, stream):
+                self._head = access_units(stream, self.codec)(av.Packet(sample))
+        return self._head
 
 
 class PacketCutter:
-    """The videos of one camera feature of a dataset; the index of one file is in memory."""
+    """The videos of one camera feature of a dataset; what some files contain is kept, for episodes in any order."""
 
     def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
         self._root, self._info, self._key = root, info, key
-        self._path = Path()
+        self._files: dict[Path, _VideoFile] = {}
 
-    def _open(self, path: Path) -> None:
-        if path == self._path:
-            return
-        self._index: Mp4Index = mp4_index(path)
-        with opened_video(path) as (_, stream):
-            context = stream.codec_context
-            self._codec = codec_of(stream)
-            self._size, self._pixels = (context.width, context.height), context.pix_fmt
-            self._head = b""
-            extra = context.extradata or b""
-            length_size = extra[4] if self._codec == "h264" else extra[21] if len(extra) > 21 else 3
-            if self._codec != "av1" and (length_size & 3) != 3:
-                raise ExportError(f"The video has lengths of less than four bytes, which are not copied: {path}")
-        self._frames = np.rint(self._index.times * self._info.fps).astype(np.int64)
-        self._path = path
+    def _open(self, path: Path) -> _VideoFile:
+        file = self._files.pop(path, None) or _VideoFile(path, self._info.fps)
+        self._files[path] = file
+        if len(self._files) > _MOST_FILES:
+            del self._files[next(iter(self._files))]
+        return file
 
     def stream_info(self, place: EpisodePlace) -> dict[str, Any]:
         """What a dataset states about how its images are encoded."""
-        self._open(self._file(place))
+        file = self._open(self._path(place))
         return {
-            "video.height": self._size[1],
-            "video.width": self._size[0],
-            "video.codec": _MP4_NAMES.get(self._codec, self._codec),
-            "video.pix_fmt": self._pixels,
+            "video.height": file.size[1],
+            "video.width": file.size[0],
+            "video.codec": _MP4_NAMES.get(file.codec, file.codec),
+            "video.pix_fmt": file.pixels,
             "video.fps": int(self._info.fps),
             "video.channels": 3,
             "has_audio": False,
             "is_depth_map": False,
         }
 
-    def _file(self, place: EpisodePlace) -> Path:
+    def _path(self, place: EpisodePlace) -> Path:
         position, _ = place.videos[self._key]
         return self._root / position.path(self._info.video_path or VIDEO_PATH, self._key)
 
     def cut(self, place: EpisodePlace, first: int, last: int) -> EncodedVideo:
-        """The images of the frames from `first` to before `last`, behind those from which the first one is decoded.
+        """The images of the frames from `first` to before `last`, with all from which these are decoded.
 
         Raises:
             ExportError: They are not there, or cannot be taken out without encoding them again.
         """
-        path = self._file(place)
-        self._open(path)
-        start = place.videos[self._key][1]
-        wanted = np.flatnonzero((self._frames >= start + first) & (self._frames < start + last))
+        path = self._path(place)
+        file = self._open(path)
+        begin, end = place.videos[self._key][1] + first, place.videos[self._key][1] + last
+        wanted = np.flatnonzero((file.frames >= begin) & (file.frames < end))
         if len(wanted) != last - first:
             raise ExportError(
                 f"Episode {place.episode_index} has {len(wanted)} images for {last - first} frames of {self._key}: "
                 f"{path}"
             )
-        keys = np.flatnonzero(self._index.is_keyframe)
-        keys = keys[keys <= wanted.min()]
-        keys = keys[self._frames[keys] <= start + first]
+        keys = np.flatnonzero(file.index.is_keyframe[: wanted.min() + 1])
+        keys = keys[file.frames[keys] <= begin]
         if not len(keys):
             raise ExportError(f"Episode {place.episode_index} does not begin behind a keyframe of {self._key}: {path}")
-        part = slice(int(keys[-1]), int(wanted.max()) + 1)
-        frames, lead = self._frames[part], start + first - int(self._frames[keys[-1]])
-        places = frames - frames.min()
-        if not np.array_equal(np.sort(places), np.arange(len(places))) or len(places) != lead + last - first:
-            raise ExportError(
-                f"Episode {place.episode_index} cannot be cut at frame {last} of {self._key}, since its images are not "
-                f"shown in the order in which they were encoded: cut at a keyframe, or keep the end: {path}"
-            )
+        part = _without_gaps(file.frames, int(keys[-1]), int(wanted.max()) + 1)
+        places = file.frames[part] - file.frames[keys[-1]]
+        if not np.array_equal(np.sort(places), np.arange(len(places))):
+            raise ExportError(f"Two images of {self._key} are shown at one time, or none at some: {path}")
+        lead, count = begin - int(file.frames[keys[-1]]), last - first
         shifts = places - np.arange(len(places))
-        samples = self._read(path, part)
-        sizes = self._index.sizes[part]
-        behind = int(sizes[:lead].sum())
+        sizes = file.index.sizes[part]
+        samples = _read(path, file.index.offsets[part], sizes)
+        ends = np.cumsum(sizes)
+        own = memoryview(samples)[int(ends[lead - 1]) if lead else 0 : int(ends[lead + count - 1])]
         return EncodedVideo(
-            codec=_MP4_NAMES.get(self._codec, self._codec),
-            width=self._size[0],
-            height=self._size[1],
-            first=self._first(path, samples[: int(sizes[0])]),
+            codec=_MP4_NAMES.get(file.codec, file.codec),
+            width=file.size[0],
+            height=file.size[1],
+            first=file.first_image(samples[: int(sizes[0])]),
             samples=samples,
             sizes=sizes,
-            is_keyframe=self._index.is_keyframe[part],
-            digest=hashlib.sha256(memoryview(samples)[behind:]).hexdigest(),
+            is_keyframe=file.index.is_keyframe[part],
+            digest=hashlib.sha256(own).hexdigest(),
             lead=lead,
+            tail=len(places) - lead - count,
             shifts=shifts if shifts.any() else None,
         )
 
-    def _read(self, path: Path, part: slice) -> bytes:
-        offsets, sizes = self._index.offsets[part], self._index.sizes[part]
-        with path.open("rb") as file:
-            if np.array_equal(offsets[1:], (offsets + sizes)[:-1]):
-                file.seek(int(offsets[0]))
-                return file.read(int(sizes.sum()))
-            pieces = []
-            for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
-                file.seek(offset)
-                pieces.append(file.read(size))
-            return b"".join(pieces)
 
-    def _first(self, path: Path, sample: bytes) -> bytes:
-        """A first image as it was encoded: behind the parameter sets, which of H.264 and HEVC are those of the file."""
-        if self._codec == "av1":
-            return b"\x12\x00" + sample
-        if not self._head:
-            with opened_video(path) as (_, stream):
-                self._head = access_units(stream, self._codec)(av.Packet(sample))
-        return self._head
+def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np.intp]:
+    """The images from one on, in the order in which they are stored, with those that later ones are decoded from.
+
+    Images may be shown in another order than they are stored in. Those that are stored behind the keyframe and shown
+    before it need images that are not taken. Behind the last wanted one follow as many as it takes until at every
+    moment one is shown.
+    """
+    last = min(end + _MOST_REORDERED, len(frames))
+    while True:
+        part: NDArray[np.intp] = begin + np.flatnonzero(frames[begin:end] >= frames[begin])
+        if len(part) > int(frames[part].max() - frames[begin]) or end >= last:
+            return part
+        end += 1
+
+
+def _read(path: Path, offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> bytes:
+    with path.open("rb") as file:
+        if np.array_equal(offsets[1:], (offsets + sizes)[:-1]):
+            file.seek(int(offsets[0]))
+            return file.read(int(sizes.sum()))
+        pieces = []
+        for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
+            file.seek(offset)
+            pieces.append(file.read(size))
+        return b"".join(pieces)

@@ -51,30 +51,25 @@ class Source:
         """Instructions."""
         return read_tasks(self.root)
 
+    @property
+    def episode_tables(self) -> list[Path]:
+        """The files of the table of episodes; none before v3.0."""
+        return sorted((self.root / "meta" / "episodes").glob("*/*.parquet"))
+
     @cached_property
     def fact_types(self) -> Mapping[str, Any]:
         """Columns of the table of episodes that state facts -> Arrow type; empty before v3.0."""
-        tables = sorted((self.root / "meta" / "episodes").glob("*/*.parquet"))
+        tables = self.episode_tables
         schema = open_table(tables[0]).schema_arrow if tables else ()
         return {
             item.name: item.type for item in schema if item.name not in _FIXED and not item.name.startswith(_PLACED)
         }
 
-    @cached_property
     def facts(self) -> list[dict[str, Any]]:
         """The values of these columns, by episode in order."""
         if self.info.is_old:
             return [{} for _ in self.places]
-        return self._columns(self.root / "meta", tuple(self.fact_types))
-
-    def _columns(self, folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-        tables = sorted((folder / "episodes").glob("*/*.parquet"))
-        found: list[dict[str, Any]] = []
-        for path in tables:
-            there = [name for name in ("episode_index", *names) if name in open_table(path).schema_arrow.names]
-            for batch in table_batches(path, there):
-                found += batch.to_pylist()
-        return found
+        return _columns(self.episode_tables, tuple(self.fact_types))
 
     @property
     def sidecar_tables(self) -> list[Path]:
@@ -84,7 +79,7 @@ class Source:
     @cached_property
     def beside(self) -> dict[int, dict[str, Any]]:
         """What demorec keeps beside the episodes: episode_index -> name -> value, as far as it is short."""
-        rows = self._columns(self.root / SIDECAR_DIR, (*_BESIDE, _SCENE))
+        rows = _columns(self.sidecar_tables, (*_BESIDE, _SCENE))
         return {row.pop("episode_index"): row for row in rows}
 
     def has_scene(self, episode_index: int) -> bool:
@@ -116,10 +111,20 @@ class Source:
         beside = {
             index: {name: value for name, value in row.items() if name != _SCENE} for index, row in self.beside.items()
         }
-        for place, row, facts in zip(self.places, found, self.facts, strict=True):
+        for place, row, facts in zip(self.places, found, self.facts(), strict=True):
             known = {**beside.get(place.episode_index, {}), **facts}
             row |= {name: value for name, value in known.items() if name not in row}
         return found
+
+
+def _columns(tables: Sequence[Path], names: Sequence[str]) -> list[dict[str, Any]]:
+    """The rows of tables of episodes, less columns that a table has not."""
+    found: list[dict[str, Any]] = []
+    for path in tables:
+        there = [name for name in ("episode_index", *names) if name in open_table(path).schema_arrow.names]
+        for batch in table_batches(path, there):
+            found += batch.to_pylist()
+    return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,7 +18,7 @@ from demorec.datasets.editing.beside import Beside
 from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
 from demorec.datasets.editing.packets import PacketCutter
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
-from demorec.datasets.editing.rows import Rows
+from demorec.datasets.editing.rows import Rows, RowsBeside
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
@@ -34,6 +34,7 @@ from demorec.mcap.video import Rgb
 
 _OLD_STATS = "meta/episodes_stats.jsonl"
 _NUMBERS = tuple(name for name in NAMES if name != "count")
+_EPISODES_AT_ONCE = 64
 _OF_THE_END = ("next.done", "next.success", "next.reward")
 
 
@@ -45,14 +46,14 @@ class EditReport:
         path: The dataset.
         num_episodes, num_frames: In it.
         decoded: Episodes of which images were decoded for their statistics.
-        lead: Images in front of cuts that stay in the videos, since later ones are decoded from them.
+        around: Images beside cuts that stay in the videos, since others are decoded from them.
     """
 
     path: Path
     num_episodes: int
     num_frames: int
     decoded: int
-    lead: int
+    around: int
 
 
 def write_plan(
@@ -80,10 +81,10 @@ def write_plan(
             DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
             Beside(plan, folder, aside) as beside,
         ):
-            lead = 0
+            around = 0
             for done, cut in enumerate(plan.cuts, start=1):
                 data = readers[cut.source].episode(cut)
-                lead += sum(video.lead for video in data.videos.values())
+                around += sum(video.lead + video.tail for video in data.videos.values())
                 beside.add(cut, writer.add(data))
                 if progress is not None:
                     progress(done, len(plan.cuts))
@@ -98,7 +99,7 @@ def write_plan(
         num_episodes=info.total_episodes,
         num_frames=info.total_frames,
         decoded=sum(reader.num_decoded for reader in readers),
-        lead=lead,
+        around=around,
     )
 
 
@@ -127,6 +128,12 @@ class _Reader:
         self._cutters = {key: PacketCutter(self.source.root, info, key) for key in info.video_keys if key in names}
         stored = [name for name in self._names if info.features[name].dtype == "image"]
         self._stored = {key: StoredImages(self.source.root, info, key) for key in stored}
+        self._facts_beside: RowsBeside | None = None
+        if types := self.source.fact_types:
+            schema = pa.schema([("episode_index", pa.int64()), *types.items()])
+            self._facts_beside = RowsBeside(
+                self.source.episode_tables, aside / f"facts_{number}.arrow", schema, rows=_EPISODES_AT_ONCE
+            )
         self._known = _ImageStatistics(self.source) if not decode else None
 
     def episode(self, cut: Cut) -> EpisodeData:
@@ -192,10 +199,11 @@ class _Reader:
         return array
 
     def _tasks(self, rows: pa.Table) -> list[str]:
-        tasks, found = self.source.tasks, rows.column("task_index").to_pylist()
-        if any(not isinstance(index, int) or not 0 <= index < len(tasks) for index in found):
+        tasks, found = self.source.tasks, rows.column("task_index").to_numpy()
+        if found.dtype.kind != "i" or found.min() < 0 or found.max() >= len(tasks):
             raise ExportError(f"A row names a task that is not in the table of tasks: {self.source.root}")
-        return [tasks[index] for index in found]
+        first = tasks[found[0]]
+        return [first] if (found == found[0]).all() else [tasks[index] for index in found.tolist()]
 
     def _language(self, rows: pa.Table, cut: Cut) -> EpisodeLanguage:
         """What is said in these rows, times counted from the first of them."""
@@ -219,7 +227,8 @@ class _Reader:
         return EpisodeLanguage(persistent=[*latest.values(), *kept], events=spoken.events)
 
     def _facts(self, cut: Cut, place: EpisodePlace) -> dict[str, Any]:
-        facts = {name: value for name, value in self.source.facts[cut.episode].items() if name != "episode_index"}
+        table = self._facts_beside.read(place.episode_index) if self._facts_beside is not None else None
+        facts: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
         if "duration_s" in facts:
             facts["duration_s"] = (cut.last - cut.first) / self._fps
         if (cut.first, cut.last) != (0, place.length):

@@ -249,8 +249,8 @@ def _samples(file: BinaryIO, size: int) -> Iterator[int]:
             elif kind in (b"stsz", b"stz2"):
                 _, each, count = struct.unpack(">III", file.read(12))
                 if kind == b"stsz" and each == 0 and 4 * count <= length:
-                    found = struct.iter_unpack(">I", file.read(4 * count))
-                    yield max(count, sum(number for (number,) in found))
+                    found = np.frombuffer(file.read(4 * count), ">u4", count)
+                    yield max(count, int(found.sum(dtype=np.int64)))
                 else:
                     yield max(count, each * count if kind == b"stsz" else 0)
             elif kind == b"trun":

@@ -35,18 +35,19 @@ _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EncodedVideo:
-    """The T images of one camera in one episode, and those before them without which they cannot be decoded.
+    """The T images of one camera in one episode, and those around them without which they cannot be decoded.
 
     Attributes:
         codec: "h264", "hevc" or "av1".
         first: The first image as it was encoded, a keyframe.
         samples: All images back to back, as an mp4 file stores them; or a file of them that is deleted once written.
-        sizes: (lead + T,) int64, bytes of each in `samples`.
-        is_keyframe: (lead + T,) bool, which ones can be decoded by themselves.
-        digest: SHA-256 of the samples of the T images, hex.
+        sizes: (lead + T + tail,) int64, bytes of each in `samples`.
+        is_keyframe: (lead + T + tail,) bool, which ones can be decoded by themselves.
+        digest: SHA-256 of T samples, those of the images, hex; with a tail, of those that are stored in their place.
         lead: How many images are in front that belong to no frame, from a keyframe on.
-        shifts: (lead + T,) int64, by how many places each image is shown after the place at which it is stored; None
-            where images are shown in the order in which they were encoded.
+        tail: How many images are shown behind the last frame, since some of the T are decoded from them.
+        shifts: (lead + T + tail,) int64, by how many places each image is shown after the place at which it is stored;
+            None where images are shown in the order in which they were encoded.
     """
 
     codec: str
@@ -58,6 +59,7 @@ class EncodedVideo:
     is_keyframe: NDArray[np.bool_]
     digest: str
     lead: int = 0
+    tail: int = 0
     shifts: NDArray[np.int64] | None = None
 
     @classmethod
@@ -83,7 +85,7 @@ class EncodedVideo:
     @property
     def num_frames(self) -> int:
         """T."""
-        return len(self.sizes) - self.lead
+        return len(self.sizes) - self.lead - self.tail
 
     @property
     def delay(self) -> int:
