@@ -88,7 +88,7 @@ def matrix(values: Sequence[Sequence[float]]) -> Fault:
 def saturated(share: float) -> Fault:
     """Colours farther from grey, or nearer."""
     grey = np.array([0.299, 0.587, 0.114])
-    return matrix(share * np.eye(3) + (1 - share) * np.tile(grey, (3, 1)))
+    return matrix((share * np.eye(3) + (1 - share) * np.tile(grey, (3, 1))).tolist())
 
 
 def wrong_matrix() -> Fault:
@@ -367,16 +367,16 @@ def noisy_depth(rows: Rows) -> Rows:
 
 
 def tilted(rows: Rows) -> Rows:
-    return (rows + np.linspace(-0.01, 0.01, rows.shape[2])[None, None]).astype(np.float32)
+    return np.asarray(rows + np.linspace(-0.01, 0.01, rows.shape[2])[None, None], dtype=np.float32)
 
 
 def half_size(rows: Rows) -> Rows:
-    return rows[:, ::2, ::2].repeat(2, axis=1).repeat(2, axis=2)[:, : rows.shape[1], : rows.shape[2]]
+    return np.asarray(rows[:, ::2, ::2].repeat(2, axis=1).repeat(2, axis=2)[:, : rows.shape[1], : rows.shape[2]])
 
 
 def mixed(rows: Rows) -> Rows:
     late = np.concatenate([rows[:1], rows[:-1]])
-    return ((rows + late) / 2).astype(np.float32)
+    return np.asarray((rows + late) / 2, dtype=np.float32)
 
 
 DEPTH: dict[str, Fault] = {

@@ -70,12 +70,12 @@ def frames_to_compare(keyframes: NDArray[np.int64], count: int, detail: NDArray[
     usual = np.array([np.median(amount[max(n - _NEAR, 0) : n + _NEAR + 1]) for n in range(len(starts))])
     odd = starts[int(np.argmax(np.abs(amount - usual)))]
     chosen = np.unique([starts[0], starts[len(starts) // 2], starts[-1], odd])
-    return np.unique((chosen[:, None] + np.arange(_PAIR)).reshape(-1))
+    return np.asarray(np.unique((chosen[:, None] + np.arange(_PAIR)).reshape(-1)))
 
 
 def with_lead(frames: NDArray[np.int64]) -> NDArray[np.int64]:
     """The frames, and those before them that their encoder needs."""
-    return np.unique(np.maximum(frames[:, None] - np.arange(LEAD + 1), 0))
+    return np.asarray(np.unique(np.maximum(frames[:, None] - np.arange(LEAD + 1), 0)))
 
 
 def encoded_again(

@@ -193,7 +193,7 @@ def amount_of_detail(picture: NDArray[np.uint8]) -> float:
 @_njit  # type: ignore[untyped-decorator]
 def _brightness(image: NDArray[np.uint8], y: int, x: int) -> float:
     """BT.601."""
-    return 0.299 * image[y, x, 0] + 0.587 * image[y, x, 1] + 0.114 * image[y, x, 2]
+    return float(0.299 * image[y, x, 0] + 0.587 * image[y, x, 1] + 0.114 * image[y, x, 2])
 
 
 @_njit  # type: ignore[untyped-decorator]
@@ -217,15 +217,15 @@ def full_size_equations(
             for x in range(width):
                 lines[y, x] = _brightness(drawn[n], y, x)
         for i in range(1, height - 1):
-            y = i - (height - 1) / 2
+            below = i - (height - 1) / 2
             for j in range(1, width - 1):
-                x = j - (width - 1) / 2
+                beside = j - (width - 1) / 2
                 across, down = (lines[i, j + 1] - lines[i, j - 1]) / 2, (lines[i + 1, j] - lines[i - 1, j]) / 2
                 if across == 0.0 and down == 0.0:
                     continue
                 around = lines[i, j + 1] + lines[i, j - 1] + lines[i + 1, j] + lines[i - 1, j]
-                bases[0], bases[1], bases[2], bases[3] = -across, -down, -x * across, -y * across
-                bases[4], bases[5], bases[6] = -x * down, -y * down, around - 4 * lines[i, j]
+                bases[0], bases[1], bases[2], bases[3] = -across, -down, -beside * across, -below * across
+                bases[4], bases[5], bases[6] = -beside * down, -below * down, around - 4 * lines[i, j]
                 error = _brightness(seen[n], i, j) - _brightness(expected[n], i, j)
                 for a in range(7):
                     right[a] += bases[a] * error
