@@ -17,7 +17,8 @@ from demorec.check.base import (
 )
 from demorec.check.cells import ImageKind
 from demorec.check.drawn import PictureComparison, judge_lag
-from demorec.check.episode import CheckedEpisode, of_each_camera
+from demorec.check.episode import CheckedEpisode, at_full_size, of_each_camera
+from demorec.check.full_size import FullSize
 from demorec.check.rows import displacement, matrices
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
@@ -106,15 +107,27 @@ def projection(episode: CheckedEpisode, camera: SceneCamera, compared: PictureCo
 
 
 @calibration_check(
-    measures="size of what the pictures show against what the recorded numbers make of it, off 1",
+    measures="how far things are from where the recorded numbers put them, in some images at full size",
+    unit="px",
     needs_pictures=True,
 )
-@of_each_camera
-def projected_size(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
-    """Things are as large in the picture as their distance and K make them: catches a wrong focal length or scale."""
-    told = float(episode.recording.calibration(camera.name).intrinsics[1, 1] / camera.intrinsics[1, 1])
-    size = (1 + compared.scale) / told
-    return Measurement(value=abs(size - 1), detail=f"camera {camera.name}: things appear {size:.3f} times as large")
+@at_full_size
+def image_placement(camera: SceneCamera, compared: FullSize) -> Found:
+    """Nothing is shifted by a part of a pixel, turned, sheared, or of another size or aspect than K makes it."""
+    return Measurement(value=compared.displacement, frame=int(compared.frames[0]), detail=f"camera {camera.name}")
+
+
+@calibration_check(
+    measures="share of the pixels of some images of depth or labels that are not what is drawn at full size",
+    needs_pictures=True,
+)
+def pixels_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
+    """Depth and labels are exact to the pixel: catches offsets, steps, noise, filters, smeared and grown edges."""
+    for camera in episode.cameras:
+        for kind in episode.kinds(camera.name)[1:]:
+            found = episode.pixels_off(camera, kind)
+            what = f"camera {camera.name}, {kind}"
+            yield found if isinstance(found, NotMeasured) else worst_frame(found[0], what, frames=found[1])
 
 
 @alignment_check(

@@ -80,7 +80,7 @@ def draw(
         for kind in kinds[name]
     }
     painter = Painter(
-        _renderer(),
+        warm_renderer(),
         small,
         depth="depth" in wanted,
         segmentation="labels" in wanted,
@@ -169,7 +169,7 @@ def fill_between(cells: Cells, frames: NDArray[np.int64]) -> None:
 
 
 @cache
-def _renderer() -> Renderer:
+def warm_renderer() -> Renderer:
     """Kept warm from one recording to the next: it has read the robot's meshes."""
     from demorec.render.raster import RasterRenderer
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from itertools import combinations
 from pathlib import Path
@@ -20,12 +20,14 @@ from demorec.check.base import Form, Found, NotMeasured
 from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells, correlation
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
 from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
-from demorec.check.episode_drawn import DrawnEpisode, draw_episode
+from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size
 from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
+from demorec.check.full_size import FullSize, compare_full_size, encoded_again, frames_to_compare, share_off, with_lead
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.core.errors import RecordingError, SceneError
 from demorec.core.geometry import Array
+from demorec.episode.camera_error import told_error
 from demorec.episode.episode import Columns, Event, Outcome, frame_time_ns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
@@ -80,6 +82,7 @@ class CheckedEpisode(ExitStack):
         self.path, self._named_urdf = path, named_urdf
         self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
+        self._full_sizes: dict[str, FullSize] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
 
     def shared[T](self, compute: Callable[[CheckedEpisode], T]) -> T:
@@ -312,7 +315,8 @@ class CheckedEpisode(ExitStack):
     def pictures(self, camera: SceneCamera, kind: ImageKind = "color") -> PictureSummary:
         """What the checks need of a camera's decoded pictures; decoded once."""
         if (camera.name, kind) not in self._pictures:
-            self._pictures[camera.name, kind] = summarise(self.recording, camera, kind)
+            keep = () if kind == "color" else self.sampled[camera.name].tolist()[::2]
+            self._pictures[camera.name, kind] = summarise(self.recording, camera, kind, keep)
         return self._pictures[camera.name, kind]
 
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
@@ -358,6 +362,63 @@ class CheckedEpisode(ExitStack):
         is_turned = camera.name in self._drawn.shift
         return strays(seen, self._drawn.pictures.cells[camera.name, kind], kind, is_turned=is_turned)
 
+    @cached_property
+    def sampled(self) -> Mapping[str, NDArray[np.int64]]:
+        """Camera -> frames that are compared at their full size."""
+        found = {}
+        for camera in self.cameras:
+            packets = self.recording.packets(camera.name)
+            keyframes = np.array([packet.frame_index for packet in packets if packet.is_keyframe], dtype=np.int64)
+            detail = self.pictures(camera).detail
+            found[camera.name] = frames_to_compare(keyframes, len(detail), detail)
+        return found
+
+    @cached_property
+    def _drawn_full_size(self) -> Mapping[tuple[str, ImageKind], Mapping[int, NDArray[Any]]] | NotMeasured:
+        """(camera, kind) -> frame -> image, as it was before it was encoded."""
+        kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
+        try:
+            return draw_full_size(self.info, self.columns, kinds, self.sampled)
+        except NOT_DRAWABLE as error:
+            return NotMeasured(why=f"the recording cannot be drawn here: {error}")
+
+    def _full_size(self, camera: SceneCamera, kind: ImageKind) -> Mapping[int, NDArray[Any]] | NotMeasured:
+        drawn = self._drawn_full_size
+        if isinstance(drawn, NotMeasured):
+            return drawn
+        if told_error(camera.name, self.info.behaviour) is None and f"calibration_{camera.name}_angle" in (
+            self.info.behaviour
+        ):
+            return NotMeasured(why=f"how camera {camera.name} is turned off its recorded pose is not recorded exactly")
+        return drawn[camera.name, kind]
+
+    def full_size(self, camera: SceneCamera) -> FullSize | NotMeasured:
+        """Some colour images of a camera at their full size, against what is drawn and encoded again."""
+        renderer = self.info.config.get("renderer", "raster")
+        if renderer != "raster":
+            return NotMeasured(why=f"colours of the renderer {renderer!r} are others than those that are drawn here")
+        if isinstance(drawn := self._full_size(camera, "color"), NotMeasured):
+            return drawn
+        frames = self.sampled[camera.name]
+        if len(frames) < 2:
+            return NotMeasured(why=f"camera {camera.name} has {len(frames)} pictures")
+        if camera.name not in self._full_sizes:
+            wanted = with_lead(frames).tolist()
+            seen = dict(zip(wanted, self.recording.images_at(camera.name, wanted), strict=True))
+            images = np.stack([drawn[frame] for frame in frames.tolist()])
+            expected = encoded_again(self.recording.video_settings(camera.name), list(images), frames, seen)
+            recorded = np.stack([seen[frame] for frame in frames.tolist()])
+            self._full_sizes[camera.name] = compare_full_size(recorded, expected, images, frames)
+        return self._full_sizes[camera.name]
+
+    def pixels_off(self, camera: SceneCamera, kind: ImageKind) -> tuple[Array, NDArray[np.intp]] | NotMeasured:
+        """Shares (N,) of the pixels of depth or labels that are others than drawn, and the frames (N,)."""
+        if isinstance(drawn := self._full_size(camera, kind), NotMeasured):
+            return drawn
+        kept = self.pictures(camera, kind).kept
+        frames = np.array([frame for frame in sorted(kept) if frame in drawn], dtype=np.intp)
+        return np.array([share_off(kept[frame], drawn[frame]) for frame in frames.tolist()]), frames
+
     def compared(self, camera: SceneCamera, kind: ImageKind = "color") -> PictureComparison | NotMeasured:
         """A camera's pictures against what the recorded numbers make of them."""
         renderer = self.info.config.get("renderer", "raster")
@@ -390,6 +451,18 @@ def of_each_camera(
     return judge_all
 
 
+def at_full_size(judge: Callable[[SceneCamera, FullSize], Found]) -> Callable[[CheckedEpisode], Iterator[Found]]:
+    """A check of some colour images of one camera at their full size, as one of all cameras."""
+
+    @wraps(judge)
+    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
+        for camera in episode.cameras:
+            compared = episode.full_size(camera)
+            yield compared if isinstance(compared, NotMeasured) else judge(camera, compared)
+
+    return judge_all
+
+
 def _scan(schema: str, block: Block) -> TopicScan:
     stamps = None
     if schema in _STAMP_FIRST and len(block) and int(block.lengths.min()) >= _STAMP_BYTES:
@@ -417,6 +490,8 @@ class PictureSummary:
         mean: (N, 3) mean colour, 0..255; of the brightnesses that stand for depth and labels, (N, channels).
         dark, bright: (N,) share of pixels that are nearly black or nearly white.
         cells: (N, h, w, channels) means over small areas, 0..255.
+        detail: (N,) how much fine structure colours have.
+        kept: Frame -> some of the pictures as they are.
     """
 
     error: str
@@ -424,6 +499,8 @@ class PictureSummary:
     dark: Array
     bright: Array
     cells: Cells
+    detail: NDArray[np.float32]
+    kept: Mapping[int, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def num_pictures(self) -> int:
@@ -431,8 +508,10 @@ class PictureSummary:
         return len(self.cells)
 
 
-def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind) -> PictureSummary:
-    """Decode all pictures of a camera once."""
+def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind, keep: Collection[int] = ()) -> PictureSummary:
+    """Decode all pictures of a camera once, and keep those of some frames."""
+    from demorec.check import kernels
+
     read: dict[ImageKind, Callable[[str], Iterator[NDArray[Any]]]] = {
         "color": recording.images,
         "depth": recording.depth,
@@ -440,10 +519,15 @@ def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind) -> Pic
     }
     grid = CellGrid(camera.width, camera.height)
     found: list[PictureCells] = []
+    detail: list[float] = []
+    kept: dict[int, NDArray[Any]] = {}
     error = ""
     try:
-        for picture in read[kind](camera.name):
+        for frame, picture in enumerate(read[kind](camera.name)):
             found.append(grid.read(kind, picture))  # what came before the damage counts
+            detail.append(kernels.amount_of_detail(picture) if kind == "color" else 0.0)
+            if frame in keep:
+                kept[frame] = picture
     except RecordingError as problem:
         error = str(problem)
     return PictureSummary(
@@ -452,4 +536,6 @@ def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind) -> Pic
         dark=np.array([picture.dark for picture in found]),
         bright=np.array([picture.bright for picture in found]),
         cells=np.array([picture.cells for picture in found]) if found else np.empty((0, 2, 2, 1), dtype=np.float32),
+        detail=np.array(detail, dtype=np.float32),
+        kept=kept,
     )

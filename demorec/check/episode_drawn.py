@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
-from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
+from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw, warm_renderer
 from demorec.core.geometry import Array, Pose
 from demorec.episode.camera_error import told_error, true_camera
 from demorec.episode.episode import Columns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
+from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
 
 _NUM_FITTED = 9
@@ -80,6 +82,35 @@ def draw_episode(
             if camera.name in turns
         },
     )
+
+
+def draw_full_size(
+    info: EpisodeInfo,
+    columns: Columns,
+    kinds: Mapping[str, Iterable[ImageKind]],
+    frames: Mapping[str, NDArray[np.int64]],
+) -> dict[tuple[str, ImageKind], dict[int, NDArray[Any]]]:
+    """(camera, kind) -> frame -> its image before it was encoded, of some frames of each camera.
+
+    Raises:
+        SceneError, RenderError: A model is not there, or cannot be drawn.
+    """
+    scene, wanted = drawable_scene(info), {kind for of_camera in kinds.values() for kind in of_camera}
+    world = RecordedWorld(info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses)
+    found: dict[tuple[str, ImageKind], dict[int, NDArray[Any]]] = {
+        (name, kind): {} for name in kinds for kind in kinds[name]
+    }
+    for frame in sorted({int(frame) for of_camera in frames.values() for frame in of_camera}):
+        cameras = tuple(camera for camera in scene.cameras if frame in frames[camera.name])
+        painter = Painter(warm_renderer(), cameras, depth="depth" in wanted, segmentation="labels" in wanted)
+        world.frame = frame
+        painter.setup(world)
+        for name, image in painter.images().items():
+            for kind in kinds[name]:
+                drawn = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
+                assert drawn is not None
+                found[name, kind][frame] = drawn.copy()
+    return found
 
 
 def drawable_scene(info: EpisodeInfo) -> Scene:

@@ -6,6 +6,7 @@ in cells, `rows` (h + 1) and `columns` (w + 1) say where these begin, and where 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
@@ -175,3 +176,101 @@ def compare_steps(
             size += step * step
             product += step * (seen[t, k] - seen[t - 1, k])
         moved[t], shown[t] = size, product
+
+
+@_njit  # type: ignore[untyped-decorator]
+def amount_of_detail(picture: NDArray[np.uint8]) -> float:
+    """The mean second difference along every fourth row of an image (H, W, 3), of green: noise, and sharp edges."""
+    height, width, _ = picture.shape
+    total = count = 0
+    for y in range(2, height, 4):
+        for x in range(1, width - 1):
+            total += abs(2 * np.int32(picture[y, x, 1]) - picture[y, x - 1, 1] - picture[y, x + 1, 1])
+        count += width - 2
+    return total / max(count, 1)
+
+
+@_njit  # type: ignore[untyped-decorator]
+def _brightness(image: NDArray[np.uint8], y: int, x: int) -> float:
+    """BT.601."""
+    return float(0.299 * image[y, x, 0] + 0.587 * image[y, x, 1] + 0.114 * image[y, x, 2])
+
+
+@_njit  # type: ignore[untyped-decorator]
+def full_size_equations(
+    seen: NDArray[np.uint8],
+    expected: NDArray[np.uint8],
+    drawn: NDArray[np.uint8],
+    gram: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Add gram (7, 7) and right (7,) of the least squares seen - expected = bases, over images (N, H, W, 3).
+
+    The bases are what the brightness of drawn changes by when it is shifted right and down (pixels), when x and y grow
+    with x and y (four shares), and when it is blurred (half the variance, pixels squared).
+    """
+    count, height, width, _ = drawn.shape
+    bases = np.empty(7)
+    lines = np.empty((height, width))
+    for n in range(count):
+        for y in range(height):
+            for x in range(width):
+                lines[y, x] = _brightness(drawn[n], y, x)
+        for i in range(1, height - 1):
+            below = i - (height - 1) / 2
+            for j in range(1, width - 1):
+                beside = j - (width - 1) / 2
+                across, down = (lines[i, j + 1] - lines[i, j - 1]) / 2, (lines[i + 1, j] - lines[i - 1, j]) / 2
+                if across == 0.0 and down == 0.0:
+                    continue
+                around = lines[i, j + 1] + lines[i, j - 1] + lines[i + 1, j] + lines[i - 1, j]
+                bases[0], bases[1], bases[2], bases[3] = -across, -down, -beside * across, -below * across
+                bases[4], bases[5], bases[6] = -beside * down, -below * down, around - 4 * lines[i, j]
+                error = _brightness(seen[n], i, j) - _brightness(expected[n], i, j)
+                for a in range(7):
+                    right[a] += bases[a] * error
+                    for b in range(7):
+                        gram[a, b] += bases[a] * bases[b]
+
+
+@_njit  # type: ignore[untyped-decorator]
+def sum_colors_off(
+    seen: NDArray[np.uint8], expected: NDArray[np.uint8], drawn: NDArray[np.uint8], sums: NDArray[np.float64]
+) -> None:
+    """Add to sums (N, 64, 7) of each drawn colour, four steps a channel: its pixels, how far red, green and blue of
+    seen are from expected, and the squares of how far those of expected are from drawn; images (N, H, W, 3)."""
+    count, height, width, _ = drawn.shape
+    for n in range(count):
+        for y in range(height):
+            for x in range(width):
+                color = (drawn[n, y, x, 0] // 64) * 16 + (drawn[n, y, x, 1] // 64) * 4 + drawn[n, y, x, 2] // 64
+                sums[n, color, 0] += 1
+                for c in range(3):
+                    own = np.float64(expected[n, y, x, c]) - drawn[n, y, x, c]
+                    sums[n, color, 1 + c] += np.float64(seen[n, y, x, c]) - expected[n, y, x, c]
+                    sums[n, color, 4 + c] += own * own
+
+
+@_njit  # type: ignore[untyped-decorator]
+def block_errors(
+    seen: NDArray[np.uint8],
+    expected: NDArray[np.uint8],
+    drawn: NDArray[np.uint8],
+    size: int,
+    off: NDArray[np.float64],
+    own: NDArray[np.float64],
+) -> None:
+    """Fill off and own (N, h, w): root mean square differences of seen and of expected from drawn, block by block."""
+    count, rows, columns = off.shape
+    for n in range(count):
+        for i in range(rows):
+            for j in range(columns):
+                far = coder = 0.0
+                for y in range(i * size, (i + 1) * size):
+                    for x in range(j * size, (j + 1) * size):
+                        for c in range(3):
+                            true = np.float64(drawn[n, y, x, c])
+                            far += (seen[n, y, x, c] - true) ** 2
+                            coder += (expected[n, y, x, c] - true) ** 2
+                off[n, i, j] = math.sqrt(far / (3 * size * size))
+                own[n, i, j] = math.sqrt(coder / (3 * size * size))

@@ -18,7 +18,8 @@ from demorec.check.base import (
     worst_frame,
 )
 from demorec.check.drawn import PictureComparison, judge_unlike
-from demorec.check.episode import CheckedEpisode, of_each_camera
+from demorec.check.episode import CheckedEpisode, at_full_size, of_each_camera
+from demorec.check.full_size import FullSize
 from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
 from demorec.episode.scene import SceneCamera
@@ -49,18 +50,6 @@ def pictures_decode(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @picture_check(
-    measures="pictures that are nearly all black or nearly all white",
-)
-def pictures_exposed(episode: CheckedEpisode) -> Iterator[Found]:
-    """No picture is black or burnt out: 95 % of its pixels darker than 12 or brighter than 250 of 255."""
-    for camera in episode.cameras:
-        summary = episode.pictures(camera)
-        wrong = (summary.dark > 0.95) | (summary.bright > 0.95)
-        frame = int(np.argmax(wrong)) if wrong.any() else None
-        yield Measurement(value=int(wrong.sum()), frame=frame, detail=f"camera {camera.name}")
-
-
-@picture_check(
     measures="largest share of a picture that is black or white",
 )
 def exposure(episode: CheckedEpisode) -> Iterator[Found]:
@@ -77,6 +66,36 @@ def pictures_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
     """The pictures show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
     for camera in episode.cameras:
         yield judge_unlike(episode.compared(camera), f"camera {camera.name}")
+
+
+@picture_check(
+    measures="mean difference of a colour from what is drawn and encoded at full size, in units of the encoder's error",
+)
+@at_full_size
+def image_colors(camera: SceneCamera, compared: FullSize) -> Found:
+    """Every colour is as drawn: catches other gains, curves, saturation and colour matrices, also if they drift."""
+    return Measurement(value=compared.color, frame=compared.color_frame, detail=f"camera {camera.name}")
+
+
+@picture_check(
+    measures="blur or sharpening of some images at full size, as half its variance",
+    unit="px^2",
+)
+@at_full_size
+def image_sharpness(camera: SceneCamera, compared: FullSize) -> Found:
+    """Images are as sharp as their encoder leaves them."""
+    word = "blurred" if compared.sharpness > 0 else "sharpened"
+    frame = int(compared.frames[0])
+    return Measurement(value=abs(compared.sharpness), frame=frame, detail=f"camera {camera.name}, {word}")
+
+
+@picture_check(
+    measures="error of an image at full size, or of its worst block, in units of the encoder's own",
+)
+@at_full_size
+def image_errors(camera: SceneCamera, compared: FullSize) -> Found:
+    """No part is farther from what is drawn than its encoder leaves it: catches noise, spots, lines and stamps."""
+    return worst_frame(compared.errors, f"camera {camera.name}", frames=compared.frames.astype(np.intp))
 
 
 @picture_check(

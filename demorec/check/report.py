@@ -50,6 +50,8 @@ RENAMED = {
     "dataset_duplicates": "duplicates",
     "run_coverage": "coverage",
     "dataset_coverage": "coverage",
+    "projected_size": "image_placement",
+    "pictures_exposed": "exposure",
     "effort_bears_the_arm": "effort_matches_dynamics",
     "wrench_holds_the_hand": "wrench_bears_the_hand",
     **dict.fromkeys(

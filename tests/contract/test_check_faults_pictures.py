@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+from scipy import ndimage
 from support.check import checked, simulate
 from support.faults import Good, Rows
 
@@ -22,6 +23,7 @@ from demorec.core.tables import CHECKS
 from demorec.render.recorded import RecordedWorld
 
 Fault = Callable[[Rows], Rows]
+RANDOM = np.random.default_rng(1)
 ONE = 100
 """The frame of a single odd picture: the hand is closing in on the cube."""
 
@@ -126,6 +128,68 @@ def along_the_ray(rows: Rows) -> Rows:
     return np.asarray(rows * np.sqrt(1 + 0.45 * (x * x + y * y)), dtype=rows.dtype)
 
 
+def moved(right: float, down: float) -> Fault:
+    shift = (0, down, right, 0)
+    return lambda rows: ndimage.shift(rows.astype(np.float32), shift, order=1, mode="nearest").astype(np.uint8)
+
+
+def turned(degrees: float) -> Fault:
+    resample = Image.Resampling.BICUBIC
+    return lambda rows: np.stack([np.asarray(Image.fromarray(row).rotate(degrees, resample)) for row in rows])
+
+
+def wider(times: float) -> Fault:
+    def fault(rows: Rows) -> Rows:
+        height, width = rows.shape[1:3]
+        x = width / 2 * (1 - 1 / times)
+        box, resize = (x, 0, width - x, height), Image.Resampling.BICUBIC
+        return np.stack([np.asarray(Image.fromarray(row).resize((width, height), resize, box=box)) for row in rows])
+
+    return fault
+
+
+def softened(rows: Rows) -> Rows:
+    return np.stack([np.asarray(Image.fromarray(row).filter(ImageFilter.GaussianBlur(1))) for row in rows])
+
+
+def noisy(rows: Rows) -> Rows:
+    return np.clip(rows + RANDOM.normal(0, 8, rows.shape), 0, 255).astype(np.uint8)
+
+
+def spot(size: int) -> Fault:
+    def fault(rows: Rows) -> Rows:
+        out = rows.copy()
+        out[:, 60 : 60 + size, 30 : 30 + size] //= 3
+        return out
+
+    return fault
+
+
+def column(rows: Rows) -> Rows:
+    out = rows.copy()
+    out[:, :, rows.shape[2] // 3] = 0
+    return out
+
+
+def mixed(rows: Rows, matrix: Array) -> Rows:
+    return np.clip(np.rint(rows.astype(np.float64) @ matrix.T), 0, 255).astype(np.uint8)
+
+
+def saturated(share: float) -> Fault:
+    grey = np.tile([0.299, 0.587, 0.114], (3, 1))
+    return lambda rows: mixed(rows, share * np.eye(3) + (1 - share) * grey)
+
+
+def as_bt709(rows: Rows) -> Rows:
+    """Decoded by another matrix than they were encoded by (ITU-R BT.601 and BT.709)."""
+
+    def luma_and_chroma(red: float, blue: float) -> Array:
+        y = np.array([red, 1 - red - blue, blue])
+        return np.stack([y, (np.array([0, 0, 1]) - y) / (2 - 2 * blue), (np.array([1, 0, 0]) - y) / (2 - 2 * red)])
+
+    return mixed(rows, np.linalg.inv(luma_and_chroma(0.2126, 0.0722)) @ luma_and_chroma(0.299, 0.114))
+
+
 COLOR: list[tuple[str, Fault, str]] = [
     ("one frame late", late(1), "picture_lag"),
     ("two frames late", late(2), "picture_lag"),
@@ -158,9 +222,25 @@ COLOR: list[tuple[str, Fault, str]] = [
     ("turned by half", lambda rows: rows[:, ::-1, ::-1], "projection"),
     ("shifted to the left by one pixel", rolled(-1), "projection"),
     ("shifted down by one pixel", rolled(1, axis=1), "projection"),
-    ("zoomed in", zoomed(1.2), "projected_size"),
-    ("zoomed in by three hundredths", zoomed(1.03), "projected_size"),
+    ("zoomed in", zoomed(1.2), "image_placement"),
+    ("zoomed in by three hundredths", zoomed(1.03), "image_placement"),
 ]  # fmt: skip
+
+FULL_SIZE: list[tuple[str, Fault, str]] = [
+    ("half a pixel to the right", moved(0.5, 0.0), "image_placement"),
+    ("half a pixel up and to the left", moved(-0.5, -0.5), "image_placement"),
+    ("turned by half a degree", turned(0.5), "image_placement"),
+    ("two percent too wide", wider(1.02), "image_placement"),
+    ("blurred by a pixel", softened, "image_sharpness"),
+    ("noise", noisy, "image_errors"),
+    ("a dark spot", spot(5), "image_errors"),
+    ("a dead column", column, "image_errors"),
+    ("posterised", lambda rows: np.asarray(rows // 16 * 16 + 8, dtype=rows.dtype), "image_colors"),
+    ("less saturated", saturated(0.8), "image_colors"),
+    ("BT.709 for BT.601", as_bt709, "image_colors"),
+    ("brighter by a fortieth", lambda rows: np.clip(rows * 1.05, 0, 255).astype(np.uint8), "image_colors"),
+]
+"""Faults too small for the cells."""
 
 DEPTH: list[tuple[str, Fault, str]] = [
     ("one frame late", late(1), "picture_lag"),
@@ -176,6 +256,12 @@ DEPTH: list[tuple[str, Fault, str]] = [
     ("five hundredths too far", lambda rows: rows * np.float32(1.05), "depth_matches_scene"),
     ("along the ray", along_the_ray, "depth_matches_scene"),
     ("inverted", lambda rows: rows.max() - rows, "depth_matches_scene"),
+    ("a centimetre too near", lambda rows: (rows - np.float32(0.01)).astype(np.float32), "pixels_as_drawn"),
+    ("one percent too far", lambda rows: rows * np.float32(1.01), "pixels_as_drawn"),
+    ("8 bit", lambda rows: (np.round(rows / 3 * 255) / 255 * 3).astype(np.float32), "pixels_as_drawn"),
+    ("shifted by one pixel", rolled(1), "pixels_as_drawn"),
+    ("noise", lambda rows: (rows + RANDOM.normal(0, 0.01, rows.shape)).astype(np.float32), "pixels_as_drawn"),
+    ("edges smeared", lambda rows: ndimage.gaussian_filter(rows, (0, 1, 1)), "pixels_as_drawn"),
 ]
 
 LABELS: list[tuple[str, Fault, str]] = [
@@ -189,10 +275,13 @@ LABELS: list[tuple[str, Fault, str]] = [
     ("one of nothing", one(lambda rows: rows * 0 - 1), "segmentation_matches_scene"),
     ("mirrored", lambda rows: rows[:, :, ::-1], "segmentation_matches_scene"),
     ("upside down", lambda rows: rows[:, ::-1], "segmentation_matches_scene"),
+    ("grown by two pixels", lambda rows: ndimage.maximum_filter(rows, size=(1, 5, 5)), "pixels_as_drawn"),
+    ("shrunk by a pixel", lambda rows: ndimage.minimum_filter(rows, size=(1, 3, 3)), "pixels_as_drawn"),
+    ("shifted by one pixel", rolled(-1, axis=1), "pixels_as_drawn"),
 ]
 
 CASES: list[tuple[ImageKind, str, Fault, str]] = [
-    *(("color", *row) for row in COLOR),
+    *(("color", *row) for row in (*COLOR, *FULL_SIZE)),
     *(("depth", *row) for row in DEPTH),
     *(("labels", *row) for row in LABELS),
 ]

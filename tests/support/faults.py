@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from demorec.core.tables import CHECKS
 from demorec.episode.episode import Columns, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
+from demorec.mcap import Recording
 
 Rows = NDArray[Any]
 
@@ -54,9 +55,11 @@ class Good:
     def with_pictures(self, changed: Mapping[tuple[str, ImageKind], Rows]) -> CheckedEpisode:
         """The episode with other pictures; what is drawn of it stays."""
         spoilt = CheckedEpisode(self.episode.path)
-        spoilt.__dict__["recording"] = self.episode.recording
+        spoilt.__dict__["recording"] = _WithImages(self.episode.recording, changed)
         spoilt.__dict__["columns"] = self.episode.columns
         spoilt.__dict__["_drawn"] = self.episode._drawn
+        spoilt.__dict__["sampled"] = self.episode.sampled
+        spoilt.__dict__["_drawn_full_size"] = self.episode._drawn_full_size
         for key in self.pictures.keys() - changed.keys():
             spoilt._pictures[key] = self.episode.pictures(self._cameras[key[0]], key[1])
             compared = self.episode.compared(self._cameras[key[0]], key[1])
@@ -67,9 +70,31 @@ class Good:
             cells = np.stack([grid.read(kind, picture).cells for picture in pictures])
             nothing = np.zeros(len(pictures))
             spoilt._pictures[name, kind] = PictureSummary(
-                error="", mean=np.zeros((len(pictures), 3)), dark=nothing, bright=nothing, cells=cells
+                error="",
+                mean=np.zeros((len(pictures), 3)),
+                dark=nothing,
+                bright=nothing,
+                cells=cells,
+                detail=nothing.astype(np.float32),
+                kept={} if kind == "color" else {frame: pictures[frame] for frame in self.episode.sampled[name]},
             )
         return spoilt
+
+
+class _WithImages:
+    """A recording with other colour images."""
+
+    def __init__(self, recording: Recording, images: Mapping[tuple[str, ImageKind], Rows]) -> None:
+        self._recording, self._images = recording, images
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._recording, name)
+
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rows]:
+        """Those, or the recording's own."""
+        if (camera, "color") not in self._images:
+            return self._recording.images_at(camera, frames)
+        return iter(self._images[camera, "color"][list(frames)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,0 +1,178 @@
+"""Some frames of a camera at their full size, against what the recorded numbers and the camera's encoder make of them.
+
+The drawn images are those that were encoded, so what an encoder of the same settings makes of them is what must have
+been recorded: what is left is neither the encoder's error nor its quality. A later frame's quality depends on the
+frames before, which are taken from the recording. Depth and labels are stored without loss and compared pixel by pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.config import VideoConfig
+from demorec.core.geometry import Array
+from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, make_encoder
+
+BLOCK = 8
+"""Pixels a side of the parts of an image that are judged by themselves: those of a transform in H.264."""
+LEAD = 6
+"""Frames before those that are compared, by which the encoder finds its quality: its memory halves with each."""
+_PAIR = 2
+"""Frames that are compared from a keyframe on: one of each kind."""
+_NEAR = 10
+"""Keyframes around one that tell how much detail is usual."""
+_LEAST_PIXELS, _MANY_PIXELS = 64, 512
+"""Of a colour in an image: one of fewer is not judged, one of many fully."""
+_LEVELS = 2.0
+"""By which a block may be off beside its encoder's error: what rounding does."""
+_DEPTH_METRES = 0.004
+"""Depth is stored in millimetres; another machine draws edges a little elsewhere."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FullSize:
+    """How N frames of a camera's colour images differ from what its encoder makes of the drawn ones.
+
+    Attributes:
+        frames: (N,) which they are.
+        displacement: Pixels by which something is elsewhere: shift, and what turn, size, shear do half-way to a corner.
+        sharpness: Pixels squared: half the variance of the blur that would make the difference; negative if sharpened.
+        color: The mean difference of a colour, in units of its encoder's error (one level at least), the largest.
+        color_frame: Where that is.
+        errors: (N,) the image's error, of its worst block or of nine tenths of them, in units of the encoder's own.
+    """
+
+    frames: NDArray[np.int64]
+    displacement: float
+    sharpness: float
+    color: float
+    color_frame: int
+    errors: Array
+
+
+def frames_to_compare(keyframes: NDArray[np.int64], count: int, detail: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(N,) the first two frames, two later ones, and those around the keyframe whose detail is most unusual.
+
+    Args:
+        keyframes: In order.
+        count: Frames that there are.
+        detail: (count,) how much fine structure each image has.
+    """
+    starts = keyframes[keyframes <= count - _PAIR]
+    if not len(starts):
+        return np.arange(min(count, _PAIR))
+    amount = np.log(np.maximum(detail[starts], 1e-3))
+    usual = np.array([np.median(amount[max(n - _NEAR, 0) : n + _NEAR + 1]) for n in range(len(starts))])
+    odd = starts[int(np.argmax(np.abs(amount - usual)))]
+    chosen = np.unique([starts[0], starts[len(starts) // 2], starts[-1], odd])
+    return np.asarray(np.unique((chosen[:, None] + np.arange(_PAIR)).reshape(-1)))
+
+
+def with_lead(frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The frames, and those before them that their encoder needs."""
+    return np.asarray(np.unique(np.maximum(frames[:, None] - np.arange(LEAD + 1), 0)))
+
+
+def encoded_again(
+    settings: VideoSettings, drawn: Sequence[Rgb], frames: NDArray[np.int64], seen: dict[int, Rgb]
+) -> NDArray[np.uint8]:
+    """(N, H, W, 3) what the encoder makes of drawn frames.
+
+    Args:
+        settings: Of the encoder.
+        drawn: N images.
+        frames: (N,) which they are, those of one keyframe one after the other.
+        seen: Frame -> recorded image, also of the frames before.
+
+    Raises:
+        ConfigError: This build of FFmpeg lacks the encoder.
+    """
+    config = VideoConfig(
+        codec=settings.codec,  # type: ignore[arg-type]
+        gop=max(settings.gop, 1),
+        crf=settings.crf,
+        preset=settings.preset or None,
+        jpeg_quality=settings.jpeg_quality or VideoConfig.jpeg_quality,
+    )
+    images: list[Rgb] = []
+    for part in np.split(np.arange(len(frames)), np.flatnonzero(np.diff(frames) > 1) + 1):
+        first = int(frames[part[0]])
+        lead = LEAD // config.gop * config.gop  # so that the first of them is a keyframe as it was
+        before = [seen[frame] for frame in range(max(first - lead, 0), first)]
+        encoder = make_encoder(config, settings.width, settings.height, settings.fps)
+        data = [packet for image in (*before, *(drawn[n] for n in part)) for packet in encoder.encode(image)]
+        packets = [
+            VideoPacket(frame_index=n, time_ns=0, data=packet, is_keyframe=n == 0)
+            for n, packet in enumerate([*data, *encoder.finish()])
+        ]
+        images += list(decode(settings, packets))[len(before) :]
+    return np.stack(images)
+
+
+def compare_full_size(
+    seen: NDArray[np.uint8], expected: NDArray[np.uint8], drawn: NDArray[np.uint8], frames: NDArray[np.int64]
+) -> FullSize:
+    """Compare images (N, H, W, 3): recorded, encoded again, and drawn."""
+    from demorec.check import kernels
+
+    count, height, width, _ = drawn.shape
+    gram, right = np.zeros((7, 7)), np.zeros(7)
+    kernels.full_size_equations(seen, expected, drawn, gram, right)
+    gram += np.eye(7) * max(1e-6 * float(np.trace(gram)) / 7, 1e-9)
+    moved = np.linalg.solve(gram, right)
+    colors = np.zeros((count, 64, 7))
+    kernels.sum_colors_off(seen, expected, drawn, colors)
+    off, own = np.zeros((count, height // BLOCK, width // BLOCK)), np.zeros((count, height // BLOCK, width // BLOCK))
+    kernels.block_errors(seen, expected, drawn, BLOCK, off, own)
+    color, frame = _worst_color(colors)
+    return FullSize(
+        frames=frames,
+        displacement=float(np.hypot(*moved[:2]) + np.abs(moved[2:6]).max() * min(height, width) / 4),
+        sharpness=float(moved[6]),
+        color=color,
+        color_frame=int(frames[frame]),
+        errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)]),
+    )
+
+
+def _worst_color(sums: Array) -> tuple[float, int]:
+    """The largest mean difference of a colour, and the image's number; of (N, 64, 7): pixels, differences, squares.
+
+    Over all images, and in each at half its weight: there the encoder's quality may be a little another one.
+    """
+    each = _ratio(sums) / 2
+    number = int(np.argmax(each))
+    return max(float(_ratio(sums.sum(axis=0)[None])[0]), float(each[number])), number
+
+
+def _ratio(sums: Array) -> Array:
+    """(N,) of each image the largest of any colour, in units of the encoder's error, one level at least."""
+    pixels = sums[..., :1]
+    mean = np.abs(sums[..., 1:4]) / np.maximum(pixels, 1)
+    own = np.sqrt(sums[..., 4:] / np.maximum(pixels, 1))
+    # Of a few blocks the encoder's errors do not cancel.
+    weight = np.minimum(np.sqrt(pixels / _MANY_PIXELS), 1.0) * (pixels >= _LEAST_PIXELS)
+    return np.asarray((mean / np.maximum(own, 1.0) * weight).max(axis=(1, 2)))
+
+
+def _error(off: Array, own: Array) -> float:
+    """Of the blocks (h, w) of one image: its worst, or nine tenths of them, against the encoder's around."""
+    around = own.copy()
+    around[1:], around[:-1] = np.maximum(around[1:], own[:-1]), np.maximum(around[:-1], own[1:])
+    wide = around.copy()
+    wide[:, 1:] = np.maximum(wide[:, 1:], around[:, :-1])
+    wide[:, :-1] = np.maximum(wide[:, :-1], around[:, 1:])
+    worst = float(((off - _LEVELS) / np.maximum(wide, 0.5)).max(initial=0.0))
+    usual = float(np.quantile(off / np.maximum(own, 1.0), 0.9)) if off.size else 0.0
+    return max(worst, usual)
+
+
+def share_off(seen: NDArray[Any], drawn: NDArray[Any]) -> float:
+    """Of depth (H, W) in metres, or labels: the share of pixels that are others than drawn."""
+    off = np.abs(seen - drawn) > _DEPTH_METRES if seen.dtype.kind == "f" else seen != drawn
+    return float(off.mean())
