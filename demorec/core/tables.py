@@ -45,7 +45,11 @@ TASKS: Registry[type[Task]] = Registry(
 
 ROBOTS: Registry[RobotSpec] = Registry(
     kind="robot",
-    rows={"panda": "demorec.robots.panda:PANDA", "iiwa": "demorec.robots.iiwa:IIWA"},
+    rows={
+        "panda": "demorec.robots.panda:PANDA",
+        "iiwa": "demorec.robots.iiwa:IIWA",
+        "so101": "demorec.robots.so101:SO101",
+    },
     instance_of="demorec.robots.robot:RobotSpec",
 )
 

@@ -18,7 +18,8 @@ class CameraPreset:
     Attributes:
         summary: One line for `demorec list cameras`.
         mount: "world", or "tcp" for a camera that the hand carries.
-        eye, target: Where it is and what it looks at, in the mount's frame, metres.
+        eye, target: Where it is and what it looks at, in the mount's frame, metres; in the world for an arm of
+            task_scale 1, nearer to a small one. A robot may have its own mount for a camera on the hand.
         up: Direction that is up in the picture, in the mount's frame.
         fov_y: Vertical field of view, rad.
         fov_x: Horizontal field that it has at least, rad: of a picture that is too narrow for it the vertical field
@@ -35,14 +36,24 @@ class CameraPreset:
 
     def camera(self, name: str, robot: RobotSpec, *, width: int, height: int) -> SceneCamera:
         """The camera for a picture size and a robot."""
+        eye, target, up = self.eye, self.target, self.up
+        if self.mount == "tcp":
+            eye, target, up = robot.wrist_camera or (eye, target, up)
+        else:
+            eye, target = _scaled(eye, robot.task_scale), _scaled(target, robot.task_scale)
         return SceneCamera(
             name=name,
             width=width,
             height=height,
             fov_y=max(self.fov_y, 2.0 * math.atan(math.tan(self.fov_x / 2.0) * height / width)),
             mount=self.mount if self.mount == "world" else robot.tcp_link,
-            mount_from_camera=look_at(self.eye, self.target, self.up),
+            mount_from_camera=look_at(eye, target, up),
         )
+
+
+def _scaled(point: Vector3, scale: float) -> Vector3:
+    x, y, z = point
+    return scale * x, scale * y, scale * z
 
 
 FRONT = CameraPreset(

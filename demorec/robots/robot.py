@@ -97,7 +97,7 @@ class JawGripper:
         opening: Position of the joint, rad, and the opening there, metres, measured at the tips; from closed (what the
             expert closes to) to open (as far as it opens).
         force: Torque of the joint's motor, N m.
-        finger_depth: How far the fixed finger reaches beyond the TCP, metres.
+        finger_depth: How far a finger reaches beyond the TCP, the jaw wherever it turns, metres.
         palm_clearance: From the TCP back to the palm, metres: what fits between the fingers above the grasp.
         play: Air between the fixed finger and an object before the jaw pushes it there, metres.
     """
@@ -211,6 +211,8 @@ class RobotSpec:
         gripper: What opens and closes.
         task_scale: Factor on the lengths of the tasks' layouts and of the expert's heights: 1 for an arm that reaches
             0.3 to 0.7 m from its base with the hand down, less for a small one.
+        wrist_camera: Eye, target and up of a camera on the hand where the arm has a usual mount, in the TCP's frame,
+            metres; (): as the camera's preset has them.
     """
 
     name: str
@@ -227,6 +229,7 @@ class RobotSpec:
     torque_limit: tuple[float, ...]
     gripper: Gripper
     task_scale: float = 1.0
+    wrist_camera: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -244,7 +247,7 @@ write_flat(
     "gripper",
     ParallelGripper,
     otherwise=JawGripper,
-    leave_out=("task_scale",),
+    leave_out=("task_scale", "wrist_camera"),
     keys={
         "joints": "gripper_joints",
         "finger_links": "finger_links",

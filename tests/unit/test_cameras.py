@@ -30,6 +30,11 @@ def inside(camera: SceneCamera, place: tuple[float, float], margin: float = 0.0)
     return margin <= u <= 1 - margin and margin <= v <= 1 - margin
 
 
+def scaled(world: World, x: float, y: float, z: float) -> tuple[float, float, float]:
+    scale = world.robot.task_scale
+    return scale * x, scale * y, scale * z
+
+
 @pytest.fixture(scope="module", params=ROBOTS.names())
 def world(request: pytest.FixtureRequest) -> Iterator[World]:
     prepared = episode(0, robot=request.param, cameras=CAMERAS.names(), variation="none")
@@ -44,19 +49,19 @@ def cameras_of(world: World) -> dict[str, SceneCamera]:
 
 def test_front_sees_every_place_where_objects_go_and_the_hand_above(world: World) -> None:
     camera = cameras_of(world)["front"]
-    for x, y, z in itertools.product((0.33, 0.67), (-0.30, 0.30), (0.0, 0.06)):
-        assert inside(camera, pixel(camera, camera.mount_from_camera, (x, y, z)), margin=0.02), (x, y, z)
+    for place in itertools.product((0.33, 0.67), (-0.30, 0.30), (0.0, 0.06)):
+        assert inside(camera, pixel(camera, camera.mount_from_camera, scaled(world, *place)), margin=0.02), place
     assert inside(camera, pixel(camera, camera.mount_from_camera, tuple(world.arm.world_from_tcp().position)))
 
 
 def test_top_sees_every_place_where_objects_go_with_the_base_below(world: World) -> None:
     camera = cameras_of(world)["top"]
-    for x, y, z in itertools.product((0.33, 0.67), (-0.30, 0.30), (0.0, 0.06)):
-        assert inside(camera, pixel(camera, camera.mount_from_camera, (x, y, z)), margin=0.02), (x, y, z)
-    near, far = (pixel(camera, camera.mount_from_camera, (x, 0.0, 0.0)) for x in (0.35, 0.65))
+    for place in itertools.product((0.33, 0.67), (-0.30, 0.30), (0.0, 0.06)):
+        assert inside(camera, pixel(camera, camera.mount_from_camera, scaled(world, *place)), margin=0.02), place
+    near, far = (pixel(camera, camera.mount_from_camera, scaled(world, x, 0.0, 0.0)) for x in (0.35, 0.65))
     assert near[1] > far[1]
-    right = pixel(camera, camera.mount_from_camera, (0.5, -0.2, 0.0))
-    assert right[0] > pixel(camera, camera.mount_from_camera, (0.5, 0.2, 0.0))[0]  # no mirror: y is to the left
+    right, left = (pixel(camera, camera.mount_from_camera, scaled(world, 0.5, y, 0.0)) for y in (-0.2, 0.2))
+    assert right[0] > left[0]  # no mirror: y is to the left
 
 
 @pytest.mark.parametrize("size", [(56, 40), (224, 224), (640, 480), (640, 360)])
@@ -65,7 +70,7 @@ def test_workspace_sees_every_place_where_objects_go_in_pictures_of_any_shape(
 ) -> None:
     camera = CAMERAS.load("workspace").camera("workspace", world.robot, width=size[0], height=size[1])
     pixels = [
-        pixel(camera, camera.mount_from_camera, (*place, z))
+        pixel(camera, camera.mount_from_camera, scaled(world, *place, z))
         for place in itertools.product(WORKSPACE.x, WORKSPACE.y)
         for z in (0.0, 0.06)
     ]
@@ -79,9 +84,11 @@ def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
     state = world.client.getLinkState(mount.body, mount.link, computeForwardKinematics=True)
     pose = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5])) @ camera.mount_from_camera
     tcp = world.arm.world_from_tcp()
-    half = world.robot.gripper.max_width / 2
-    for point in ([0, 0, 0], [0, 0.7 * half, 0], [0, -0.7 * half, 0], [0, 0, 0.1]):
+    gripper, turned = world.robot.gripper, -1 if world.robot.wrist_camera else 1
+    half, middle = gripper.max_width / 2, gripper.object_offset(gripper.max_width)
+    for point in ([0, middle, 0], [0, middle + 0.7 * half, 0], [0, middle - 0.7 * half, 0], [0, middle, 0.1]):
         assert inside(camera, pixel(camera, pose, tuple(tcp.apply(np.array(point))))), point
-    # The hand's own x axis runs down in the picture: what lies ahead of the fingers comes in from below.
+    # The hand's own x axis runs down in the picture: what lies ahead of the fingers comes in from below. SO-101's mount
+    # looks from there.
     ahead, behind = (pixel(camera, pose, tuple(tcp.apply(np.array([x, 0, 0.05]))))[1] for x in (0.02, -0.02))
-    assert ahead > behind
+    assert turned * (ahead - behind) > 0

@@ -126,7 +126,7 @@ def test_a_straight_path_is_straight_and_turns_evenly(robot: SimulatedRobot) -> 
     arm = arm_kinematics(spec)
     start = np.array(spec.home_q)
     base_from_start = arm.forward(start)
-    turn = Pose.from_yaw([0.05, 0.15, -0.1], 0.7)
+    turn = Pose.from_yaw(spec.task_scale * np.array([0.05, 0.15, -0.1]), 0.7)
     base_from_goal = Pose(
         position=base_from_start.position + turn.position,
         quat_xyzw=(turn @ Pose(quat_xyzw=base_from_start.quat_xyzw)).quat_xyzw,

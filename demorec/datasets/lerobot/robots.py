@@ -33,6 +33,8 @@ ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
 """What of the name of an element is not that of its joint."""
 _DIGEST = re.compile(r"[0-9a-f]{16}")
+IN_MOTOR_UNITS = frozenset({"so101"})
+"""Rows of `ROBOTS` whose joints LeRobot itself has, in other units."""
 _KEPT = ("material", "link", "joint")
 """What of a URDF places and draws links; the rest is for simulators and controllers, and full of paths."""
 _IN_PACKAGE = re.compile(r"^(?:file:/*)?/.*/share/([^/]+/.+)$")
@@ -106,11 +108,14 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
 def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     """The arm of ours whose joints the elements of observation.state are called after, "panda_joint1.pos" or the like.
 
-    Of a dataset that does not say what its robot is; lengths are those of the model.
+    Of a dataset that does not say what its robot is; lengths are those of the model. LeRobot's own arms are left out:
+    their joints are called the same in degrees and in per cent.
     """
     stems = [ELEMENT_SUFFIX.sub("", name) for name in names]
     for row in ROBOTS.names():
         robot = ROBOTS.load(row)
+        if robot.name in IN_MOTOR_UNITS:
+            continue
         if set(robot.arm_joints) <= set(stems):
             urdf = robot_description(robot.urdf, 1.0)
             joints = tuple(stem if stem in robot.joint_names else "" for stem in stems)

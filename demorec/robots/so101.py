@@ -1,0 +1,51 @@
+"""SO-101 follower arm of The Robot Studio and Hugging Face (`demorec/sim/assets/so101.urdf`): five joints and a jaw.
+
+Position limits are the URDF's. Every joint is driven by a servo STS3215 with gears of 1:345; at 7.4 V its data sheet
+has a stall torque of 19.5 kg cm and 52 turns a minute without load. Nobody publishes acceleration limits. The jaw
+closes with a tenth of that torque: 2.7 N at its tip hold whatever fits, and the solver's iterations suffice for it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from demorec.robots.robot import JawGripper, RobotSpec
+
+STALL_TORQUE = 19.5e-2 * 9.80665
+"""N m."""
+NO_LOAD_SPEED = 52.0 * 2.0 * math.pi / 60.0
+"""rad/s."""
+
+SO101 = RobotSpec(
+    name="so101",
+    urdf="demorec:so101.urdf",
+    base_link="ground",
+    arm_joints=("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"),
+    tcp_link="tcp",
+    hand_link="gripper_link",
+    home_q=(0.0, 0.06422, -0.09751, 1.60408, -1.52212),
+    position_lower=(-1.91986, -1.74533, -1.69, -1.65806, -2.74385),
+    position_upper=(1.91986, 1.74533, 1.69, 1.65806, 2.84121),
+    velocity_limit=(NO_LOAD_SPEED,) * 5,
+    acceleration_limit=(20.0,) * 5,
+    torque_limit=(STALL_TORQUE,) * 5,
+    gripper=JawGripper(
+        joints=("gripper",),
+        finger_links=("gripper_link", "moving_jaw_so101_v1_link"),
+        # Measured on the meshes: the jaw's nearest point to the plane of the fixed finger, below 12 mm above the TCP.
+        opening=(
+            (-0.17, 0.0022),
+            (-0.1, 0.0078),
+            (0.0, 0.0158),
+            (0.1, 0.0230),
+            (0.2, 0.0303),
+            (0.25, 0.0340),
+        ),
+        force=0.2,
+        finger_depth=0.0085,
+        palm_clearance=0.056,
+    ),
+    task_scale=0.38,
+    # The mount of LeRobot's users: beside the gripper's motor, looking at the finger tips.
+    wrist_camera=((0.0552, 0.0079, -0.0531), (0.0, 0.0079, 0.033), (1.0, 0.0, 0.0)),
+)
