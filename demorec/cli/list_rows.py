@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ListRows:
-    """List the available tasks, cameras, robots, renderers, export formats or checks.
+    """List the available tasks, cameras, robots, objects, renderers, export formats or checks.
 
     Examples:
       demorec list tasks
       demorec list cameras --json
     """
 
-    what: Positional[Literal["tasks", "cameras", "robots", "renderers", "exporters", "checks"]]
+    what: Positional[Literal["tasks", "cameras", "robots", "objects", "renderers", "exporters", "checks"]]
     """What to list."""
     json: bool = False
     """Print JSON: a list of names and summaries."""
@@ -52,10 +52,19 @@ def _robot(registry: Registry[Any], name: str) -> str:
     return f"{len(robot.arm_joints)} joints, gripper opening {1000 * robot.gripper.max_width:.0f} mm, from {robot.urdf}"
 
 
+def _kinds(registry: Registry[Any], name: str) -> str:
+    kinds = registry.load(name).kinds
+    return f"{sum(kind.count for kind in kinds)} shapes: {', '.join(kind.noun for kind in kinds)}"
+
+
 def _first_line_of_module(registry: Registry[Any], name: str) -> str:
     module = importlib.import_module(registry.rows[name].partition(":")[0])
     return (module.__doc__ or "").strip().splitlines()[0]
 
 
-_DESCRIBED: Mapping[str, Callable[[Registry[Any], str], str]] = {"robots": _robot, "renderers": _first_line_of_module}
+_DESCRIBED: Mapping[str, Callable[[Registry[Any], str], str]] = {
+    "robots": _robot,
+    "objects": _kinds,
+    "renderers": _first_line_of_module,
+}
 """How a row is described in one line, where it has no summary of its own."""

@@ -95,6 +95,11 @@ class GenerateConfig:
     """How much episodes vary besides their layout: none; mild (action noise with clean labels); full (everything)."""
     ranges: Ranges = field(default_factory=Ranges)
     """Single ranges that override those of --variation (auto: as --variation has them)."""
+    objects: tuple[str, ...] = ()
+    """Shelves that things are drawn from: names from `demorec list objects`, or my_package.my_module:MY_SHELF
+    (auto: those of the task, if it draws from shelves)."""
+    object_split: Literal["all", "train", "eval"] = "all"
+    """train leaves out one shape in five of each kind; eval has only those."""
     interject: bool = False
     """The expert first goes for a wrong object and is corrected in words, if the scene has one to mistake."""
     sampling: Literal["random", "sobol", "lhs"] = "random"
@@ -117,7 +122,7 @@ class GenerateConfig:
     @property
     def modules(self) -> tuple[str, ...]:
         """The user's own modules that it names; whoever makes a config of their own words allows them thereby."""
-        return modules_of((self.task, self.robot, *self.cameras))
+        return modules_of((self.task, self.robot, *self.cameras, *self.objects))
 
     def check_names(self, allowed: Iterable[str]) -> None:
         """Raise ConfigError unless all that it names may be loaded.
@@ -131,7 +136,7 @@ class GenerateConfig:
         Raises:
             NotAllowedError: It names something of another module.
         """
-        from demorec.core.tables import CAMERAS, RENDERERS, ROBOTS, TASKS
+        from demorec.core.tables import CAMERAS, OBJECTS, RENDERERS, ROBOTS, TASKS
 
         allowed = tuple(allowed)
         TASKS.check_name(self.task, allowed)
@@ -141,6 +146,8 @@ class GenerateConfig:
             if name == "none":
                 raise ConfigError(f"--cameras none stands alone, found {' '.join(self.cameras)}.")
             CAMERAS.check_name(name, allowed)
+        for name in self.objects:
+            OBJECTS.check_name(name, allowed)
 
     def validate(self) -> None:
         """Check all values that can be judged without loading anything heavy; the config is the user's own words.
@@ -181,7 +188,7 @@ class GenerateConfig:
         self.video.validate()
 
 
-leave_out_defaults(GenerateConfig, "interject")
+leave_out_defaults(GenerateConfig, "interject", "objects", "object_split")
 
 
 @dataclass(frozen=True, kw_only=True)

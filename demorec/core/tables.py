@@ -15,6 +15,7 @@ from demorec.robots.assets import model_name
 if TYPE_CHECKING:
     from demorec.check.base import Check
     from demorec.datasets.options import Exporter
+    from demorec.objects.shelf import Shelf
     from demorec.render import Renderer
     from demorec.render.cameras import CameraPreset
     from demorec.robots.robot import RobotSpec
@@ -38,6 +39,7 @@ TASKS: Registry[type[Task]] = Registry(
         "line_up": "demorec.tasks.line_up:LineUp",
         "pick_from_clutter": "demorec.tasks.pick:PickFromClutter",
         "pick_shapes": "demorec.tasks.pick:PickShapes",
+        "pick_anything": "demorec.tasks.anything:PickAnything",
         "tutorial": "demorec.tasks.tutorial:Tutorial",
     },
     subclass_of="demorec.tasks.base:Task",
@@ -62,6 +64,16 @@ CAMERAS: Registry[CameraPreset] = Registry(
         "workspace": "demorec.render.cameras:WORKSPACE",
     },
     instance_of="demorec.render.cameras:CameraPreset",
+)
+
+OBJECTS: Registry[Shelf] = Registry(
+    kind="shelf",
+    rows={
+        "household": "demorec.objects.household:HOUSEHOLD",
+        "blocks": "demorec.objects.blocks:BLOCKS",
+        "cubes": "demorec.objects.blocks:CUBES",
+    },
+    instance_of="demorec.objects.shelf:Shelf",
 )
 
 RENDERERS: Registry[type[Renderer]] = Registry(

@@ -36,6 +36,7 @@ class Shape:
         scale: mesh and urdf: uniform scale of the file.
         origin: mesh: the point of the file, in its own axes before scaling, that becomes the body's origin.
         y_up: mesh: whether the file's y axis points up (its x axis stays x).
+        mesh: mesh: the solid itself instead of a file, as `demorec.episode.mesh` writes it, with origin and scale.
     """
 
     kind: ShapeKind
@@ -44,6 +45,7 @@ class Shape:
     scale: float = 1.0
     origin: Vector3 = (0.0, 0.0, 0.0)
     y_up: bool = False
+    mesh: str = ""
 
     @property
     def body_from_mesh(self) -> Pose:
@@ -62,6 +64,9 @@ class Shape:
         if self.kind == "capsule":
             return (2 * self.size[0], 2 * self.size[0], self.size[1] + 2 * self.size[0])
         return (self.size[0], self.size[1], self.size[2])
+
+
+leave_out_defaults(Shape, "mesh")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +99,7 @@ class Body:
         lateral_friction, spinning_friction, rolling_friction: Coulomb coefficients, as PyBullet's changeDynamics.
         restitution: 0 (no bounce) .. 1.
         linear_damping, angular_damping: 1/s.
-        rgba: Colour; (1, 1, 1, 1) leaves a URDF's or mesh's own.
+        rgba: Colour; (1, 1, 1, 1) leaves a URDF's or mesh file's own.
         color_name: The word for it in instructions, or "".
         texture: Procedural texture, or None.
         collides: False for a mark that is only seen.

@@ -13,9 +13,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from demorec.core.config import MAX_PIXELS
+from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
 from demorec.core.plain import from_json
 from demorec.episode.info import Camera, EpisodeInfo, Feature
+from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body, Scene, SceneCamera, Shape
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
@@ -135,6 +137,11 @@ def _shape(what: str, shape: Shape) -> Iterator[str]:
         yield from _positive(f"a size of {what}", value)
     if max(map(abs, shape.origin)) > _MAX_METRES:
         yield f"the origin of {what} is far away"
+    if shape.mesh:
+        try:
+            decode_mesh(shape.mesh)
+        except SceneError as error:
+            yield f"the mesh of {what}: {error}"
 
 
 def _camera(camera: SceneCamera) -> Iterator[str]:

@@ -14,7 +14,7 @@ from demorec.core.geometry import Pose
 from demorec.core.plain import digest, to_plain
 from demorec.core.registry import modules_of
 from demorec.core.seeding import Purpose, generator
-from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
+from demorec.core.tables import CAMERAS, OBJECTS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.episode.camera_error import error_values
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
@@ -80,6 +80,9 @@ def load_task(config: GenerateConfig) -> type[Task]:
     task: type[Task] = TASKS.load(config.task, config.modules)
     if config.fixed and not task.has_fixed_layout:
         raise ConfigError(f"--fixed was given, but the task {config.task!r} has no fixed layout: leave it out.")
+    if (config.objects or config.object_split != "all") and not task.shelves:
+        flag = "--objects" if config.objects else "--object-split"
+        raise ConfigError(f"{flag} was given, but the task {config.task!r} has things of its own: leave it out.")
     return task
 
 
@@ -98,7 +101,7 @@ def prepare(plan: EpisodePlan) -> Episode:
     robot = load_robot(config.robot, config.modules)
     task = load_task(config)()
     ranges = resolve(config.variation, config.ranges)
-    scene = task.sample_scene(robot, _sampler(plan, ranges))
+    scene = task.sample_scene(robot, _sampler(plan, ranges, task))
     for module in modules_of([config.task]):
         scene = _with_model_names(scene, module)
     robot = robot.scaled(scene.robot.scale)
@@ -159,14 +162,22 @@ def _with_model_names(scene: Scene, module: str) -> Scene:
     return replace(scene, bodies=tuple(replace(b, shape=s) for b, s in zip(scene.bodies, shapes, strict=True)))
 
 
-def _sampler(plan: EpisodePlan, ranges: Ranges) -> Sampler:
+def _sampler(plan: EpisodePlan, ranges: Ranges, task: Task) -> Sampler:
     config = plan.config
     # Another attempt would only fail at the same point again.
     method = config.sampling if plan.attempt == 0 else "random"
     point = stratified_point(
         method, root_seed=_root_seed(config), episode_index=plan.episode_index, block=config.sampling_block
     )
-    return Sampler(_rng(plan, "scene"), unit_point=point, ranges=ranges, split=config.split, fixed=config.fixed)
+    return Sampler(
+        _rng(plan, "scene"),
+        unit_point=point,
+        ranges=ranges,
+        split=config.split,
+        fixed=config.fixed,
+        shelves=[OBJECTS.load(name, config.modules) for name in config.objects or task.shelves],
+        object_split=config.object_split,
+    )
 
 
 def _miscalibrated(camera: SceneCamera, true_from_recorded: Pose) -> SceneCamera:

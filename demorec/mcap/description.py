@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import SceneError, in_words
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba
-from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.assets import asset_path, mesh_path, surface_file
 from demorec.robots.obj import read_obj
 from demorec.robots.urdf import UrdfShape, parse_xml, quat_from_rpy, read_links
 
@@ -84,7 +84,7 @@ def body_description(body: Body) -> str:
 def _body_primitives(body: Body) -> Iterator[tuple[Primitive, Pose]]:
     shape = body.shape
     if shape.kind == "mesh":
-        for primitive in _mesh_primitives(asset_path(shape.file), (shape.scale,) * 3):
+        for primitive in _mesh_primitives(surface_file(shape), (shape.scale,) * 3):
             yield primitive, shape.body_from_mesh
     elif shape.kind == "urdf":
         path = asset_path(shape.file)

@@ -15,7 +15,7 @@ from demorec.core.errors import SceneError, in_words
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba, Scene
 from demorec.render import Mount, Visual, VisualBody
-from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.assets import asset_path, mesh_path, surface_file
 from demorec.robots.bullet_kinematics import BulletBody, as_told, origin_as_told, standing_as_told
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import read_links
@@ -114,7 +114,7 @@ def _load_body(body: Body) -> tuple[VisualBody, BulletBody | None]:
         link=-1,
         kind=body.shape.kind,
         size=(shape.scale,) * 3 if shape.kind == "mesh" else shape.size,
-        file=str(asset_path(shape.file)) if shape.kind == "mesh" else "",
+        file=str(surface_file(shape)) if shape.kind == "mesh" else "",
         link_from_shape=as_told(shape.body_from_mesh),
         rgba=_in_single(body.rgba),
     )

@@ -8,13 +8,17 @@ a module only if the user has allowed it.
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib.util
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from demorec.core.cache import cache_folder, write_whole
 from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
 from demorec.core.registry import import_root, is_allowed, is_module_name, module_file
+from demorec.episode.mesh import decode_mesh
+from demorec.episode.scene import Shape
 
 OWN_PREFIX = "demorec:"
 
@@ -64,6 +68,33 @@ def asset_path(name: str) -> Path:
             "your own module."
         )
     return path
+
+
+def surface_file(shape: Shape) -> Path:
+    """The file that a mesh is drawn from: its own, or one in the cache of what the recording holds.
+
+    Raises:
+        SceneError: There is no such file, or the recording's mesh is broken; others as `asset_path`.
+    """
+    return _written_mesh(shape.mesh)[0] if shape.mesh else asset_path(shape.file)
+
+
+def collision_file(shape: Shape) -> Path:
+    """The file that a mesh collides as, each of its objects as its convex hull; errors as `surface_file`."""
+    return _written_mesh(shape.mesh)[1] if shape.mesh else asset_path(shape.file)
+
+
+@functools.lru_cache(maxsize=1024)
+def _written_mesh(text: str) -> tuple[Path, Path]:
+    """The surface and the convex parts of a mesh of the scene, as files named after their content."""
+    mesh = decode_mesh(text)
+    folder, digest = cache_folder("objects"), hashlib.sha256(text.encode()).hexdigest()[:32]
+    surface, parts = (folder / f"{digest}{suffix}.obj" for suffix in ("", "_parts"))
+    for path, content in ((surface, mesh.surface_obj()), (parts, mesh.parts_obj())):
+        # What another process has left there may be cut off or edited, and would decide what is recorded.
+        if not path.is_file() or path.read_text() != content:
+            write_whole(path, lambda temporary, content=content: temporary.write_text(content))  # type: ignore[misc]
+    return surface, parts
 
 
 def modules_of_models(names: Iterable[str]) -> tuple[str, ...]:

@@ -15,9 +15,10 @@ import numpy as np
 
 from demorec.core.errors import DemorecError, RenderError, SceneError
 from demorec.core.geometry import Array, Pose
+from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body, Texture
 from demorec.render import Visual, VisualBody, VisualKind
-from demorec.robots.assets import asset_path, mesh_path
+from demorec.robots.assets import asset_path, collision_file, mesh_path, surface_file
 from demorec.robots.inertials import check_masses, with_massless_frames
 from demorec.sim.client import silence
 
@@ -40,18 +41,22 @@ def add_body(client: Any, body: Body) -> int:
     else:
         frame = shape.body_from_mesh
         place = {"FramePosition": frame.position.tolist(), "FrameOrientation": frame.quat_xyzw.tolist()}
-        size, file = shape.size, ""
+        size, file, parts = shape.size, "", ""
         if shape.kind == "mesh":
-            size, file = (shape.scale,) * 3, str(asset_path(shape.file))
+            size = (shape.scale,) * 3
+            file, parts = str(surface_file(shape)), str(collision_file(shape))
         collision = -1
         if body.collides:  # a mesh becomes its convex hull
-            geometry = shape_arguments(client, shape.kind, size, file, length_name="height")
+            geometry = shape_arguments(client, shape.kind, size, parts, length_name="height")
             with silence():  # a mesh may be warned of
                 collision = client.createCollisionShape(**geometry, **{f"collision{k}": v for k, v in place.items()})
         geometry = shape_arguments(client, shape.kind, size, file)
         placed = {f"visual{k}": v for k, v in place.items()}
         visual = client.createVisualShape(**geometry, **placed, rgbaColor=body.rgba)
         index = client.createMultiBody(body.mass, collision, visual, pose.position.tolist(), pose.quat_xyzw.tolist())
+        if shape.mesh and body.movable:  # PyBullet takes the moments of the bounding box
+            inertia = body.mass * shape.scale**2 * decode_mesh(shape.mesh).mass_properties()[2]
+            client.changeDynamics(index, -1, localInertiaDiagonal=inertia.tolist())
     for link in range(-1, client.getNumJoints(index)):
         client.changeDynamics(
             index,

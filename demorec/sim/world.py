@@ -85,7 +85,7 @@ class World:
         self.joint_samples = ()
         self._shape_rows, self._visuals = (), ()
         self.client.resetSimulation()
-        _set_engine(self.client, scene.physics)
+        set_engine(self.client, scene.physics)
         self._bodies: dict[str, int] = {}
         self._specs: dict[str, Body] = {body.name: body for body in scene.bodies}
         for body in scene.fixed:
@@ -262,7 +262,7 @@ class World:
             )
 
 
-def _set_engine(client: Any, physics: Physics) -> None:
+def set_engine(client: Any, physics: Physics) -> None:
     """Set every engine parameter, those at their default value too: some survive resetSimulation."""
     client.setGravity(*physics.gravity)
     client.setPhysicsEngineParameter(

@@ -30,6 +30,8 @@ class Task(ABC):
     """One line for `demorec list tasks`."""
     has_fixed_layout: ClassVar[bool] = False
     """Whether `--fixed` gives one exact layout instead of a random one."""
+    shelves: ClassVar[tuple[str, ...]] = ()
+    """Rows of `OBJECTS` that it draws from unless --objects names others; empty: it has its own things."""
     camera_presets: ClassVar[Mapping[str, CameraPreset]] = {}
     """Camera name -> preset in place of the table's, for a scene that the usual view misses."""
 

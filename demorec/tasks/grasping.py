@@ -8,7 +8,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, wrap_angle
-from demorec.episode.scene import Body, yaw_of
+from demorec.episode.scene import Body, Shape, yaw_of
+from demorec.objects.antipodal import Grasp, Hand, antipodal_grasps, standing_rotation
 from demorec.robots.motion import angle_between
 from demorec.robots.robot import RobotSpec
 from demorec.tasks.script import Behaviour
@@ -20,6 +21,8 @@ _PALM = (0.035, 0.11)
 _UP = np.array([0.0, 0.0, 1.0])
 _GAP = 0.005
 """Air between the hand and what it shall not touch, metres."""
+_COST_OF_TURNING = 0.1
+"""Of a radian that the hand turns, in the unit of `demorec.objects.antipodal.Grasp.cost`."""
 ABOVE_M, ABOVE_RAD = 0.01, 0.35
 """How far the hand may be beside where it is going to be lowered to, so that it need not rise and come again."""
 
@@ -96,6 +99,8 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
         robot: Whose hand it is.
         behaviour: How it is done.
     """
+    if body.shape.mesh:
+        return [_perturbed(grasp, behaviour) for grasp in _grasps_of_mesh(body, pose, now=now, robot=robot)]
     gripper, half = robot.gripper, resting_half_height(body, pose)
     top, bottom = pose.position[2] + half, pose.position[2] - half
     # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
@@ -107,6 +112,53 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
         x, y = pose.position[:2] - gripper.object_offset(2 * half_extent(body, pose, across)) * across[:2]
         found.append(_perturbed(hand_down((x, y, z), yaw), behaviour))
     return found
+
+
+def found_grasps(shape: Shape, robot: RobotSpec, up: Array) -> tuple[Grasp, ...]:
+    """The grasps of a solid that stands with the direction `up` (3,) of its own axes upward, best first."""
+    gripper = robot.gripper
+    hand = Hand(
+        max_width=gripper.max_width,
+        finger_depth=gripper.finger_depth,
+        palm_clearance=gripper.palm_clearance,
+        tip_clearance=0.005 * robot.task_scale,
+    )
+    x, y, z = np.round(up, 2).tolist()
+    length = math.hypot(x, y, z)
+    return antipodal_grasps(shape.mesh, hand, scale=shape.scale, up=(x / length, y / length, z / length))
+
+
+def _grasps_of_mesh(body: Body, pose: Pose, *, now: float, robot: RobotSpec) -> list[Pose]:
+    """The same for a solid, by their cost and how far the hand has to turn."""
+    up = pose.rotation[2]
+    found = found_grasps(body.shape, robot, up)
+    x, y, z = up.tolist()
+    turned = pose.rotation @ standing_rotation((x, y, z)).T
+    heading = math.atan2(turned[1, 0], turned[0, 0])
+    cos, sin = math.cos(heading), math.sin(heading)
+    grasps: list[tuple[float, Pose]] = []
+    for grasp in found:
+        for yaw in symmetric_yaws(heading + grasp.yaw, 2):
+            across = hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
+            offset = np.array([cos * grasp.x - sin * grasp.y, sin * grasp.x + cos * grasp.y, grasp.z])
+            place = pose.position + offset - robot.gripper.object_offset(grasp.width) * across
+            grasps.append((grasp.cost + _COST_OF_TURNING * abs(wrap_angle(yaw - now)), hand_down(place, yaw)))
+    return [grasp for _, grasp in sorted(grasps, key=lambda entry: entry[0])]
+
+
+def clear_first(grasps: Sequence[Pose], others: Sequence[tuple[Body, Pose]], robot: RobotSpec) -> list[Pose]:
+    """Grasps `world_from_tcp` in their order, but those at which the open hand would touch another body last."""
+    return sorted(grasps, key=lambda grasp: not all(_is_clear(grasp, other, at, robot) for other, at in others))
+
+
+def _is_clear(hand: Pose, body: Body, pose: Pose, robot: RobotSpec) -> bool:
+    """Whether the open hand, pointing down at `world_from_tcp`, touches nothing of a body."""
+    tips, palm = hand.position[2] - robot.gripper.finger_depth, hand.position[2] + robot.gripper.palm_clearance
+    return (
+        _is_lower(body, pose, tips)
+        or (_is_beside(hand, _FINGERS, body, pose) and _is_lower(body, pose, palm))
+        or _is_beside(hand, _PALM, body, pose)
+    )
 
 
 def _perturbed(grasp: Pose, behaviour: Behaviour) -> Pose:
@@ -154,18 +206,12 @@ def grasps_beside(
     distance = max(abs(x), half_extent(body, pose, hand_x) + _FINGERS[0] + _GAP)
     offset = robot.gripper.object_offset(2 * half_extent(body, pose, hand_y))
     centre = np.array([*(pose.position - offset * hand_y)[:2], grasp.position[2]])
-    tips, palm = grasp.position[2] - robot.gripper.finger_depth, grasp.position[2] + robot.gripper.palm_clearance
     found = []
     for side in (1.0, -1.0):
         missed = Pose(
             position=centre + side * math.copysign(distance, x) * hand_x + y * hand_y, quat_xyzw=grasp.quat_xyzw
         )
-        if all(
-            _is_lower(other, at, tips)
-            or (_is_beside(missed, _FINGERS, other, at) and _is_lower(other, at, palm))
-            or _is_beside(missed, _PALM, other, at)
-            for other, at in others
-        ):
+        if all(_is_clear(missed, other, at, robot) for other, at in others):
             found.append(missed)
     return found
 

@@ -14,6 +14,7 @@ from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
 from demorec.episode.variation import PRESETS, Ranges
+from demorec.objects.shelf import Shelf, Split
 
 MAX_TRIES = 1000
 STRATIFIED_NUMBERS = 12
@@ -70,6 +71,8 @@ class Sampler:
         ranges: Resolved ranges of the run, for what `named` draws and for the initial joints.
         split: "train" keeps every point out of the held-out rectangle, "eval" puts the first one into it.
         fixed: Whether the task's exact layout is wanted, of those that have one.
+        shelves: What things are drawn from, for tasks that draw from shelves.
+        object_split: Which of their shapes: `demorec.objects.shelf.Split`.
         is_free: Whether something may lie at a point (x, y), beside what a caller of `point` accepts.
     """
 
@@ -78,6 +81,8 @@ class Sampler:
     ranges: Ranges = PRESETS["mild"]
     split: Literal["all", "train", "eval"] = "all"
     fixed: bool = False
+    shelves: Sequence[Shelf] = ()
+    object_split: Split = "all"
     is_free: Callable[[tuple[float, float]], bool] = lambda point: True
     _used: int = field(default=0, init=False)
     _points: int = field(default=0, init=False)

@@ -15,11 +15,12 @@ import numpy as np
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
-from demorec.episode.scene import Goal
+from demorec.episode.scene import Body, Goal
 from demorec.robots.kinematics import WHOLE_POSE
 from demorec.robots.motion import MotionLimits, plan_straight
 from demorec.sim.world import World
 from demorec.tasks.grasping import (
+    clear_first,
     grasps_beside,
     grasps_of,
     hand_down,
@@ -249,11 +250,10 @@ class Expert:
         if self._missing:
             world, x, y = self.world, self.behaviour.miss_x, self.behaviour.miss_y
             body, pose = world.body(name), world.pose(name)
-            others = [(other, world.pose(other.name)) for other in world.scene.bodies if other.name != name]
             beside = (
                 missed
                 for grasp in self.grasps(name)
-                for missed in grasps_beside(grasp, body, pose, x=x, y=y, others=others, robot=world.robot)
+                for missed in grasps_beside(grasp, body, pose, x=x, y=y, others=self._others(name), robot=world.robot)
             )
             found = self.first_reachable(beside, above_by)
             self._missing = self._has_missed = found is not None
@@ -382,7 +382,15 @@ class Expert:
         """Grasp poses `world_from_tcp` of an object with the behaviour's errors."""
         world = self.world
         body, pose = world.body(name), world.pose(name)
-        return grasps_of(body, pose, now=hand_yaw(self.tcp()), robot=world.robot, behaviour=self.behaviour)
+        grasps = grasps_of(body, pose, now=hand_yaw(self.tcp()), robot=world.robot, behaviour=self.behaviour)
+        if body.shape.mesh:
+            grasps = clear_first(grasps, self._others(name), world.robot)
+        return grasps
+
+    def _others(self, name: str) -> list[tuple[Body, Pose]]:
+        """All bodies but one, and their poses."""
+        world = self.world
+        return [(other, world.pose(other.name)) for other in world.scene.bodies if other.name != name]
 
     def _place_pose(self, goal: Goal, *, keep_yaw: bool = False) -> Pose:
         """`world_from_tcp` that puts the held object at its goal, with the offset in the hand compensated.

@@ -38,6 +38,11 @@ def tilt_of(pose: Pose) -> float:
     return math.acos(min(1.0, float(np.abs(pose.rotation[2]).max())))
 
 
+def lean_of(pose: Pose) -> float:
+    """Angle, rad, between the vertical and the body's z axis."""
+    return math.acos(max(-1.0, min(1.0, float(pose.rotation[2, 2]))))
+
+
 def at_most(name: str, value: float, limit: float, unit: str) -> SuccessCheck:
     """A check that holds when value <= limit."""
     return SuccessCheck(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value <= limit))
@@ -72,7 +77,8 @@ def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DIST
         at_most(f"distance_to_goal{suffix}", math.dist(pose.position[:2], wanted.position[:2]), max_distance, "m"),
         at_most(f"height_error{suffix}", abs(pose.position[2] - height), MAX_HEIGHT_ERROR, "m"),
         at_least(f"on_support{suffix}", on_support(world, goal.object, goal.onto), 1.0, ""),
-        at_most(f"tilt{suffix}", tilt_of(pose), MAX_TILT, "rad"),
+        # A box may rest on any face, a bottle may not.
+        at_most(f"tilt{suffix}", lean_of(pose) if body.shape.mesh else tilt_of(pose), MAX_TILT, "rad"),
         at_most(f"speed{suffix}", math.hypot(*linear.tolist()), MAX_SPEED, "m/s"),
         at_most(f"spin{suffix}", math.hypot(*angular.tolist()), MAX_SPIN, "rad/s"),
         at_most(f"touched_by_robot{suffix}", world.touches_robot(goal.object), 0.0, ""),

@@ -16,7 +16,7 @@ from demorec.core.errors import DemorecError, as_reason
 from demorec.core.geometry import Array, Pose, quat_multiply
 from demorec.episode.scene import Body, Rgba, Scene, Shape, Texture
 from demorec.render.procedural import texture_pixels
-from demorec.robots.assets import asset_path
+from demorec.robots.assets import asset_path, surface_file
 from demorec.robots.urdf import Urdf, UrdfJoint
 from demorec.view.episode import PlayedEpisode
 from demorec.view.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, skeleton_meshes, sphere_mesh, urdf_meshes
@@ -101,9 +101,9 @@ def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
 
 
 def _model_mesh(shape: Shape) -> SurfaceMesh:
-    path = asset_path(shape.file)
     if shape.kind == "mesh":
-        return mesh_file(path).placed(shape.body_from_mesh, np.full(3, shape.scale), _OWN_COLOR)
+        return mesh_file(surface_file(shape)).placed(shape.body_from_mesh, np.full(3, shape.scale), _OWN_COLOR)
+    path = asset_path(shape.file)
     text = path.read_text()
     poses = Urdf.parse(text, scale=shape.scale).link_poses({})
     links = urdf_meshes(text, path.parent, shape.scale)

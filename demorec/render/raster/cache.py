@@ -1,68 +1,18 @@
-"""Decimated meshes and compiled code, kept between runs in the user's cache folder, which several processes share."""
+"""Decimated meshes, kept between runs in the user's cache folder."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import logging
-import os
-import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 
+from demorec.core.cache import cache_folder, folder_lock, write_whole
 from demorec.render.raster.mesh import RasterMesh
-
-
-def cache_folder(*parts: str) -> Path:
-    """A folder below the user's cache folder, created when missing; `DEMOREC_CACHE` moves it elsewhere."""
-    root = os.environ.get("DEMOREC_CACHE") or platformdirs.user_cache_dir("demorec", appauthor=False)
-    folder = Path(root).joinpath(*parts)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        # A home that cannot be written to (containers): work goes on, and is lost with the temporary folder.
-        folder = Path(tempfile.gettempdir()).joinpath(f"demorec-{os.getuid()}", *parts)
-        folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then move it there: readers see all of it or nothing."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        write(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold a lock between processes for as long as the context lasts; the system frees it if the process dies.
-
-    A folder that cannot be written to is not locked: nothing will be kept in it.
-    """
-    import fcntl
-
-    try:
-        file = (folder / "lock").open("a")
-    except OSError:
-        yield
-        return
-    with file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            fcntl.flock(file, fcntl.LOCK_UN)
-
 
 log = logging.getLogger(__name__)
 _SOURCES = ("mesh.py", "mesh_files.py", "decimate.py", "textures.py")

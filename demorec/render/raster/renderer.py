@@ -9,12 +9,12 @@ from typing import Self
 
 import numpy as np
 
+from demorec.core.cache import folder_lock
 from demorec.core.geometry import Array, Pose, look_at
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import Light, SceneCamera, Texture
 from demorec.render import RenderSetup, Visual, VisualBody, VisualKind, check_setup, world_from_camera
 from demorec.render.raster.batch import Batch, make_batch
-from demorec.render.raster.cache import folder_lock
 from demorec.render.raster.canvas import Canvas
 from demorec.render.raster.kernels.jit import compiled_folder
 from demorec.render.raster.shapes import Instance, ModelStore, make_instances

@@ -12,7 +12,7 @@ import llvmlite.binding
 import numba
 import numpy as np
 
-from demorec.render.raster.cache import cache_folder
+from demorec.core.cache import cache_folder
 
 # Only flags that change no finite result: pictures are equal whatever vector width a CPU has. `contract`, `arcp` and
 # `reassoc` are left out on purpose.

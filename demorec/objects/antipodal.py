@@ -1,0 +1,162 @@
+"""Where a gripper that comes from above takes hold of a solid, from its mesh alone.
+
+Points are drawn from the surface where it is steep; at each one the fingers close along its normal. What they would
+touch first is looked up in a cloud of surface points, within the strip that a finger's pad sweeps: both contacts have
+to face the fingers (friction holds nothing steeper), across a width that fits, with no other part of the solid where
+the open fingers come down or where the palm is.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.episode.mesh import SolidMesh, decode_mesh
+
+CANDIDATES, CLOUD = 300, 3000
+KEPT = 40
+"""Grasps, the best of all."""
+PAD = 0.010
+"""Half the width of a finger's pad, metres."""
+FINGER = 0.015
+"""Half the width of a finger, and what it has to be clear of, metres."""
+PAD_ABOVE = 0.010
+"""How far the pad reaches above the TCP, metres."""
+_SKIN = 0.0015
+"""Surface points that are so near to the outermost one touch the finger, metres."""
+LEAST_FACING = math.cos(math.radians(25.0))
+"""Cosine of the angle between a finger's motion and what it touches, in the mean."""
+LEAST_WIDTH, PLAY = 0.015, 0.01
+"""Metres: of what is gripped (the expert takes less for nothing), and how much narrower than the opening it is."""
+_STEEP = 0.5
+"""Largest vertical part of the normal where a finger may touch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hand:
+    """What of a gripper decides what it can grasp; lengths in metres as of `demorec.robots.robot.ParallelGripper`.
+
+    Attributes:
+        max_width: Full opening.
+        finger_depth: From the TCP to the finger tips.
+        palm_clearance: From the TCP back to the palm.
+        tip_clearance: Air between the finger tips and the support.
+    """
+
+    max_width: float
+    finger_depth: float
+    palm_clearance: float
+    tip_clearance: float = 0.005
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grasp:
+    """One grasp, relative to the solid's origin; x, y, yaw in axes that turn with it about the vertical.
+
+    Attributes:
+        x, y, z: Where the TCP is to be, metres.
+        yaw: Angle, rad, of the hand's x axis, which runs along the pads; the fingers close across it.
+        width: Between the contacts, metres.
+        cost: Smaller is better.
+    """
+
+    x: float
+    y: float
+    z: float
+    yaw: float
+    width: float
+    cost: float
+
+
+@functools.lru_cache(maxsize=256)
+def antipodal_grasps(text: str, hand: Hand, *, scale: float = 1.0, up: tuple[float, float, float]) -> tuple[Grasp, ...]:
+    """The best grasps of a solid with the hand pointing down, best first; none when nothing fits.
+
+    Args:
+        text: As of `Shape.mesh`.
+        hand: The gripper.
+        scale: Of the solid.
+        up: The world's vertical in the solid's axes.
+    """
+    mesh = decode_mesh(text)
+    points, normals = _surface(mesh, CLOUD)
+    standing = standing_rotation(up)
+    points, normals = _turned(standing, scale * points), _turned(standing, normals)
+    steep = np.flatnonzero(np.abs(normals[:, 2]) < _STEEP)
+    chosen = steep[:: max(1, len(steep) // CANDIDATES)]
+    found = [_grasp(points, normals, row, hand) for row in chosen.tolist()]
+    best = sorted((grasp for grasp in found if grasp is not None), key=lambda grasp: grasp.cost)
+    return tuple(best[:KEPT])
+
+
+def standing_rotation(up: tuple[float, float, float]) -> Array:
+    """(3, 3) the smallest rotation that turns a direction of the solid (of unit length) into the vertical."""
+    x, y, z = up
+    if z < -0.999:
+        return np.diag([1.0, -1.0, -1.0])
+    share = 1.0 / (1.0 + z)
+    return np.array([[1 - share * x * x, -share * x * y, -x], [-share * x * y, 1 - share * y * y, -y], [x, y, z]])
+
+
+def _grasp(points: Array, normals: Array, row: int, hand: Hand) -> Grasp | None:
+    """The grasp that closes along the normal at a point of the cloud; None when it does not hold or fit."""
+    length = math.hypot(*normals[row, :2].tolist())
+    across = normals[row, :2] / -length  # (2,) in the direction of which the first finger moves
+    along = np.array([across[1], -across[0]])  # x of a hand that points down, its y being `across`
+    u = points[:, 0] * along[0] + points[:, 1] * along[1]
+    v = points[:, 0] * across[0] + points[:, 1] * across[1]
+    w, at = points[:, 2], float(points[row, 2])
+    low = float(w.min()) + hand.finger_depth + hand.tip_clearance
+    z = max(at, low, float(w.max()) - (hand.palm_clearance - 0.007))
+    if at < z - hand.finger_depth + 0.002:
+        return None  # the pads end above it
+    middle = float(u[row])
+    pad = (np.abs(u - middle) < PAD) & (w > z - hand.finger_depth) & (w < z + PAD_ABOVE)
+    first, last = float(v[pad].min()), float(v[pad].max())
+    width, centre = last - first, (first + last) / 2
+    if not LEAST_WIDTH <= width <= hand.max_width - PLAY:
+        return None
+    swept = (np.abs(u - middle) < FINGER) & (w > z - hand.finger_depth - hand.tip_clearance / 2)
+    if float(np.abs(v[swept] - centre).max()) > hand.max_width / 2 - 0.003:
+        return None  # a finger would come down on it
+    facing = normals[:, 0] * across[0] + normals[:, 1] * across[1]
+    near, far = pad & (v < first + _SKIN), pad & (v > last - _SKIN)
+    least = min(-float(facing[near].mean()), float(facing[far].mean()))
+    if least < LEAST_FACING:
+        return None
+    apart = max(abs(float(u[side].mean()) - middle) for side in (near, far))
+    height = max(float(w[near].mean()), float(w[far].mean()))
+    # Off the centre of mass it turns about the fingers when it is lifted; below it, it may topple.
+    off = math.hypot(middle, centre)
+    tight = max(0.0, width - hand.max_width + 0.02)
+    cost = 4 * (1 - least) + 60 * off + 60 * apart + 10 * max(0.0, -height) + 20 * tight
+    x, y = (middle * along + centre * across).tolist()
+    return Grasp(x=x, y=y, z=z, yaw=math.atan2(along[1], along[0]), width=width, cost=cost)
+
+
+@functools.lru_cache(maxsize=2)
+def _shares(count: int) -> tuple[Array, Array]:
+    """(count,) and (count, 2) random numbers in 0..1, always the same."""
+    rng = np.random.default_rng(0)
+    return np.sort(rng.uniform(size=count)), rng.uniform(size=(count, 2))
+
+
+def _surface(mesh: SolidMesh, count: int) -> tuple[Array, Array]:
+    """(count, 3) points spread evenly over the surface, and the unit normals there."""
+    a, b, c = (mesh.points[mesh.faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    double = np.sqrt((normals * normals).sum(axis=1))
+    total = np.cumsum(double)
+    places, share = _shares(count)
+    rows = np.minimum(np.searchsorted(total, places * total[-1]), len(total) - 1)
+    share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
+    points = a[rows] + share[:, :1] * (b - a)[rows] + share[:, 1:] * (c - a)[rows]
+    return points, normals[rows] / double[rows, np.newaxis]
+
+
+def _turned(rotation: Array, vectors: Array) -> Array:
+    return np.stack([sum(row[axis] * vectors[:, axis] for axis in range(3)) for row in rotation], axis=1)

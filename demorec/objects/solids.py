@@ -1,0 +1,151 @@
+"""Closed meshes from a few numbers: turned on a lathe, cut from a board, bent from a rod; each with its convex parts.
+
+Angles come from `math`, and points are rounded to what a recording stores, so that the same numbers give the same mesh
+on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.episode.mesh import SolidMesh
+
+Point2 = tuple[float, float]
+
+
+def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = (), sides: int = 24) -> SolidMesh:
+    """A solid of revolution about z.
+
+    Args:
+        profile: (radius, z) of the outside from below to above, metres; radius 0 at an end is a point on the axis.
+        cavity: The same of the inside of a vessel, from the rim down to its floor. As physics has it, it is filled:
+            fingers that cannot grip a wall do not go in.
+        sides: Of each ring.
+    """
+    points: list[tuple[float, float, float]] = []
+    rings: list[list[int]] = []
+    for radius, z in (*profile, *cavity):
+        around = [2 * math.pi * k / sides for k in range(sides)] if radius > 0 else [0.0]
+        rings.append(list(range(len(points), len(points) + len(around))))
+        points += [(radius * math.cos(a), radius * math.sin(a), z) for a in around]
+    faces = [face for below, above in pairwise(rings) for face in _band(below, above)]
+    parts = [[row for ring in rings[first : last + 1] for row in ring] for first, last in _convex_runs(profile)]
+    return _solid(points, _with_ends(faces, rings[0], rings[-1]), parts)
+
+
+def board(
+    outline: Sequence[Point2], pieces: Sequence[Sequence[int]], depth: float, *, upright: bool = False
+) -> SolidMesh:
+    """A flat shape of even depth.
+
+    Args:
+        outline: (x, y) corners, counter-clockwise, metres.
+        pieces: Rows of `outline`, counter-clockwise, of convex pieces that make it up.
+        depth: Along z, metres; with `upright` along y, the outline's y being up.
+        upright: Whether it stands on an edge of the outline instead of lying flat.
+    """
+    n = len(outline)
+    if upright:
+        points = [(x, side * depth / 2, z) for side in (1, -1) for x, z in outline]
+    else:
+        points = [(x, y, side * depth / 2) for side in (-1, 1) for x, y in outline]
+    faces = _band(list(range(n)), list(range(n, 2 * n)))
+    for piece in pieces:
+        for a, b in pairwise(piece[1:]):
+            faces += [(piece[0], b, a), (piece[0] + n, a + n, b + n)]
+    return _solid(points, faces, [[row + end for row in piece for end in (0, n)] for piece in pieces])
+
+
+def rod(
+    path: Sequence[tuple[float, float, float]], radii: Sequence[float], up: Sequence[float], *, sides: int = 10
+) -> SolidMesh:
+    """A bent rod of round section, its ends flat; each stretch is one convex part.
+
+    Args:
+        path: (x, y, z) of its axis, metres, in one plane.
+        radii: At each point, metres.
+        up: (3,) unit normal of that plane.
+    """
+    axis, normal = np.array(path), np.array(up)
+    points: list[tuple[float, float, float]] = []
+    for row, radius in enumerate(radii):
+        along = axis[min(row + 1, len(axis) - 1)] - axis[max(row - 1, 0)]
+        side = np.cross(normal, along / math.sqrt(float((along * along).sum())))
+        for k in range(sides):
+            angle = 2 * math.pi * k / sides
+            x, y, z = (axis[row] + radius * (math.cos(angle) * side + math.sin(angle) * normal)).tolist()
+            points.append((x, y, z))
+    rings = [list(range(sides * row, sides * (row + 1))) for row in range(len(axis))]
+    faces = [face for below, above in pairwise(rings) for face in _band(below, above)]
+    parts = [[*below, *above] for below, above in pairwise(rings)]
+    return _solid(points, _with_ends(faces, rings[0], rings[-1]), parts)
+
+
+def joined(*solids: SolidMesh) -> SolidMesh:
+    """Several solids as one; where they overlap, they count twice."""
+    starts = np.cumsum([0, *(len(solid.points) for solid in solids)]).tolist()
+    return SolidMesh(
+        points=np.concatenate([solid.points for solid in solids]),
+        faces=np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=False)]),
+        parts=tuple(part + start for solid, start in zip(solids, starts, strict=False) for part in solid.parts),
+    )
+
+
+Face = tuple[int, int, int]
+
+
+def _solid(points: Sequence[Sequence[float]], faces: Sequence[Face], parts: Sequence[Sequence[int]]) -> SolidMesh:
+    made = SolidMesh(
+        points=np.array(points, dtype=np.float64),
+        faces=np.array(faces, dtype=np.int64),
+        parts=tuple(np.array(part, dtype=np.int64) for part in parts),
+    )
+    return made.moved(np.eye(3), np.zeros(3))  # rounded
+
+
+def _band(below: Sequence[int], above: Sequence[int]) -> list[Face]:
+    """Faces between two rings that run counter-clockwise seen from above; one of them may be a single point."""
+    n = max(len(below), len(above))
+    faces: list[Face] = []
+    for k in range(n):
+        a, b = below[k % len(below)], below[(k + 1) % len(below)]
+        c, d = above[k % len(above)], above[(k + 1) % len(above)]
+        if a != b:
+            faces.append((a, b, d))
+        if c != d:
+            faces.append((a, d, c))
+    return faces
+
+
+def _with_ends(faces: list[Face], first: Sequence[int], last: Sequence[int]) -> list[Face]:
+    """The faces and those of flat ends."""
+    lower = [(first[0], b, a) for a, b in pairwise(first[1:])]
+    return faces + lower + [(last[0], a, b) for a, b in pairwise(last[1:])]
+
+
+def _convex_runs(profile: Sequence[Point2]) -> list[tuple[int, int]]:
+    """First and last rows of the stretches of a profile whose solids of revolution are convex, in order."""
+    runs, first = [], 0
+    for row in range(1, len(profile) - 1):
+        (r0, z0), (r1, z1), (r2, z2) = profile[row - 1 : row + 2]
+        if row > first and (r1 - r0) * (z2 - z1) - (z1 - z0) * (r2 - r1) < -1e-9:
+            runs.append((first, row))
+            first = row
+    return [*runs, (first, len(profile) - 1)]
+
+
+def arc(centre: Point2, radius: float, start: float, end: float, count: int) -> NDArray[np.float64]:
+    """(count, 2) points of a circle's arc between two angles, rad, both ends among them."""
+    angles = [start + (end - start) * k / (count - 1) for k in range(count)]
+    return np.array([(centre[0] + radius * math.cos(a), centre[1] + radius * math.sin(a)) for a in angles])
+
+
+def rounded(points: Array) -> list[Point2]:
+    """Rows of (n, 2) as pairs."""
+    return [(x, y) for x, y in points.tolist()]

@@ -1,0 +1,179 @@
+"""Shelves of things, the meshes that recordings hold, how things rest and where they are grasped."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+import trimesh
+from support.commands import exit_code
+from support.sim import episode
+
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.tables import OBJECTS
+from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
+from demorec.objects.antipodal import Hand, antipodal_grasps
+from demorec.objects.shelf import Kind
+from demorec.sim.resting import at_rest
+
+PANDA_HAND = Hand(max_width=0.08, finger_depth=0.007, palm_clearance=0.035)
+UP = (0.0, 0.0, 1.0)
+KINDS = {kind.noun: kind for name in OBJECTS.names() for kind in OBJECTS.load(name).kinds}
+
+
+def as_trimesh(mesh: SolidMesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(vertices=mesh.points, faces=mesh.faces, process=False)
+
+
+def block(x: float, y: float, z: float) -> SolidMesh:
+    box = trimesh.creation.box(extents=(x, y, z))
+    return SolidMesh(points=np.array(box.vertices), faces=np.array(box.faces), parts=(np.arange(8),))
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
+def test_each_shape_is_a_closed_solid_that_physics_has_as_it_is_drawn(kind: Kind) -> None:
+    for number in range(0, kind.count, 6):
+        mesh = kind.shape(number)
+        assert mesh.is_closed()
+        surface = as_trimesh(mesh)
+        assert surface.is_watertight
+        assert surface.volume > 0
+        parts = [trimesh.convex.convex_hull(mesh.points[part]) for part in mesh.parts]
+        outside = trimesh.util.concatenate(parts).bounds - surface.bounds
+        assert np.abs(outside).max() < 1e-6
+        filled = sum(part.volume for part in parts)
+        if kind.noun not in ("mug", "glass", "bowl"):  # whose insides are filled
+            assert filled == pytest.approx(surface.volume, rel=0.02)
+
+
+@pytest.mark.parametrize("noun", ["bottle", "corner", "banana"])
+def test_mass_properties_are_those_of_the_mesh(noun: str) -> None:
+    mesh = KINDS[noun].shape(3)
+    other = as_trimesh(mesh)
+    volume, centre, moments = mesh.mass_properties()
+    assert volume == pytest.approx(other.volume)
+    np.testing.assert_allclose(centre, other.center_mass, atol=1e-9)
+    np.testing.assert_allclose(moments * other.mass, np.diag(other.moment_inertia), rtol=1e-6)
+    np.testing.assert_allclose(mesh.centred().mass_properties()[1], 0.0, atol=1e-5)
+
+
+def test_shapes_differ_and_held_out_ones_are_no_others() -> None:
+    for kind in KINDS.values():
+        texts = [encode_mesh(kind.shape(number)) for number in range(kind.count)]
+        assert len(set(texts)) == kind.count, kind.noun
+        assert texts[1] == encode_mesh(kind.shape(1))
+        train, held_out = set(kind.numbers("train")), set(kind.numbers("eval"))
+        assert not train & held_out
+        assert train | held_out == set(kind.numbers("all"))
+        assert len(held_out) == kind.count // 5
+
+
+def test_a_mesh_comes_back_from_its_text_and_a_broken_one_is_refused() -> None:
+    mesh = KINDS["mug"].shape(0)
+    text = encode_mesh(mesh)
+    back = decode_mesh(text)
+    assert np.array_equal(back.points, mesh.points)
+    assert np.array_equal(back.faces, mesh.faces)
+    assert all(np.array_equal(a, b) for a, b in zip(back.parts, mesh.parts, strict=True))
+    data = base64.b64decode(text)
+    wrong_row = bytearray(data)
+    wrong_row[12 + 6 * len(mesh.points) : 14 + 6 * len(mesh.points)] = b"\xff\xfe"
+    for broken in (data[:-1], data[:8], b"", b"\xff" * 40, bytes(wrong_row)):
+        with pytest.raises(SceneError, match="broken"):
+            decode_mesh(base64.b64encode(broken).decode())
+    with pytest.raises(SceneError, match="broken"):
+        decode_mesh("no base64 at all")
+    with pytest.raises(SceneError, match="reaches"):
+        encode_mesh(block(0.7, 0.1, 0.1))
+
+
+def test_a_mesh_without_a_face_or_with_one_turned_round_is_open() -> None:
+    mesh = block(0.04, 0.04, 0.04)
+    assert mesh.is_closed()
+    turned = np.concatenate([mesh.faces[:1, ::-1], mesh.faces[1:]])
+    for faces in (mesh.faces[1:], turned):
+        assert not SolidMesh(points=mesh.points, faces=faces, parts=mesh.parts).is_closed()
+
+
+def test_things_come_to_rest_as_they_stand_and_what_is_balanced_falls() -> None:
+    text, height = at_rest(encode_mesh(block(0.03, 0.05, 0.04)))
+    np.testing.assert_allclose(decode_mesh(text).extents, (0.03, 0.05, 0.04), atol=2e-5)
+    assert height == pytest.approx(0.02, abs=1.5e-3)
+    half = math.sqrt(0.5)
+    on_edge = block(0.03, 0.05, 0.04).moved(np.array([[1, 0, 0], [0, half, -half], [0, half, half]]), np.zeros(3))
+    text, height = at_rest(encode_mesh(on_edge))
+    assert sorted(decode_mesh(text).extents.tolist()) == pytest.approx([0.03, 0.04, 0.05], abs=3e-4)
+    assert min(abs(height - half_side) for half_side in (0.02, 0.025)) < 1.5e-3
+
+
+def test_a_box_is_grasped_across_the_side_that_fits_and_not_by_its_edges() -> None:
+    grasps = antipodal_grasps(encode_mesh(block(0.09, 0.03, 0.03)), PANDA_HAND, up=UP)
+    assert grasps
+    for grasp in grasps:
+        assert abs(math.sin(grasp.yaw)) < 0.02  # the hand's x axis along the long side
+        assert grasp.width == pytest.approx(0.03, abs=1e-3)
+    best = grasps[0]
+    assert math.hypot(best.x, best.y) < 4e-3
+    assert not antipodal_grasps(encode_mesh(block(0.09, 0.075, 0.03)), PANDA_HAND, up=UP)
+
+
+def test_a_grasp_follows_the_direction_that_is_up() -> None:
+    text = encode_mesh(block(0.09, 0.03, 0.05))
+    (best, *_) = antipodal_grasps(text, PANDA_HAND, up=(0.0, 1.0, 0.0))  # lies on its side: 0.05 across now
+    assert best.width == pytest.approx(0.05, abs=1e-3)
+
+
+def test_what_sticks_out_where_a_finger_would_come_down_forbids_the_grasp() -> None:
+    """A post is grasped, but not below a plate on it that is nearly as wide as the hand opens."""
+    post, plate = trimesh.creation.box(extents=(0.03, 0.03, 0.04)), trimesh.creation.box(extents=(0.076, 0.076, 0.01))
+    plate.apply_translation((0.0, 0.0, 0.025))
+    both = SolidMesh(
+        points=np.concatenate([post.vertices, plate.vertices]),
+        faces=np.concatenate([post.faces, plate.faces + 8]),
+        parts=(np.arange(8), np.arange(8, 16)),
+    )
+    assert antipodal_grasps(encode_mesh(block(0.03, 0.03, 0.04)), PANDA_HAND, up=UP)
+    assert not antipodal_grasps(encode_mesh(both), PANDA_HAND, up=UP)
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
+def test_each_kind_has_grasps_for_the_usual_hand(kind: Kind) -> None:
+    for number in range(0, kind.count, 8):
+        text, _ = at_rest(encode_mesh(kind.shape(number)))
+        assert antipodal_grasps(text, PANDA_HAND, up=UP), f"{kind.noun} {number}"
+
+
+def test_scenes_name_one_thing_without_doubt_and_take_from_the_shelves_asked_for() -> None:
+    counts: Counter[int] = Counter()
+    targets = set()
+    for index in range(30):
+        info = episode(index, task="pick_anything", objects=("blocks",), object_split="eval").info
+        names = [body.name for body in info.scene.movable]
+        counts[len(names)] += 1
+        (goal,) = info.scene.goals
+        assert goal.object.replace("_", " ") in info.instruction
+        assert len(set(names)) == len(names)
+        targets.add(goal.onto)
+        for body in info.scene.movable:
+            kind = KINDS[body.name.split("_")[1]]
+            assert kind in OBJECTS.load("blocks").kinds
+            assert body.shape.mesh in {at_rest(encode_mesh(kind.shape(n)))[0] for n in kind.numbers("eval")}
+    assert set(counts) == set(range(1, 7))
+    assert targets == {"", "blue_tray"}
+
+
+def test_tasks_with_things_of_their_own_refuse_shelves() -> None:
+    with pytest.raises(ConfigError, match="--objects was given"):
+        episode(task="stack", objects=("blocks",))
+    with pytest.raises(ConfigError, match="--object-split was given"):
+        episode(task="stack", object_split="train")
+    with pytest.raises(ConfigError, match=r"Unknown shelf 'houshold'.*household"):
+        episode(task="pick_anything", objects=("houshold",))
+
+
+def test_list_shows_the_shelves(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("list", "objects") == 0
+    assert "330 shapes: mug, glass, bowl" in capsys.readouterr().out
