@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.view.style import phase_colors
 
 WIDTH, HEIGHT, GAP, BAR = 480, 360, 4, 32
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     args = parser.parse_args()
     shown: list[Image.Image] = []
-    with SimulatedRecording(args.recording) as recording:
+    with Recording(args.recording) as recording:
         phases = recording.columns().phase
         images = zip(recording.images("front"), recording.images("wrist"), strict=True)
         for frame, pair in enumerate(images):

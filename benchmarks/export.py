@@ -35,7 +35,8 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.episode.episode import Frame, Outcome, SimulatedInfo
+from demorec.episode.episode import Frame, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import SimulatedWriter
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -89,7 +90,7 @@ def scene_pictures(frames: int, width: int, height: int, seed: int) -> list[NDAr
     return result
 
 
-def made_up(pictures: Pictures, episode: int) -> tuple[SimulatedInfo, list[Frame], Outcome]:
+def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
     """An episode of made-up numbers and the given pictures."""
     from support.recording import make_episode
 
@@ -105,10 +106,10 @@ def made_up(pictures: Pictures, episode: int) -> tuple[SimulatedInfo, list[Frame
         replace(frame, images={name: replace(frame.images[name], color=pictures[name][t]) for name in pictures})
         for t, frame in enumerate(frames)
     ]
-    return replace(info, scene=replace(info.scene, cameras=cameras)), frames, outcome
+    return info.with_simulation(scene=replace(info.scene, cameras=cameras)), frames, outcome
 
 
-def record(path: Path, episode: tuple[SimulatedInfo, list[Frame], Outcome]) -> None:
+def record(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
     info, frames, outcome = episode
     with SimulatedWriter(path, info) as writer:
         for frame in frames:

@@ -106,7 +106,7 @@ def run_episode(config: GenerateConfig, index: int, against: str = "") -> Row:
     )
     if not against:
         return row
-    other = replace(episode, info=replace(episode.info, robot=replace(episode.info.robot, urdf=against)))
+    other = replace(episode, info=episode.info.with_simulation(robot=replace(episode.info.robot, urdf=against)))
     with make_world(other.info) as world:
         cpu, frames = _timed(Session.of_episode(world, other), other)
     return replace(

@@ -156,12 +156,12 @@ def statistics(values: torch.Tensor) -> dict[str, torch.Tensor]:
 
 def plain_increments(dataset: Path) -> NDArray[np.float32]:
     """Increments of the clean targets alone, from the same recordings."""
-    from demorec.mcap import SimulatedRecording
+    from demorec.mcap import Recording
 
     rows = []
     count = json.loads((dataset / "meta" / "info.json").read_text())["total_episodes"]
     for path in sorted((dataset.parent / "episodes").glob("*.mcap"))[:count]:
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             columns, start = recording.columns(), recording.info.scene.robot.joint_position
         increments = np.diff(columns.action_joint_target, axis=0, prepend=np.array([start]))
         rows.append(np.concatenate([increments, columns.action_gripper[:, None]], axis=1))

@@ -49,8 +49,7 @@ def row_by_row(episode: PlayedEpisode, target: Path) -> None:
     """The same numbers, each at its time."""
     stream = new_recording(episode)
     stream.save(target)
-    info, positions = episode.simulated, episode.joint_position
-    assert info is not None
+    info, positions = episode.info, episode.joint_position
     assert episode.base_from_tcp is not None
     urdf, _ = robot_model(info.robot.urdf, info.scene.robot.scale, episode.robot_description)
     motions = [
@@ -80,7 +79,6 @@ def measure_saving(path: Path, rounds: int) -> None:
         target = Path(folder) / "x.rrd"
         save(source, target)  # meshes into the cache, libraries into memory
         with source.open() as episode:
-            assert episode.simulated is not None
             num_frames, num_samples = episode.num_frames, len(episode.curves["position"].time_ns)
             for _ in range(rounds):
                 columns.append(_cpu(lambda: as_columns(episode, target)))

@@ -20,7 +20,8 @@ import numpy as np
 
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.core.geometry import Array
-from demorec.episode.episode import CameraImages, Frame, Outcome, SimulatedInfo
+from demorec.episode.episode import CameraImages, Frame, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.mcap import SimulatedWriter, video
 from demorec.render import Renderer, RenderSetup
@@ -91,7 +92,7 @@ def timed_encoders(clock: Clock) -> None:
 
 def measure(
     plan: EpisodePlan, folder: Path, clock: Clock, kept: list[Frame] | None = None
-) -> tuple[SimulatedInfo, Outcome]:
+) -> tuple[EpisodeInfo, Outcome]:
     """Simulate, draw and record one episode; its frames are kept in `kept` where that is given."""
     episode = prepare(plan)
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
@@ -181,10 +182,10 @@ def main() -> None:
 
 def psnr(path: Path, frames: list[Frame]) -> float:
     """Of the decoded pictures, all cameras together."""
-    from demorec.mcap import SimulatedRecording
+    from demorec.mcap import Recording
 
     errors = []
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         for camera in recording.cameras:
             for frame, picture in zip(frames, recording.images(camera), strict=True):
                 errors.append(np.mean((picture.astype(np.float64) - frame.images[camera].color) ** 2))

@@ -20,7 +20,7 @@ from pathlib import Path
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.render.painter import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
@@ -69,7 +69,7 @@ def main() -> None:
             [(replayed, _)] = replay_all([open_file(path, ReplayOptions())], ReplayOptions())
             timed("replay", start)
             identical += replayed.is_identical
-            with SimulatedRecording(path) as recording:
+            with Recording(path) as recording:
                 simulated += recording.num_frames / recording.info.fps
         config = GenerateConfig(
             task=arguments.task, cameras=("front", "wrist"), width=arguments.size, height=arguments.size
@@ -98,7 +98,7 @@ def main() -> None:
                 start = time.process_time()
                 check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=pictures))
                 timed("check with pictures" if pictures else "check, not decoding", start)
-            with SimulatedRecording(path) as recording:
+            with Recording(path) as recording:
                 filmed += recording.num_frames / recording.info.fps
     count = arguments.episodes
     print(f"{identical} of {count} replays identical to the bit, {same_pictures} of {arguments.pictures} drawings")

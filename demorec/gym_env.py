@@ -24,8 +24,9 @@ from demorec.core.errors import ConfigError, SceneError
 from demorec.core.registry import check_choice
 from demorec.core.tables import CAMERAS, TASKS, environment_name
 from demorec.episode import features
-from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SimulatedInfo, SuccessCheck
+from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.episode.variation import Preset
@@ -174,7 +175,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return {name: _key(name) for name in self._vector_lengths}
 
     @property
-    def info(self) -> SimulatedInfo:
+    def info(self) -> EpisodeInfo:
         """Of the present episode."""
         return self.episode.info
 
@@ -298,8 +299,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         if scene is None:
             return episode
         scene = replace(scene, cameras=episode.info.scene.cameras)
-        info = replace(episode.info, scene=scene)
-        return replace(episode, info=info)
+        return replace(episode, info=episode.info.with_simulation(scene=scene))
 
     def _is_privileged(self) -> bool:
         """The default: without cameras, and with as many objects in each of the first scenes."""
@@ -310,7 +310,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         names = (features.observation_names(info.robot, info.scene, privileged=True) for info in infos)
         return len({len(of_scene[features.ENVIRONMENT_STATE]) for of_scene in names}) == 1
 
-    def _lengths(self, info: SimulatedInfo) -> dict[str, int]:
+    def _lengths(self, info: EpisodeInfo) -> dict[str, int]:
         """Dataset feature -> how many numbers it has."""
         names = features.observation_names(
             info.robot, info.scene, privileged=self.privileged, state=self._state_kind, sensed=self._sensed
@@ -349,7 +349,7 @@ def _key(feature: str) -> str:
     return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
 
 
-def _observation_space(info: SimulatedInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
+def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
     found: dict[str, spaces.Space[Any]] = {
         _key(name): spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         for name, length in vector_lengths.items()

@@ -25,7 +25,8 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_json, to_json
 from demorec.core.registry import modules_of
 from demorec.core.tables import load_robot
-from demorec.episode.episode import Frame, Outcome, SimulatedInfo
+from demorec.episode.episode import Frame, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
 from demorec.mcap import SimulatedWriter
@@ -286,7 +287,7 @@ def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Fram
     return frames, session.outcome
 
 
-def _is_within_reach(info: SimulatedInfo, point: list[float]) -> bool:
+def _is_within_reach(info: EpisodeInfo, point: list[float]) -> bool:
     """Whether the TCP gets to a point of the world (3,), metres, with the hand pointing down."""
     base_from_world = info.scene.robot.world_from_base.inverse()
     arm = arm_kinematics(info.robot, scale=info.scene.robot.scale)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from demorec.annotate.situation import nouns_of
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import SimulatedColumns
+from demorec.episode.episode import Columns
 from demorec.episode.scene import SceneCamera, Shape
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 MIN_PIXELS = 10
 """Pixels below which a thing is too hidden, or too far, to be spoken of."""
@@ -61,7 +61,7 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
     """Name -> what a picture shows of it; things that no pixel shows are left out.
 
     Args:
-        labels: (H, W) as of `SimulatedRecording.segmentation_at`.
+        labels: (H, W) as of `Recording.segmentation_at`.
         numbers: Name of a body -> its label.
     """
     counts = {name: int(np.count_nonzero(labels == number)) for name, number in numbers.items()}
@@ -72,7 +72,7 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
     }
 
 
-def body_labels(recording: SimulatedRecording) -> dict[str, int]:
+def body_labels(recording: Recording) -> dict[str, int]:
     """Name of each body that is spoken of, all but what only carries the scene -> its label in segmentation pictures.
 
     Raises:
@@ -147,7 +147,7 @@ class SeenObject:
 
 
 def seen_objects(
-    recording: SimulatedRecording, columns: SimulatedColumns, rows: NDArray[np.intp], camera: SceneCamera
+    recording: Recording, columns: Columns, rows: NDArray[np.intp], camera: SceneCamera
 ) -> Iterator[SeenObject]:
     """Everything that a camera with segmentation sees in the given frames, row by row.
 

@@ -18,14 +18,14 @@ from demorec.annotate.tries import Story, Stretch, interjection, story_of
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
-from demorec.episode.episode import MISTAKEN_PHASE, SimulatedColumns
+from demorec.episode.episode import MISTAKEN_PHASE, Columns
 from demorec.episode.scene import Scene
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 
 def narrate(
-    recording: SimulatedRecording,
-    columns: SimulatedColumns,
+    recording: Recording,
+    columns: Columns,
     rows: NDArray[np.intp],
     kinds: Collection[LanguageKind],
     cameras: Sequence[str] = (),
@@ -66,7 +66,7 @@ def narrate(
 class _Told:
     """The sentences of one episode, kind by kind."""
 
-    def __init__(self, recording: SimulatedRecording, columns: SimulatedColumns, rows: NDArray[np.intp]) -> None:
+    def __init__(self, recording: Recording, columns: Columns, rows: NDArray[np.intp]) -> None:
         self._info, self._columns, self._rows = recording.info, columns, rows
         self._story: Story = story_of(recording, columns)
         self._scene: Scene = recording.info.scene

@@ -20,9 +20,9 @@ from demorec.annotate.grounding import MIN_PIXELS, Seen, body_labels, pixels_of,
 from demorec.annotate.referring import phrases_for
 from demorec.annotate.situation import NamedThing, Surroundings, situations
 from demorec.core.geometry import Array
-from demorec.episode.episode import SimulatedColumns
+from demorec.episode.episode import Columns
 from demorec.episode.scene import SceneCamera
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 ANSWERS = {
     "bbox": {"detections"},
@@ -68,8 +68,8 @@ class _View:
 
 
 def questions(
-    recording: SimulatedRecording,
-    columns: SimulatedColumns,
+    recording: Recording,
+    columns: Columns,
     rows: NDArray[np.intp],
     cameras: Sequence[str],
     asked: Mapping[int, int],
@@ -225,8 +225,8 @@ _KINDS: tuple[Callable[[_View, int], tuple[str, dict[str, Any]] | None], ...] = 
 
 
 def traces(
-    recording: SimulatedRecording,
-    columns: SimulatedColumns,
+    recording: Recording,
+    columns: Columns,
     rows: NDArray[np.intp],
     cameras: Sequence[str],
     asked: Mapping[int, int],

@@ -15,9 +15,9 @@ import numpy as np
 from demorec.annotate.referring import phrases_for
 from demorec.annotate.situation import Surroundings
 from demorec.core.geometry import Pose
-from demorec.episode.episode import INTERJECTION_EVENT, SimulatedColumns
+from demorec.episode.episode import INTERJECTION_EVENT, Columns
 from demorec.episode.scene import Goal, Scene
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 _SAID = (
     "No, {wanted} is meant.",
@@ -53,7 +53,7 @@ class Correction:
     mistaken: str
 
 
-def correction_of(recording: SimulatedRecording, columns: SimulatedColumns) -> Correction | None:
+def correction_of(recording: Recording, columns: Columns) -> Correction | None:
     """The interjection of a recording; None without one.
 
     Raises:
@@ -142,7 +142,7 @@ class Story:
         return "release" in phases and "lower" not in phases and "carry" in phases
 
 
-def story_of(recording: SimulatedRecording, columns: SimulatedColumns) -> Story:
+def story_of(recording: Recording, columns: Columns) -> Story:
     """Tries and stretches of a recording.
 
     A try begins where the script announced a grasp; a recording without such events is one try at its only goal.
@@ -168,7 +168,7 @@ def story_of(recording: SimulatedRecording, columns: SimulatedColumns) -> Story:
     return Story(tries=tuple(tries), stretches=tuple(stretches), correction=correction_of(recording, columns))
 
 
-def _tries(recording: SimulatedRecording, columns: SimulatedColumns, scene: Scene) -> list[Try]:
+def _tries(recording: Recording, columns: Columns, scene: Scene) -> list[Try]:
     tries: list[Try] = []
     for time_ns, event in recording.events():
         frame = int(np.searchsorted(columns.time_ns, time_ns))
@@ -207,7 +207,7 @@ def _goal_of(name: str, goals: Sequence[Goal], first: int) -> int | None:
     return next((index for index in range(first, len(goals)) if goals[index].object == name), None)
 
 
-def _lies_at(goal: Goal, scene: Scene, columns: SimulatedColumns) -> bool:
+def _lies_at(goal: Goal, scene: Scene, columns: Columns) -> bool:
     """Whether the object is at its goal in the last frame, seen from above."""
     onto = columns.object_poses.get(goal.onto)
     if onto is not None:

@@ -13,7 +13,7 @@ from demorec.check.base import Found, Measurement, worst
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
 from demorec.core.replacing import PICTURE, written_whole
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, yaw_of
 
 MIN_EPISODES = 50
@@ -30,7 +30,7 @@ _UNITS = {"x": "m", "y": "m", "size": "m", "mass": "kg", "yaw": "rad"}
 """Last word of a quantity's name -> its unit."""
 
 
-def randomised(infos: Sequence[SimulatedInfo]) -> dict[str, Array]:
+def randomised(infos: Sequence[EpisodeInfo]) -> dict[str, Array]:
     """Name -> one value per episode: start places, yaws, sizes and masses of objects, places of goals.
 
     A goal on a body has two places: that of the body, and its own in the body's frame. Quantities that not all
@@ -77,15 +77,15 @@ def _values(scene: Scene) -> dict[str, float]:
     return values
 
 
-def worst_gap(infos: Sequence[SimulatedInfo]) -> Found:
+def worst_gap(infos: Sequence[EpisodeInfo]) -> Found:
     """The largest gap over all tasks."""
-    by_task: dict[str, list[SimulatedInfo]] = {}
+    by_task: dict[str, list[EpisodeInfo]] = {}
     for info in infos:
         by_task.setdefault(info.task, []).append(info)
     return worst(*map(largest_gap, by_task.values()))
 
 
-def largest_gap(infos: Sequence[SimulatedInfo]) -> Measurement | None:
+def largest_gap(infos: Sequence[EpisodeInfo]) -> Measurement | None:
     """The largest stretch of any randomised quantity in which no episode lies, as a share of its range."""
     if len(infos) < MIN_EPISODES:
         return None
@@ -147,7 +147,7 @@ def motion_vector(joint_position: Array) -> Array:
     return np.asarray(joint_position[moments], dtype=np.float64).reshape(-1)
 
 
-def draw_coverage(infos: Sequence[SimulatedInfo], path: Path) -> None:
+def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> None:
     """A PNG file: starts (dots, in the object's colour) and goals (rings) from above, and a histogram per quantity.
 
     Raises:
@@ -172,7 +172,7 @@ def draw_coverage(infos: Sequence[SimulatedInfo], path: Path) -> None:
         raise ConfigError(f"The picture cannot be written ({error.strerror or error}): {path}") from error
 
 
-def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[SimulatedInfo]) -> None:
+def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
     starts = [
         (info.scene.body(g.object), info.scene.world_from_goal(g).position) for info in infos for g in info.scene.goals
     ]

@@ -32,7 +32,6 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, RowStream, episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
-from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import (
     ACTION,
     EE_POSE,
@@ -44,6 +43,7 @@ from demorec.episode.features import (
     action_names,
     state_names,
 )
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 from demorec.render.recorded import RecordedWorld
 from demorec.robots.assets import asset_path
@@ -73,7 +73,7 @@ class DescribedEpisode:
     number: int
     rows: Rows
     kept: dict[str, Any]
-    info: SimulatedInfo
+    info: EpisodeInfo
 
 
 def read_rows(folder: Path, names: Sequence[str], *, schema: pa.Schema | None = None) -> list[dict[str, Any]]:
@@ -216,7 +216,7 @@ class Dataset:
         return [spoken_of(stream.batches(place), self.path) for place in self.places]
 
     @cached_property
-    def infos(self) -> list[SimulatedInfo]:
+    def infos(self) -> list[EpisodeInfo]:
         """What was known of each simulated episode before its first frame; empty for a dataset of somebody else's."""
         try:
             return [read_episode_info(row["episode_info"]) for row in self.sidecar if row["episode_info"] is not None]
@@ -224,7 +224,7 @@ class Dataset:
             raise ExportError(f"The sidecar's episode_info cannot be used ({in_words(error)}): {self.path}") from error
 
     @property
-    def successes(self) -> list[SimulatedInfo]:
+    def successes(self) -> list[EpisodeInfo]:
         """What was known of each simulated episode."""
         return self.infos
 
@@ -233,7 +233,7 @@ class Dataset:
         motions = [motion_vector(rows[STATE]) for rows in self.rows] if STATE in self.info.features else []
         return [f"episode {number}" for number in range(len(motions))], motions, []
 
-    def tcp_poses(self, info: SimulatedInfo, rows: Rows) -> dict[str, Array]:
+    def tcp_poses(self, info: EpisodeInfo, rows: Rows) -> dict[str, Array]:
         """Feature -> the TCP's poses (T, 7) that it holds, base frame."""
         told = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}
         if self.state_kind(info) == "joint_ee":
@@ -270,20 +270,20 @@ class Dataset:
             if row["episode_index"] in range(len(self.rows))
         ]
 
-    def action_kind(self, info: SimulatedInfo) -> ActionKind | None:
+    def action_kind(self, info: EpisodeInfo) -> ActionKind | None:
         """What the action column holds, by the names of its components; None when it is none of ours."""
         names = self.info.features[ACTION].names if ACTION in self.info.features else None
         kinds: tuple[ActionKind, ...] = ("joint", "joint_increment", "ee", "ee_delta")
         return next((kind for kind in kinds if action_names(info.robot, kind) == names), None)
 
-    def state_kind(self, info: SimulatedInfo) -> StateKind | None:
+    def state_kind(self, info: EpisodeInfo) -> StateKind | None:
         """What observation.state holds, by the names of its components; None when it is none of ours."""
         names = self.info.features[STATE].names if STATE in self.info.features else None
         return next((kind for kind in STATE_KINDS if state_names(info.robot, kind) == names), None)
 
 
 def compare_beginning(
-    info: SimulatedInfo, state: Array, fps: int, seen: Mapping[str, Cells]
+    info: EpisodeInfo, state: Array, fps: int, seen: Mapping[str, Cells]
 ) -> Mapping[str, PictureComparison] | NotMeasured:
     """Camera -> its pictures until the fingers first close against what states and scene make of them.
 

@@ -23,7 +23,8 @@ from demorec.check.base import Found, Measurement, NotMeasured, dataset_check, s
 from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.datasets.lerobot.language import SpokenEpisode
-from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE, SimulatedInfo
+from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
+from demorec.episode.info import EpisodeInfo
 
 Row = dict[str, Any]
 _ABOUT_PICTURES = ("vqa", "trace")
@@ -162,7 +163,7 @@ def _wrong_phases(episode: SpokenEpisode, row: Row, fps: int) -> Iterator[str]:
             yield f"frame {first}: {entry['content'][:60]!r} {'hides' if is_miss else 'invents'} a deliberate miss"
 
 
-def _wrong_words(episode: SpokenEpisode, row: Row, info: SimulatedInfo, start: Surroundings) -> Iterator[str]:
+def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings) -> Iterator[str]:
     """Wordings mean the things of the task; subtasks name things of a goal, by kind and colour."""
     scene = info.scene
     objects = {goal.object for goal in scene.goals}
@@ -184,7 +185,7 @@ def _wrong_words(episode: SpokenEpisode, row: Row, info: SimulatedInfo, start: S
 
 
 def _wrong_interjections(
-    episode: SpokenEpisode, row: Row, info: SimulatedInfo, start: Surroundings, fps: int
+    episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings, fps: int
 ) -> Iterator[str]:
     """Interjections come where the expert listens, say what is meant and what was mistaken, and renew the plan."""
     said = {

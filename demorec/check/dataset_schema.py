@@ -16,8 +16,8 @@ from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import check_video, open_table, read_json
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import ACTION, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, observation_names
+from demorec.episode.info import EpisodeInfo
 
 _TYPES = {
     "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
@@ -155,7 +155,7 @@ def dataset_description(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.infos)} episodes")
 
 
-def _described(dataset: Dataset, info: SimulatedInfo, stride: int) -> Iterator[str]:
+def _described(dataset: Dataset, info: EpisodeInfo, stride: int) -> Iterator[str]:
     features = dataset.info.features
     if dataset.info.robot_type != info.robot.name:
         yield f"robot_type is {dataset.info.robot_type}, the robot was {info.robot.name}"

@@ -24,9 +24,10 @@ from demorec.check.motion import Motions
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.core.errors import RecordingError, SceneError
 from demorec.core.geometry import Array
-from demorec.episode.episode import Event, Outcome, SimulatedColumns, SimulatedInfo, frame_time_ns
+from demorec.episode.episode import Columns, Event, Outcome, frame_time_ns
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
-from demorec.mcap import SimulatedRecording, channels
+from demorec.mcap import Recording, channels, open_recording
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
@@ -86,12 +87,12 @@ class CheckedEpisode(ExitStack):
         return cast(T, self._shared[compute])
 
     @cached_property
-    def recording(self) -> SimulatedRecording:
+    def recording(self) -> Recording:
         """The open recording."""
-        return self.enter_context(SimulatedRecording(self.path))
+        return self.enter_context(open_recording(self.path, simulated=True))
 
     @property
-    def info(self) -> SimulatedInfo:
+    def info(self) -> EpisodeInfo:
         """What was known before the first frame."""
         return self.recording.info
 
@@ -101,7 +102,7 @@ class CheckedEpisode(ExitStack):
         return self.recording.outcome
 
     @cached_property
-    def columns(self) -> SimulatedColumns:
+    def columns(self) -> Columns:
         """All numbers."""
         return self.recording.columns()
 
@@ -401,7 +402,7 @@ class PictureSummary:
         return len(self.cells)
 
 
-def summarise(recording: SimulatedRecording, camera: SceneCamera, kind: ImageKind) -> PictureSummary:
+def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind) -> PictureSummary:
     """Decode all pictures of a camera once."""
     read: dict[ImageKind, Callable[[str], Iterator[NDArray[Any]]]] = {
         "color": recording.images,

@@ -17,7 +17,8 @@ from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
 from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw
 from demorec.core.geometry import Array, Pose
 from demorec.episode.camera_error import told_error, true_camera
-from demorec.episode.episode import SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import Columns
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.render.recorded import RecordedWorld
 
@@ -43,8 +44,8 @@ class DrawnEpisode:
 
 
 def draw_episode(
-    info: SimulatedInfo,
-    columns: SimulatedColumns,
+    info: EpisodeInfo,
+    columns: Columns,
     kinds: Mapping[str, Iterable[ImageKind]],
     colors: Mapping[str, Cells] | None = None,
     *,
@@ -81,7 +82,7 @@ def draw_episode(
     )
 
 
-def drawable_scene(info: SimulatedInfo) -> Scene:
+def drawable_scene(info: EpisodeInfo) -> Scene:
     """The recorded scene, its cameras without their calibration error; in older recordings without its offset.
 
     One shift of all pictures makes up for most of a turn, but not for an offset: what is near moves farther by it than
@@ -110,7 +111,7 @@ def _turned_back(camera: SceneCamera, turn: Array | None) -> SceneCamera:
 
 
 def _turns(
-    info: SimulatedInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
+    info: EpisodeInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
 ) -> dict[str, Array]:
     """Camera name -> (3,) rotation vector of its calibration error, rad in its own axes, where pictures show one."""
     told = {

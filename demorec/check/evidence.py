@@ -19,8 +19,9 @@ from demorec.core.geometry import Array
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
-from demorec.episode.episode import SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import Columns
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording
 from demorec.robots.urdf import Urdf
 
@@ -98,7 +99,7 @@ class Motion:
         return [f"{name}{where}" for name, is_known in zip(self.names, known, strict=True) if is_known]
 
 
-def motion_of_simulated(info: SimulatedInfo, c: SimulatedColumns, urdf: Urdf) -> Motion:
+def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:
     """Of a recording that demorec simulated: all is known."""
     robot = info.robot
     n = len(robot.arm_joints)

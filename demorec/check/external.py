@@ -20,7 +20,7 @@ from demorec.check.base import IMAGES, Form, Found, Measurement, NotMeasured, ex
 from demorec.check.dynamics import Dynamics
 from demorec.check.evidence import Motion, motion_of_recording
 from demorec.check.motion import Motions, point_masses
-from demorec.episode.external import NO_PICTURE, Columns
+from demorec.episode.episode import NO_PICTURE, Columns
 from demorec.mcap import Recording
 from demorec.mcap.container import Container
 from demorec.mcap.video import decode

@@ -13,12 +13,12 @@ from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.external import CheckedRecording
 from demorec.check.run import CheckedRun, ExternalRun
-from demorec.core.errors import OptionError, check_option, resource_error
+from demorec.core.errors import OptionError, RecordingError, check_option, resource_error
 from demorec.core.processes import SPAWN
 from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
-from demorec.episode.episode import SimulatedInfo
-from demorec.mcap.recording import is_external
+from demorec.episode.info import EpisodeInfo
+from demorec.mcap import open_recording
 from demorec.robots.assets import allow_models, modules_of_models
 from demorec.runs.external import is_external_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
@@ -199,9 +199,9 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
     allow_models(options.allowed)
-    infos: Sequence[SimulatedInfo] = ()
+    infos: Sequence[EpisodeInfo] = ()
     scene: tuple[Form, ...] = ()  # what is asked of others that have a scene
-    if subject.kind == "recording" and is_external(subject.path):
+    if subject.kind == "recording" and _is_external(subject.path):
         scene = ("simulated",)
         with CheckedRecording(subject.path, options.urdf) as recording:
             found = _run(options, recording, ("opens", "readable"), lambda: recording.columns)
@@ -230,6 +230,15 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     modules = tuple(name for name in modules_of_models(models) if not is_allowed(name, options.allowed))
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
     return SubjectReport(**vars(subject), results=results, needs_allow=modules)
+
+
+def _is_external(path: Path) -> bool:
+    """Whether a recording is that of an external episode; False for what cannot be read."""
+    try:
+        with open_recording(path) as recording:
+            return recording.info.simulation is None
+    except RecordingError:
+        return False
 
 
 Checked = CheckedEpisode | CheckedRecording | Dataset | CheckedRun | ExternalRun

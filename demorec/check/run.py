@@ -17,9 +17,10 @@ from demorec.core.files import open_regular, read_json_limited
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.episode.episode import Outcome, SimulatedInfo
+from demorec.episode.episode import Outcome
 from demorec.episode.features import STATE
-from demorec.mcap import Recording, SimulatedRecording
+from demorec.episode.info import EpisodeInfo
+from demorec.mcap import Recording, open_recording
 from demorec.runs.external import load_external_run
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 
@@ -39,7 +40,7 @@ class Told:
         motion: `motion_vector` of its joints.
     """
 
-    info: SimulatedInfo
+    info: EpisodeInfo
     outcome: Outcome | None
     digest: str
     num_bytes: int
@@ -93,7 +94,7 @@ class CheckedRun:
         found = {}
         for path in self.recordings:
             try:
-                with SimulatedRecording(path) as recording:
+                with open_recording(path, simulated=True) as recording:
                     found[str(path.relative_to(self.path))] = Told(
                         info=recording.info,
                         outcome=recording.outcome,
@@ -121,7 +122,7 @@ class CheckedRun:
         return list(told), [t.motion for t in told.values()], [start_vector(t.info.scene) for t in told.values()]
 
     @property
-    def successes(self) -> list[SimulatedInfo]:
+    def successes(self) -> list[EpisodeInfo]:
         """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
         asked = self.run["num_episodes"]
         infos = [told.info for file, told in self.told.items() if file.startswith("episodes/")]

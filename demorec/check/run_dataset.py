@@ -22,7 +22,7 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR, is_dataset
 from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transcode
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
 from demorec.datasets.lerobot.videos import PacketReader
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import open_recording
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """What the sidecar keeps that is not of the recording."""
@@ -123,7 +123,7 @@ def episode_differences(
         ResourceError: This machine cannot read it.
     """
     try:
-        with SimulatedRecording(recording_file) as recording:
+        with open_recording(recording_file, simulated=True) as recording:
             exporting = ExportEpisode(recording, options)
             expected = prepare_episode(exporting, options, encode_depth=False)
             record = EpisodeRecord.of(exporting)

@@ -22,7 +22,7 @@ from demorec.core.replacing import PICTURE, check_replaceable
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
     from demorec.check.report import CheckOptions, Subject, SubjectReport
-    from demorec.episode.episode import SimulatedInfo
+    from demorec.episode.info import EpisodeInfo
     from demorec.replay import ReplayReport
     from demorec.replay.deep import DeepReport
 
@@ -179,15 +179,15 @@ def _split(subjects: Sequence[Subject]) -> tuple[list[Path], list[Path]]:
     return [subject.path for subject in subjects if subject.kind == "recording"], datasets
 
 
-def _infos(subjects: Sequence[Subject]) -> Iterator[SimulatedInfo]:
+def _infos(subjects: Sequence[Subject]) -> Iterator[EpisodeInfo]:
     """Of every successful episode of runs, every recording, and every episode of datasets."""
     from demorec.check.dataset import Dataset
-    from demorec.mcap import SimulatedRecording
+    from demorec.mcap import open_recording
 
     _, datasets = _split(subjects)
     for subject in subjects:
         if subject.kind == "recording" and subject.path.parent.name != "failed":
-            with SimulatedRecording(subject.path) as recording:
+            with open_recording(subject.path, simulated=True) as recording:
                 yield recording.info
         elif subject.kind == "dataset" and subject.path in datasets:
             yield from Dataset(subject.path).infos

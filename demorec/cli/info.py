@@ -17,7 +17,7 @@ from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import Found, expect
 
 if TYPE_CHECKING:
-    from demorec.episode.external import Origin
+    from demorec.episode.info import Origin
     from demorec.mcap.summary import CameraSummary, FeatureSummary, RecordingSummary
     from demorec.runs.external import ExternalRun
     from demorec.runs.run_file import RunFile
@@ -326,7 +326,6 @@ def _names(names: object) -> str:
 
 
 def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
-    from demorec.episode.external import EpisodeInfo
     from demorec.mcap import open_recording
 
     path, recordings = found.path, (*found.recordings, *found.failed)
@@ -335,7 +334,7 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
     for file in recordings:
         with open_recording(file) as recording:
             info, outcome = recording.info, recording.outcome
-            task, seed = ("(external)", "") if isinstance(info, EpisodeInfo) else (info.task, str(info.root_seed))
+            task, seed = ("(external)", "") if info.simulation is None else (info.task, str(info.root_seed))
             success = None if outcome is None else outcome.success
         items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
         word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]

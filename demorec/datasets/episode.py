@@ -17,8 +17,7 @@ from demorec.core.errors import ConfigError, ExportError
 from demorec.core.plain import digest, to_json
 from demorec.core.registry import nearest_match
 from demorec.datasets.options import CommonOptions
-from demorec.episode.episode import SimulatedColumns, interventions
-from demorec.episode.external import NO_PICTURE
+from demorec.episode.episode import NO_PICTURE, Columns, interventions
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -34,7 +33,7 @@ from demorec.episode.features import (
     observation_vectors,
 )
 from demorec.episode.sensed import SENSED, ObservationRows
-from demorec.mcap import AnyRecording, Recording, SimulatedRecording, channels
+from demorec.mcap import Recording, channels
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
 INTERVENTION = "intervention"
@@ -72,7 +71,7 @@ class ExportEpisode:
         options: Of the export.
 
     Attributes:
-        simulated: The recording, if demorec simulated the episode; else None.
+        recording, info: The episode; a simulated one has more to give.
         fps: Of the dataset.
         names: Vector feature -> names of its D elements, all that recording and options offer.
         scalars: Of `SCALARS`, all that they offer.
@@ -83,9 +82,8 @@ class ExportEpisode:
         ConfigError: Options that the recording cannot serve.
     """
 
-    def __init__(self, recording: AnyRecording, options: CommonOptions) -> None:
+    def __init__(self, recording: Recording, options: CommonOptions) -> None:
         self.recording, self.options = recording, options
-        self.simulated: SimulatedRecording | None = None
         self._state: StateKind = getattr(options, "state", "joint")
         self._sensed: list[str] = []
         self.names: dict[str, tuple[str, ...]]
@@ -93,15 +91,14 @@ class ExportEpisode:
         self.scalars: tuple[str, ...] = (DONE,)
         cameras = [ExportCamera(name=name, feature=IMAGE_PREFIX + name) for name in recording.cameras]
         on_request: tuple[str, ...] = ()
-        info = recording.info
-        if isinstance(recording, SimulatedRecording):
-            self.simulated = recording
+        self.info = info = recording.info
+        if info.simulation is not None:
             self.fps = info.fps // _frame_stride(info.fps, options.fps)
             streams = {name: row.stream for name, row in SENSED.items()}
             sensed = [name for name, stream in streams.items() if stream is None or stream.topic in recording.topics]
             on_request = (*sensed, COMMAND)
             self._sensed = [name for name in sensed if name in options.features]
-            robot, scene = recording.info.robot, recording.info.scene
+            robot, scene = info.robot, info.scene
             self.names = observation_names(
                 robot, scene, privileged=options.privileged, state=self._state, sensed=self._sensed
             )
@@ -117,7 +114,7 @@ class ExportEpisode:
         else:
             _check_external(recording, options)
             self.fps = info.fps
-            self.names = {feature.name: feature.names for feature in recording.info.features}
+            self.names = {feature.name: feature.names for feature in info.features}
             if options.depth:
                 depth_cameras = recording.depth_cameras
                 cameras += [ExportCamera(name=n, feature=IMAGE_PREFIX + n, is_depth=True) for n in depth_cameras]
@@ -128,34 +125,27 @@ class ExportEpisode:
         self.cameras = tuple(camera for camera in cameras if options.takes(camera.feature))
 
     @property
-    def subtasks(self) -> tuple[tuple[int, str], ...]:
-        """(frame, what is begun there) as an external source states it."""
-        return self.recording.subtasks if isinstance(self.recording, Recording) else ()
-
-    @property
     def origin(self) -> str:
         """Where the episode comes from: "" for a generated one, "replay of DIGEST", or JSON of imported files."""
-        origin = self.recording.info.origin
+        origin = self.info.origin
         return origin if isinstance(origin, str) else to_json(origin)
 
     @property
     def urdf(self) -> str:
         """The robot's URDF as text, "" where it is not known."""
         recording = self.recording
-        if not isinstance(recording, SimulatedRecording):
-            return recording.info.urdf
-        return recording.description() if channels.description_topic() in recording.topics else ""
+        is_described = not self.info.urdf and channels.description_topic() in recording.topics
+        return recording.description() if is_described else self.info.urdf
 
     def joints(self) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
         """Of features that have any: for each element the joint of the URDF of which it is the position, "" for none;
         and the units of the elements, where they are known.
         """
-        recording = self.recording
-        if not isinstance(recording, SimulatedRecording):
-            moving = [feature for feature in recording.info.features if any(feature.joints)]
+        if self.info.simulation is None:
+            moving = [feature for feature in self.info.features if any(feature.joints)]
             units = {feature.name: feature.units for feature in moving if feature.units}
             return {feature.name: feature.joints for feature in moving}, units
-        arm = recording.info.robot.arm_joints
+        arm = self.info.robot.arm_joints
         pose = ("m",) * 3 + ("",) * 4 if self._state == "joint_ee" else ()
         joints = (*arm, *("" for _ in self.names[STATE][len(arm) :]))
         return {STATE: joints}, {STATE: (*("rad" for _ in arm), "m", *pose)}
@@ -163,52 +153,51 @@ class ExportEpisode:
     def described_cameras(self) -> list[dict[str, Any]]:
         """What is known of each camera of the recording: name, width, height, intrinsics (K, row by row), mount,
         mount_from_camera and world_from_camera_start (position, quaternion xyzw); None for what is not."""
-        info = self.recording.info
+        info = self.info
         found = []
-        for camera in info.cameras if info.scene is None else info.scene.cameras:
+        for camera in info.cameras:
             intrinsics, placed = camera.intrinsics, camera.mount_from_camera
             row = {
                 "name": camera.name,
                 "width": camera.width,
                 "height": camera.height,
-                "intrinsics": None if intrinsics is None else np.ravel(intrinsics).tolist(),
+                "intrinsics": None if intrinsics is None else list(intrinsics),
                 "mount": camera.mount or None,
                 "mount_from_camera": None if placed is None else placed.vector().tolist(),
             }
-            if info.scene is not None:
+            if info.simulation is not None:
                 row["world_from_camera_start"] = self.columns.world_from_camera[camera.name][0].tolist()
             found.append(row)
         return found
 
     def traits(self) -> Iterator[tuple[str, str]]:
         """What all recordings of a dataset must have in common, as (what, value) in words."""
-        recording = self.recording
-        yield "kind of episode", "external" if self.simulated is None else "simulated"
-        yield "fps", str(recording.info.fps)
-        if isinstance(recording, SimulatedRecording):
+        info = self.info
+        yield "kind of episode", "external" if info.simulation is None else "simulated"
+        yield "fps", str(info.fps)
+        if info.simulation is not None:
             # A scaled arm (the tutorial's) has the same joints and limits; its lengths are in the sidecar.
-            robot = recording.info.robot
+            robot = info.robot
             yield "robot", f"{robot.name} ({digest(robot.scaled(0.0))})"
         else:
             wanted = {name: elements for name, elements in self.names.items() if self.options.takes(name)}
-            yield "robot", recording.info.robot
+            yield "robot", info.robot_name
             yield "features", " ".join(wanted)
             yield from ((f"feature {name}", ", ".join(elements)) for name, elements in wanted.items())
         yield "cameras", " ".join(camera.feature.removeprefix(IMAGE_PREFIX) for camera in self.cameras) or "none"
         for name in dict.fromkeys(camera.name for camera in self.cameras):
-            settings = recording.video_settings(name)
+            settings = self.recording.video_settings(name)
             yield f"size of camera {name}", f"{settings.width}x{settings.height}"
             yield f"codec of camera {name}", settings.codec
-        if self.simulated and self.options.privileged and self.options.takes(ENVIRONMENT_STATE):
+        if info.simulation and self.options.privileged and self.options.takes(ENVIRONMENT_STATE):
             names = self.names[ENVIRONMENT_STATE]
             yield "objects and goals", " ".join(dict.fromkeys(name.partition(".")[0] for name in names))
             yield "components of the environment state", f"{len(names)} ({digest(list(names))})"
 
     @cached_property
-    def columns(self) -> SimulatedColumns:
-        """All numbers of a simulated episode, every frame; RecordingError for damage."""
-        assert self.simulated is not None
-        return self.simulated.columns()
+    def columns(self) -> Columns:
+        """All numbers, every frame; RecordingError for damage."""
+        return self.recording.columns()
 
     @cached_property
     def rows(self) -> NDArray[np.intp]:
@@ -225,11 +214,7 @@ class ExportEpisode:
             ExportError: The recording has no frames, or a number that is not finite.
             RecordingError: It is damaged.
         """
-        recording = self.recording
-        if isinstance(recording, SimulatedRecording):
-            found = self._simulated_vectors(recording)
-        else:
-            found = recording.columns().features
+        found = self.columns.features if self.info.simulation is None else self._simulated_vectors()
         vectors = {name: values for name, values in found.items() if self.options.takes(name)}
         for name, values in vectors.items():
             self._check_finite(name, values)
@@ -253,12 +238,12 @@ class ExportEpisode:
                 f"{self.recording.path}"
             )
 
-    def _simulated_vectors(self, recording: SimulatedRecording) -> Mapping[str, NDArray[np.floating[Any]]]:
+    def _simulated_vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
         """Feature -> (T, D). With frames left out, an observation is that of the first frame of its group and an action
         the last one of it: where the robot shall be when the next observation is taken.
         """
-        info, rows, columns, options = recording.info, self.rows, self.columns, self.options
-        action_rows = np.minimum(rows + info.fps // self.fps - 1, recording.num_frames - 1)
+        info, rows, columns, options = self.info, self.rows, self.columns, self.options
+        action_rows = np.minimum(rows + info.fps // self.fps - 1, self.recording.num_frames - 1)
         vectors: dict[str, NDArray[np.floating[Any]]] = dict(
             observation_vectors(
                 ObservationRows.of_columns(columns, rows),
@@ -280,7 +265,7 @@ class ExportEpisode:
         """Feature of `scalars` -> (T,)."""
         is_last = self.rows == self.rows[-1]
         found: dict[str, NDArray[np.generic]] = {DONE: is_last}
-        if self.simulated is not None:
+        if self.info.simulation is not None:
             is_success = is_last & bool(self.recording.success)
             found |= {REWARD: is_success.astype(np.float32), SUCCESS: is_success}
             if INTERVENTION in self.scalars:
@@ -295,17 +280,15 @@ class ExportEpisode:
             ConfigError: The recording has no such images.
             ExportError: A frame has none.
         """
-        if isinstance(recording := self.recording, Recording):
-            return self._held_numbers(recording, camera.name)
-        if camera.is_depth and not recording.has_depth(camera.name):
+        if camera.is_depth and not self.recording.has_depth(camera.name):
             raise ConfigError(
                 f"--depth needs recordings with depth images (generate --depth), and the camera {camera.name!r} has "
-                f"none: leave it out: {recording.path}"
+                f"none: leave it out: {self.recording.path}"
             )
-        return self.rows.astype(np.int64)
+        return self._held_numbers(camera.name)[self.rows]
 
-    def _held_numbers(self, recording: Recording, camera: str) -> NDArray[np.int64]:
-        columns = recording.columns()
+    def _held_numbers(self, camera: str) -> NDArray[np.int64]:
+        columns = self.columns
         numbers, stamps = columns.pictures[camera].copy(), columns.picture_stamps[camera]
         longest = round(self.options.hold_pictures * _SECOND_NS)
         without = np.flatnonzero(numbers == NO_PICTURE)
@@ -320,7 +303,7 @@ class ExportEpisode:
                 raise ExportError(
                     f"Frame {frame} has no image of the camera {camera}, as {len(without)} of {len(numbers)} "
                     f"frames, and {last}: {hold}leave the camera (--features) or the episode (--episodes) out: "
-                    f"{recording.path}"
+                    f"{self.recording.path}"
                 )
             numbers[frame] = before
         return numbers

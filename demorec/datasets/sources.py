@@ -10,7 +10,7 @@ from demorec.core.plain import listed
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.options import CommonOptions, parse_episodes
 from demorec.episode.episode import POLICY_PHASE, Outcome, interventions
-from demorec.mcap import AnyRecording, open_recording
+from demorec.mcap import Recording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 
@@ -36,7 +36,7 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
+def is_wanted(recording: Recording, options: CommonOptions) -> bool:
     """Whether its episode is one of those that the options ask for (`--episodes`, `--corrected-only`).
 
     Raises:
@@ -46,11 +46,11 @@ def is_wanted(recording: AnyRecording, options: CommonOptions) -> bool:
         return False
     if not options.corrected_only:
         return True
-    phases = recording.phases()
+    phases = recording.columns().phase
     return POLICY_PHASE not in phases or bool(interventions(phases).any())
 
 
-def goes_in(recording: AnyRecording, options: CommonOptions) -> bool:
+def goes_in(recording: Recording, options: CommonOptions) -> bool:
     """Whether a recording of a wanted episode goes into the dataset, and is no failed attempt to be left out.
 
     An external episode of which nobody said whether it succeeded is no failure; whoever moved a recording into

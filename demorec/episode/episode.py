@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.errors import NotSimulatedError
 from demorec.core.geometry import Array, Pose
-from demorec.episode.scene import Scene
-from demorec.robots.robot import RobotSpec
 
 POLICY_PHASE = "policy"
 """Phase of the frames in which a policy acts, or somebody else who tells no phase; all others are the expert's."""
@@ -29,8 +28,10 @@ MISTAKEN_PHASE, CORRECTED_PHASE = "mistake", "correct"
 INTERJECTION_EVENT = "interjection"
 """Event between these two: "NAME is meant, not NAME"."""
 
-FORMAT_VERSION = 2
-"""Of the recordings. A reader knows every version up to this one; `recordings/sample/` holds a file of each."""
+NO_PICTURE = -1
+"""Stands for the number of an image where a frame has none."""
+
+Vector = NDArray[np.float32] | NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,51 +141,6 @@ class Frame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulatedInfo:
-    """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
-
-    Attributes:
-        format_version: Of the recording.
-        episode_index, attempt: Which attempt at which episode of the run.
-        root_seed: Of the run.
-        task: Name of the task (or "package.module:Name").
-        instruction: In words; LeRobot's task text.
-        robot: The arm.
-        scene: The world at the start, cameras with intrinsics and mounts included.
-        fps: Frames per second.
-        physics_hz: Steps per second.
-        behaviour: name -> value of everything else that was drawn for this episode (speed, approach height,
-            noise level), for the card and for analysis.
-        config: The resolved GenerateConfig as plain JSON data.
-        config_digest: SHA-256 of it, 16 hex digits.
-        versions: package -> version, of what decides the bits (demorec, pybullet, numpy, numba, av), with
-            the sources of modules of one's own.
-        origin: "" for a generated episode; "replay of DIGEST", "render of DIGEST" for a derived one.
-    """
-
-    format_version: int = FORMAT_VERSION
-    episode_index: int
-    attempt: int
-    root_seed: int
-    task: str
-    instruction: str
-    robot: RobotSpec
-    scene: Scene
-    fps: int
-    physics_hz: int
-    behaviour: Mapping[str, float] = field(default_factory=dict)
-    config: Mapping[str, Any] = field(default_factory=dict)
-    config_digest: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    origin: str = ""
-
-    @property
-    def robot_name(self) -> str:
-        """What the robot is called."""
-        return self.robot.name
-
-
-@dataclass(frozen=True, kw_only=True)
 class SuccessCheck:
     """One condition of success.
 
@@ -231,35 +187,108 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SimulatedColumns:
-    """All numbers of an episode, one row a frame (T rows); pictures are read on their own.
+class Sample:
+    """A vector as it came.
 
-    Poses are position, then quaternion xyzw. Shapes and units as in Observation and Action.
+    Attributes:
+        stamp_ns: Of the clock of its stream.
+        vector: (D,) of the feature's dtype.
     """
 
-    time_ns: NDArray[np.int64]  # (T,)
-    joint_position: Array  # (T, n_joints)
-    joint_velocity: Array  # (T, n_joints)
-    joint_effort: Array  # (T, n_joints)
-    gripper_width: Array  # (T,)
-    base_from_tcp: Array  # (T, 7)
-    object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
-    contact_force: Array  # (T,)
-    sensed: Mapping[str, Array]  # quantity -> (T, D), of those that the format version has
-    action_joint_target: Array  # (T, n_arm)
-    action_gripper: Array  # (T,)
-    action_base_from_tcp: Array  # (T, 7)
-    command_joint_target: Array  # (T, n_arm)
-    command_gripper: Array  # (T,)
-    command_base_from_tcp: Array  # (T, 7)
-    phase: tuple[str, ...]  # T
-    is_deliberate_miss: NDArray[np.bool_]  # (T,)
-    world_from_camera: Mapping[str, Array]  # name -> (T, 7)
+    stamp_ns: int
+    vector: Vector
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledFrame:
+    """One control step.
+
+    Attributes:
+        time_ns: Its stamp; frames come in order, at whatever distances. What it holds is `time_ns - stamp_ns` old.
+        samples: Feature -> what it holds; every feature.
+        pictures: Camera -> number of the image that it holds, counted from 0 in each camera. One image may be held
+            by several frames, or by none; a camera that is left out has no image at this frame.
+        subtask: What the robot begins to do with this frame, in the words of whoever said it; "" where nothing new was
+            said.
+    """
+
+    time_ns: int
+    samples: Mapping[str, Sample]
+    pictures: Mapping[str, int] = field(default_factory=dict)
+    subtask: str = ""
+
+
+class Simulated[V]:
+    """A column that only simulated episodes have: of any other, asking for it raises NotSimulatedError."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, columns: None, owner: type) -> None: ...
+
+    @overload
+    def __get__(self, columns: Columns, owner: type) -> V: ...
+
+    def __get__(self, columns: Columns | None, owner: type) -> V | None:
+        if columns is None:
+            return None  # the field's default
+        values: V | None = vars(columns)[self._name]
+        if values is None:
+            raise NotSimulatedError(self._name)
+        return values
+
+    def __set__(self, columns: Columns, values: V | None) -> None:
+        vars(columns)[self._name] = values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Columns:
+    """All numbers of an episode, one row a frame (T rows); images are read on their own.
+
+    A simulated episode has a fixed set, whose shapes and units are as in Observation and Action, and poses as position,
+    then quaternion xyzw. Any other has the features that its description names. Which image of a camera a frame holds
+    is known of both: in a simulation the one of its own number.
+    """
+
+    time_ns: NDArray[np.int64]  # (T,) stamps of the frames
+    joint_position: Simulated[Array] = Simulated()  # (T, n_joints)
+    joint_velocity: Simulated[Array] = Simulated()  # (T, n_joints)
+    joint_effort: Simulated[Array] = Simulated()  # (T, n_joints)
+    gripper_width: Simulated[Array] = Simulated()  # (T,)
+    base_from_tcp: Simulated[Array] = Simulated()  # (T, 7)
+    object_poses: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7), world_from_object
+    contact_force: Simulated[Array] = Simulated()  # (T,)
+    sensed: Mapping[str, Array] = field(default_factory=dict)  # quantity -> (T, D), of those of the format version
+    action_joint_target: Simulated[Array] = Simulated()  # (T, n_arm)
+    action_gripper: Simulated[Array] = Simulated()  # (T,)
+    action_base_from_tcp: Simulated[Array] = Simulated()  # (T, 7)
+    command_joint_target: Simulated[Array] = Simulated()  # (T, n_arm)
+    command_gripper: Simulated[Array] = Simulated()  # (T,)
+    command_base_from_tcp: Simulated[Array] = Simulated()  # (T, 7)
+    phase: tuple[str, ...] = ()  # T, or none where nobody states any
+    is_deliberate_miss: Simulated[NDArray[np.bool_]] = Simulated()  # (T,)
+    world_from_camera: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7)
+    features: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # feature -> (T, D) in its own dtype
+    stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # feature -> (T,) stamps of the samples
+    pictures: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (T,) number of the image held
+    picture_stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (P,) stamps of its images
 
     @property
     def num_frames(self) -> int:
         """T."""
         return len(self.time_ns)
+
+    def age_ns(self, feature: str) -> NDArray[np.int64]:
+        """(T,) how old each frame's sample of a feature is."""
+        return self.time_ns - self.stamps[feature]
+
+    def picture_age_ns(self, camera: str) -> NDArray[np.int64]:
+        """(N,) how old the images are, of the N frames that hold one of this camera."""
+        numbers = self.pictures[camera]
+        held = np.flatnonzero(numbers != NO_PICTURE)
+        ages: NDArray[np.int64] = self.time_ns[held] - self.picture_stamps[camera][numbers[held]]
+        return ages
 
 
 def frame_time_ns(frame_index: int, fps: int) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose, quat_multiply, quat_product, rotation_rows
-from demorec.episode.episode import SimulatedColumns
+from demorec.episode.episode import Columns
 from demorec.episode.scene import Goal, Scene
 from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.robots.robot import RobotSpec
@@ -260,7 +260,7 @@ def action_names(robot: RobotSpec, kind: ActionKind) -> tuple[str, ...]:
 
 
 def action_vectors(
-    columns: SimulatedColumns,
+    columns: Columns,
     scene: Scene,
     kind: ActionKind,
     rows: NDArray[np.intp] | slice = slice(None),
@@ -306,7 +306,7 @@ def action_vectors(
     return _joined([shifts, turns, gripper], dtype)
 
 
-def command_vectors(columns: SimulatedColumns, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
+def command_vectors(columns: Columns, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
     """(T, D) float64, what the motors were sent: joint targets (rad), gripper opening (m)."""
     return _joined([columns.command_joint_target[rows], columns.command_gripper[rows]], np.float64)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.episode.episode import Observation, SimulatedColumns
+from demorec.episode.episode import Columns, Observation
 from demorec.robots.robot import RobotSpec
 
 
@@ -34,7 +34,7 @@ class ObservationRows:
     sensed: Mapping[str, Array]
 
     @classmethod
-    def of_columns(cls, columns: SimulatedColumns, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
+    def of_columns(cls, columns: Columns, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
         """Those of a recorded episode, or of some of its frames."""
         sensed = {"joint_effort": columns.joint_effort, "contact_force": columns.contact_force, **columns.sensed}
         return cls(

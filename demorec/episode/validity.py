@@ -15,8 +15,7 @@ from collections.abc import Iterable, Iterator
 from demorec.core.config import MAX_PIXELS
 from demorec.core.geometry import Pose
 from demorec.core.plain import from_json
-from demorec.episode.episode import SimulatedInfo
-from demorec.episode.external import Camera, EpisodeInfo, Feature
+from demorec.episode.info import Camera, EpisodeInfo, Feature
 from demorec.episode.scene import Body, Scene, SceneCamera, Shape
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
@@ -43,20 +42,26 @@ def from_description[T](text: str, cls: type[T]) -> T:
     return from_json(text, cls)
 
 
-def read_episode_info(text: str) -> SimulatedInfo:
+def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
     """The description of an episode from its JSON.
+
+    Args:
+        text: What to read.
+        simulated: Whether it must be that of a simulated episode, or of any other.
 
     Raises:
         ValueError: One line that says what is wrong with it.
     """
-    info = from_description(text, SimulatedInfo)
-    wrong = list(_episode(info))
+    info = from_description(text, EpisodeInfo)
+    if simulated != (info.simulation is not None):
+        raise ValueError(f"it describes {'no' if simulated else 'a'} simulated episode")
+    wrong = find_problems(info)
     if wrong:
         raise ValueError("; ".join(wrong[:_MAX_TOLD]))
     return info
 
 
-def _episode(info: SimulatedInfo) -> Iterator[str]:
+def _episode(info: EpisodeInfo) -> Iterator[str]:
     yield from _within("episode_index", info.episode_index, 0, 2**63 - 1)
     yield from _within("attempt", info.attempt, 0, 2**31)
     yield from _within("root_seed", info.root_seed, 0, 2**63 - 1)
@@ -189,7 +194,7 @@ _MAX_TEXT = 10_000
 
 def find_problems(info: EpisodeInfo) -> list[str]:
     """Everything that makes a description impossible, in words; empty when nothing does."""
-    return list(_external(info))
+    return list(_external(info) if info.simulation is None else _episode(info))
 
 
 def _external(info: EpisodeInfo) -> Iterator[str]:
@@ -199,7 +204,7 @@ def _external(info: EpisodeInfo) -> Iterator[str]:
         yield f"fps is {info.fps}, allowed are 1 to 10000"
     if not info.instruction.strip():
         yield "the task text is empty"
-    for what, text in (("task text", info.instruction), ("name of the robot", info.robot)):
+    for what, text in (("task text", info.instruction), ("name of the robot", info.robot_name)):
         if len(text) > _MAX_TEXT or not text.isprintable():
             yield f"the {what} is no single line of at most {_MAX_TEXT} characters"
     if not 1 <= len(info.features) <= MAX_FEATURES or len(info.cameras) > MAX_CAMERAS:

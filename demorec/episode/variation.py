@@ -2,7 +2,7 @@
 
 A field that is None takes the preset's range. Ranges are drawn from evenly; a single number is the size of a
 symmetric spread, or a probability. What is drawn is recorded: in the scene where it is part of the scene, otherwise
-in `SimulatedInfo.behaviour`.
+in `EpisodeInfo.behaviour`.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import open_recording
 from demorec.runs.find import expect
 from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
 
@@ -134,7 +134,7 @@ def _read_run(source: Path) -> Original:
         if not attempt.file:  # no scene could be laid out, so that nothing was recorded
             continue
         try:
-            with SimulatedRecording(path) as recording:
+            with open_recording(path, simulated=True) as recording:
                 info, found = recording.info, recording.digest()
         except RecordingError as error:
             digests[key] = ""

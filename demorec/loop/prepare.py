@@ -16,7 +16,7 @@ from demorec.core.registry import modules_of
 from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.episode.camera_error import error_values
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.render import Renderer
@@ -48,7 +48,7 @@ class Episode:
     """
 
     plan: EpisodePlan
-    info: SimulatedInfo
+    info: EpisodeInfo
     task: Task
     behaviour: Behaviour
     cameras: tuple[SceneCamera, ...] = ()
@@ -115,20 +115,22 @@ def prepare(plan: EpisodePlan) -> Episode:
     cameras = vary_cameras(tuple(_cameras(task, robot, config)), ranges, camera_rng)
     errors = calibration_errors(cameras, ranges, camera_rng)
     scene = replace(scene, cameras=tuple(_miscalibrated(camera, errors[camera.name]) for camera in cameras))
-    info = SimulatedInfo(
+    info = EpisodeInfo(
         episode_index=plan.episode_index,
         attempt=plan.attempt,
-        root_seed=config.seed,
-        task=config.task,
         instruction=task.instruction(scene, _rng(plan, "expert")),
-        robot=robot,
-        scene=scene,
         fps=config.fps,
-        physics_hz=config.physics_hz,
-        behaviour=behaviour.as_mapping() | error_values(errors),
-        config=to_plain(config),
-        config_digest=digest(config),
         versions=deciding_versions(config),
+        simulation=Simulation(
+            root_seed=config.seed,
+            task=config.task,
+            robot=robot,
+            scene=scene,
+            physics_hz=config.physics_hz,
+            behaviour=behaviour.as_mapping() | error_values(errors),
+            config=to_plain(config),
+            config_digest=digest(config),
+        ),
     )
     return Episode(
         plan=plan,
@@ -173,12 +175,12 @@ def _miscalibrated(camera: SceneCamera, true_from_recorded: Pose) -> SceneCamera
     return replace(camera, mount_from_camera=camera.mount_from_camera @ true_from_recorded)
 
 
-def make_world(info: SimulatedInfo) -> World:
+def make_world(info: EpisodeInfo) -> World:
     """An empty world for episodes like this one (same robot, rates and joint sampling)."""
     return World(info.robot, fps=info.fps, sample_joints=info.config.get("joint_rate") == "physics")
 
 
-def make_renderer(info: SimulatedInfo) -> AbstractContextManager[Renderer | None]:
+def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
     """The renderer that an episode's config names, or None without cameras; a context manager either way.
 
     Raises:
@@ -203,7 +205,7 @@ class SimulatorCache:
         """Whether an episode was simulated before."""
         return self._world is not None
 
-    def acquire(self, info: SimulatedInfo) -> tuple[World, Renderer | None]:
+    def acquire(self, info: EpisodeInfo) -> tuple[World, Renderer | None]:
         """A world and a renderer (None without cameras) for episodes like this one; the present ones where they fit.
 
         Raises:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import messages
 from demorec.mcap.cdr import encode
 from demorec.mcap.description import body_description, robot_description
@@ -47,7 +47,7 @@ def camera_topic(camera: str, stream: str) -> str:
     return f"/camera/{camera}/{stream}"
 
 
-def latched_messages(info: SimulatedInfo, frames: FrameTree, *, has_labels: bool) -> Iterator[tuple[str, str, bytes]]:
+def latched_messages(info: EpisodeInfo, frames: FrameTree, *, has_labels: bool) -> Iterator[tuple[str, str, bytes]]:
     """(topic, type, message) of what is said once, before the first frame."""
     yield TF_STATIC, messages.TRANSFORMS, messages.transforms(frames.static)
     robot = robot_description(info.robot.urdf, info.scene.robot.scale)

@@ -1,31 +1,36 @@
-"""What the readers of all recordings share: an open MCAP file, its topics and its encoded images."""
+"""The file of an episode: its description, its topics and its images, decoded or as they are."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError, without_path
 from demorec.core.files import Closing
 from demorec.core.plain import to_json, to_plain
-from demorec.episode.episode import Outcome, SimulatedInfo
-from demorec.episode.external import EpisodeInfo
+from demorec.episode.episode import Outcome, frame_time_ns
+from demorec.episode.info import DEPTH_UNITS, EpisodeInfo
+from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
-from demorec.mcap.channels import camera_topic, video_topic
-from demorec.mcap.chunks import Block
+from demorec.mcap.channels import GRIPPER, camera_topic, description_topic, video_topic
 from demorec.mcap.container import Container, damage_as_recording_error
+from demorec.mcap.lossless import decode_distances
+from demorec.mcap.metadata import CameraStreams
 from demorec.mcap.pictures import PixelCounter, PixelStatistics, read_pixel_statistics
+from demorec.mcap.streams import FRAMES
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 
 _READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
 """Codec -> what takes a packet out of its message, where that is no CompressedImage."""
 
 
-class EpisodeFile[C](Closing):
+class EpisodeFile(Closing):
     """Context manager over the file of one episode.
 
     Attributes:
@@ -36,24 +41,22 @@ class EpisodeFile[C](Closing):
         is_recovered: Whether a crash cut it off.
     """
 
-    info: SimulatedInfo | EpisodeInfo
+    info: EpisodeInfo
     outcome: Outcome | None
     num_frames: int
     is_recovered: bool
-    _record: ClassVar[str]
-    """Name of the metadata record that makes the file a recording."""
-    _cameras: Mapping[str, C]
-    """What is known of each camera."""
+    _cameras: Mapping[str, CameraStreams]
+    """What was recorded of each camera."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._container = Container(self.path)
         try:
-            found = self._container.metadata(self._record)
-            if found is None:
-                raise self._other_file()
+            record = next((name for name in metadata.RECORDS if name in self._container.metadata_names), "")
+            if (found := self._container.metadata(record)) is None:
+                raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
             try:
-                self._read_metadata(found)
+                self._read_metadata(record, found)
             except RecordingError as error:
                 raise RecordingError(f"{without_path(error, self.path)}: {self.path}") from error
         except BaseException:
@@ -64,18 +67,18 @@ class EpisodeFile[C](Closing):
         """Close the file; harmless when called twice."""
         self._container.close()
 
-    @abstractmethod
-    def _other_file(self) -> RecordingError:
-        """That the file is no recording of this kind."""
-
-    @abstractmethod
-    def _read_metadata(self, found: Mapping[str, str]) -> None:
+    def _read_metadata(self, record: str, found: Mapping[str, str]) -> None:
         """Read what is known without reading the numbers."""
+        info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(record, found)
+        self._read_end(record, FRAMES if info.simulation is None else GRIPPER)
+        if self.num_frames and len(self._cameras) != len(info.cameras):
+            raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
+        self.info = self._with_urdf(info, urdf_sha256) if urdf_sha256 else info
 
-    def _read_end(self, topic: str) -> None:
+    def _read_end(self, record: str, topic: str) -> None:
         """Read how it ended; RecordingError unless its end is that of as many frames as `topic` has messages."""
         outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
-        self.outcome = None if outcome is None else metadata.read_outcome_metadata(self._record, outcome)
+        self.outcome = None if outcome is None else metadata.read_outcome_metadata(record, outcome)
         self.num_frames = self._container.counts.get(topic, 0)
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
@@ -87,13 +90,53 @@ class EpisodeFile[C](Closing):
                 f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}"
             )
 
-    def _camera(self, name: str) -> C:
+    def _with_urdf(self, info: EpisodeInfo, sha256: str) -> EpisodeInfo:
+        urdf = ""
+        for _, text in self._read(description_topic(), messages.read_string):
+            urdf = text  # the last one holds
+        if metadata.urdf_sha256(urdf) != sha256:
+            raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
+        described = replace(info, urdf=urdf)
+        if wrong := find_problems(described):
+            raise RecordingError(f"The URDF of the recording does not fit its metadata ({wrong[0]})")
+        return described
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the recorded cameras that see colours."""
+        return tuple(
+            camera.name for camera in self.info.cameras if camera.name in self._cameras and not camera.is_depth
+        )
+
+    @property
+    def depth_cameras(self) -> tuple[str, ...]:
+        """Names of the cameras that measure distances and see no colours."""
+        return tuple(camera.name for camera in self.info.cameras if camera.is_depth)
+
+    def _camera(self, name: str) -> CameraStreams:
         if name not in self._cameras:
             raise RecordingError(
                 f"The recording has no camera {name!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
                 f"{self.path}"
             )
         return self._cameras[name]
+
+    def video_settings(self, camera: str) -> VideoSettings:
+        """How the images of a camera were encoded."""
+        return self._camera(camera).video
+
+    def has_depth(self, camera: str) -> bool:
+        """Whether distances were recorded of a camera, beside its colours or in place of them."""
+        return self._camera(camera).depth
+
+    def has_segmentation(self, camera: str) -> bool:
+        """Whether segmentation images of a camera were recorded."""
+        return self._camera(camera).segmentation
+
+    def _size(self, camera: str) -> tuple[int, int]:
+        """(height, width) of all images of a camera."""
+        settings = self.video_settings(camera)
+        return settings.height, settings.width
 
     def _digest_of_description(self) -> hashlib._Hash:
         """That of the metadata, to go on with: not of what versions wrote them."""
@@ -103,28 +146,21 @@ class EpisodeFile[C](Closing):
         result.update(
             b"no outcome"
             if self.outcome is None
-            else to_json(metadata.plain_outcome(self._record, self.outcome)).encode()
+            else to_json(metadata.plain_outcome(metadata.record_of(self.info), self.outcome)).encode()
         )
         return result
 
     @property
-    @abstractmethod
-    def simulated(self) -> SimulatedInfo | None:
-        """What is known of an episode that demorec simulated: task, seed, scene; None of any other."""
-
-    @property
-    @abstractmethod
     def has_failed(self) -> bool:
-        """Whether its attempt failed."""
+        """Whether somebody said so, or a crash cut off an episode that demorec simulated."""
+        if self.outcome is None:
+            return self.info.simulation is not None
+        return self.outcome.success is False
 
     @property
     def success(self) -> bool | None:
         """How its attempt ended; None where nobody said."""
         return False if self.has_failed else None if self.outcome is None else self.outcome.success
-
-    @abstractmethod
-    def phases(self) -> Sequence[str]:
-        """Phase of each frame; empty where nobody stated any."""
 
     @property
     def topics(self) -> dict[str, tuple[str, int]]:
@@ -142,10 +178,6 @@ class EpisodeFile[C](Closing):
                 found = read(message.data)
             yield message.time_ns, found
 
-    @abstractmethod
-    def video_settings(self, camera: str) -> VideoSettings:
-        """How the images of a camera were encoded."""
-
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera, in order; `frame_index` is their number, by which frames hold them."""
         codec = self.video_settings(camera).codec
@@ -154,24 +186,52 @@ class EpisodeFile[C](Closing):
             yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def _pictures[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
-        """As `_read`, of a topic of images."""
-        return self._read(topic, read)
+        """As `_read`, of a topic of images; RecordingError unless a simulated episode has one at each frame's time."""
+        count = 0
+        for time_ns, picture in self._read(topic, read):
+            if self.info.simulation is not None and (
+                count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps)
+            ):
+                raise RecordingError(
+                    f"Image {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
+                )
+            yield time_ns, picture
+            count += 1
+        self._check_num_pictures(topic, count)
 
-    @abstractmethod
-    def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
-        """camera -> all its encoded images, in memory together."""
+    def _check_num_pictures(self, topic: str, count: int) -> None:
+        if self.info.simulation is not None and count != self.num_frames:
+            raise RecordingError(
+                f"The recording has {self.num_frames} frames, but {count} images on {topic}: {self.path}"
+            )
 
     def images(self, camera: str) -> Iterator[Rgb]:
-        """The decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
+        """The decoded images of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
+        if camera in self.depth_cameras:
+            raise RecordingError(f"The camera {camera!r} measures distances and sees no colours: {self.path}")
         return decode(self.video_settings(camera), self.packets(camera))
 
-    @abstractmethod
-    def num_images(self, camera: str) -> int:
-        """How many images there are of a camera."""
+    def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
+        """Distances in order, as they were recorded: (H, W) uint16 millimetres or float32 metres."""
+        codec, size = self._distance_codec(camera), self._size(camera)
 
-    @abstractmethod
-    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
-        """What some frames, in rising order, show of a camera that has images, (H, W, 3) uint8 RGB; in one pass."""
+        def read(data: bytes) -> NDArray[np.uint16] | NDArray[np.float32]:
+            return decode_distances(codec, _READERS.get(codec, messages.read_compressed_image)(data), size)
+
+        for _, distances in self._pictures(video_topic(camera, codec), read):
+            yield distances
+
+    def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
+        """The same in metres, (H, W) float32; in a simulation in steps of a millimetre, 0 where nothing was hit."""
+        unit = np.float32(DEPTH_UNITS[self._distance_codec(camera)])
+        for values in self.distances(camera):
+            yield values.astype(np.float32) / unit
+
+    def _distance_codec(self, camera: str) -> str:
+        if not self.has_depth(camera):
+            raise RecordingError(f"The recording has no depth images of the camera {camera!r}: {self.path}")
+        codec = self.video_settings(camera).codec
+        return codec if codec in DEPTH_UNITS else "16UC1"
 
     def picture(self, camera: str, number: int) -> Rgb:
         """One decoded image of a camera, (H, W, 3) uint8 RGB, by its own number."""

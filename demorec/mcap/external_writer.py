@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.episode.external import NO_PICTURE, Camera, EpisodeInfo, SampledFrame
+from demorec.episode.episode import NO_PICTURE, SampledFrame
+from demorec.episode.info import Camera, EpisodeInfo
 from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
 from demorec.mcap.cdr import encode
@@ -22,7 +23,6 @@ from demorec.mcap.channels import TF, TF_STATIC, camera_topic, description_topic
 from demorec.mcap.file_writer import FileWriter
 from demorec.mcap.frame_check import SampledFrameCheck
 from demorec.mcap.lossless import encode_distances
-from demorec.mcap.metadata import EXTERNAL
 from demorec.mcap.pictures import PictureCoder
 from demorec.mcap.streams import FRAMES, SUBTASK, feature_streams, frames_layout
 from demorec.mcap.transforms import ExternalTree, camera_frame
@@ -81,8 +81,6 @@ class EpisodeWriter(FileWriter[_Pictures]):
         RecordingError: It cannot be written.
     """
 
-    _record = EXTERNAL
-
     def __init__(
         self,
         path: Path,
@@ -96,7 +94,7 @@ class EpisodeWriter(FileWriter[_Pictures]):
             self._describe(info)
         self._cameras = {camera.name: _Pictures(camera, video or VideoConfig(), info.fps) for camera in info.cameras}
         self._pending: list[SampledFrame] = []
-        super().__init__(path, origin=info.origin, overwrite=overwrite)
+        super().__init__(path, info, overwrite=overwrite)
         if begins:
             self._write_description()
 
@@ -122,8 +120,8 @@ class EpisodeWriter(FileWriter[_Pictures]):
     def _write_description(self) -> None:
         """Write what is said once, or leave nothing."""
         try:
-            settings = {name: camera.settings for name, camera in self._cameras.items()}
-            self._file.metadata(EXTERNAL, metadata.external_metadata(self._info, settings))
+            streams = {name: metadata.CameraStreams(video=camera.settings) for name, camera in self._cameras.items()}
+            self._file.metadata(metadata.EXTERNAL, metadata.episode_metadata(self._info, streams))
             if self._tree is not None:
                 urdf = encode(messages.STRING, self._info.urdf)
                 self._file.log(description_topic(), messages.STRING, urdf, 0, latched=True)

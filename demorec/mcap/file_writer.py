@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 from demorec.core.errors import RecordingError
 from demorec.core.files import Closing
 from demorec.episode.episode import Outcome
-from demorec.episode.external import Origin
-from demorec.mcap.metadata import OUTCOME, outcome_metadata
+from demorec.episode.info import EpisodeInfo
+from demorec.mcap.metadata import OUTCOME, outcome_metadata, record_of
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.pictures import PictureCoder
 from demorec.mcap.recover import can_be_made_again
@@ -41,20 +40,19 @@ class FileWriter[C: PictureCoder](Closing):
 
     Args:
         path: The file to be made.
-        origin: Of the episode: an unfinished file of the same one is replaced.
+        info: Of the episode: an unfinished file of the same origin is replaced.
         overwrite: Whether a recording of that name may be replaced.
 
     Attributes:
         num_frames: So far.
     """
 
-    _record: ClassVar[str]
-    """Name of the metadata record that makes the file a recording."""
     _cameras: Mapping[str, C]
 
-    def __init__(self, path: Path, *, origin: str | Origin, overwrite: bool) -> None:
+    def __init__(self, path: Path, info: EpisodeInfo, *, overwrite: bool) -> None:
         self.num_frames = 0
-        self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(can_be_made_again, origin=origin))
+        self._record = record_of(info)
+        self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(can_be_made_again, origin=info.origin))
 
     def close(self) -> None:
         """End it and leave NAME.mcap.part as it is; harmless when called twice, and after `finish`."""

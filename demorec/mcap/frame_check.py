@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
 from demorec.core.registry import nearest_match
-from demorec.episode.episode import Frame, SimulatedInfo
-from demorec.episode.external import Camera, EpisodeInfo, SampledFrame
+from demorec.episode.episode import Frame, SampledFrame
+from demorec.episode.info import Camera, EpisodeInfo
 from demorec.episode.sensed import STREAMS
 from demorec.mcap.lossless import DEPTH_TYPES
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 
 
-def check_joint_names(info: SimulatedInfo) -> None:
+def check_joint_names(info: EpisodeInfo) -> None:
     """Raise RecordingError unless the robot's joints are different ones that its URDF has."""
     robot = info.robot
     known = {joint.name for joint in Urdf.load(asset_path(robot.urdf)).joints if joint.kind != "fixed"}
@@ -44,7 +44,7 @@ def check_joint_names(info: SimulatedInfo) -> None:
 class FrameCheck:
     """Checks frame after frame of one episode; takes microseconds, since it is part of every recording."""
 
-    def __init__(self, info: SimulatedInfo) -> None:
+    def __init__(self, info: EpisodeInfo) -> None:
         self._joints, self._arm = (len(info.robot.joint_names),), (len(info.robot.arm_joints),)
         self._objects = {body.name for body in info.scene.movable}
         self._cameras = {camera.name for camera in info.scene.cameras}

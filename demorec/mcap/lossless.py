@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 
@@ -176,7 +176,7 @@ class LabelDecoder:
         return lines[:, :width].astype(np.uint16)
 
 
-def segment_names(info: SimulatedInfo) -> Iterator[tuple[int, str]]:
+def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:
     """(segmentation value, name) of the background, every body and every link of the robot.
 
     Bodies are numbered in the order in which a world loads them (what stands still, the robot, what moves), links as

@@ -15,14 +15,15 @@ from typing import Any
 
 from demorec.core.errors import RecordingError, in_words
 from demorec.core.plain import from_plain, to_json, to_plain
-from demorec.episode.episode import FORMAT_VERSION, Outcome, SimulatedInfo
-from demorec.episode.external import EXTERNAL_VERSION, EpisodeInfo
-from demorec.episode.validity import find_problems, from_description, read_episode_info
+from demorec.episode.episode import Outcome
+from demorec.episode.info import EXTERNAL_VERSION, FORMAT_VERSION, EpisodeInfo
+from demorec.episode.validity import from_description, read_episode_info
 from demorec.mcap.video import VideoSettings
 
 EPISODE = "demorec.episode"
 EXTERNAL = "demorec.collected"
 """In place of EPISODE in recordings of episodes that demorec did not simulate."""
+RECORDS = (EPISODE, EXTERNAL)
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
 """Of a recording that a crash cut off."""
@@ -37,7 +38,6 @@ _OUTCOME_KEYS: Mapping[str, Mapping[str, str]] = {
 }  # fmt: skip
 """Record at the start -> key in that at the end -> field of `Outcome`."""
 _CHECKSUM = "crc32"
-_KNOWN_VERSIONS = tuple(str(version) for version in range(1, FORMAT_VERSION + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,20 +54,36 @@ class CameraStreams:
     segmentation: bool = False
 
 
-def episode_metadata(info: SimulatedInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
-    """The record that makes an MCAP file a recording; the first few values are for people."""
+def record_of(info: EpisodeInfo) -> str:
+    """Name of the record that describes an episode: EPISODE where demorec simulated it, else EXTERNAL."""
+    return EXTERNAL if info.simulation is None else EPISODE
+
+
+def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
+    """The record that makes an MCAP file a recording; the first few values are for people.
+
+    A URDF is not in it but a message of its own; its SHA-256 is.
+    """
+    for_people = {"instruction": info.instruction, "episode_index": str(info.episode_index)}
+    streams: Mapping[str, object] = cameras
+    if info.simulation is None:
+        for_people |= {"robot": info.robot_name, "urdf_sha256": urdf_sha256(info.urdf)}
+        streams = {name: camera.video for name, camera in cameras.items()}
+    else:
+        for_people |= {"task": info.task, "attempt": str(info.attempt), "root_seed": str(info.root_seed)}
     return sealed(
         {
-            "task": info.task,
-            "instruction": info.instruction,
-            "episode_index": str(info.episode_index),
-            "attempt": str(info.attempt),
-            "root_seed": str(info.root_seed),
+            **for_people,
             "format_version": str(info.format_version),
-            "info": to_json(info),
-            "cameras": to_json(dict(cameras)),
+            "info": to_json(dataclasses.replace(info, urdf="")),
+            "cameras": to_json(dict(streams)),
         }
     )
+
+
+def urdf_sha256(urdf: str) -> str:
+    """SHA-256 (hex) of a URDF, "" of none."""
+    return hashlib.sha256(urdf.encode()).hexdigest() if urdf else ""
 
 
 def plain_outcome(record: str, outcome: Outcome) -> dict[str, Any]:
@@ -82,38 +98,64 @@ def outcome_metadata(record: str, outcome: Outcome) -> dict[str, str]:
     return sealed({"success": success, "outcome": to_json(plain_outcome(record, outcome))})
 
 
-def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[SimulatedInfo, dict[str, CameraStreams]]:
-    """Inverse of `episode_metadata`; RecordingError on damage or an unknown format version."""
-    check_seal(EPISODE, metadata)
-    version = metadata.get("format_version", "")
-    if version not in _KNOWN_VERSIONS:
+def read_episode_metadata(
+    record: str, metadata: Mapping[str, str]
+) -> tuple[EpisodeInfo, dict[str, CameraStreams], str]:
+    """Inverse of `episode_metadata`, with the SHA-256 of the URDF, which `info` lacks.
+
+    Args:
+        record: EPISODE or EXTERNAL, the name under which the metadata are there.
+        metadata: Its values.
+
+    Raises:
+        RecordingError: It is damaged, or of an unknown format version.
+    """
+    check_seal(record, metadata)
+    version, newest = metadata.get("format_version", ""), FORMAT_VERSION if record == EPISODE else EXTERNAL_VERSION
+    if version not in map(str, range(1, newest + 1)):
+        what = "The recording" if record == EPISODE else "The recording of an external episode"
         raise RecordingError(
-            f"The recording has format version {version[:20] or 'none'}, this demorec reads 1 to {FORMAT_VERSION}: "
+            f"{what} has format version {version[:20] or 'none'}, this demorec reads 1 to {newest}: "
             "use the demorec that wrote it, or a newer one"
         )
     try:
-        info = read_episode_info(metadata["info"])
+        info = read_episode_info(metadata["info"], simulated=record == EPISODE)
         if str(info.format_version) != version:
             raise ValueError(f"its description is of format version {info.format_version}")
-        cameras = from_description(metadata["cameras"], dict[str, CameraStreams])
-        _check_cameras(info, cameras)
+        if record == EPISODE:
+            cameras = from_description(metadata["cameras"], dict[str, CameraStreams])
+            _check_cameras(info, cameras)
+            return info, cameras, ""
+        videos = from_description(metadata["cameras"], dict[str, VideoSettings])
+        _check_videos(info, videos)
+        is_depth = {camera.name: camera.is_depth for camera in info.cameras}
+        streams = {name: CameraStreams(video=videos[name], depth=depth) for name, depth in is_depth.items()}
+        return info, streams, metadata["urdf_sha256"]
     except (KeyError, ValueError) as error:
-        raise RecordingError(
-            f"The recording's metadata is not that of format version {version} ({in_words(error)})"
-        ) from error
-    return info, cameras
+        what = f"format version {version}" if record == EPISODE else "an external episode"
+        raise RecordingError(f"The recording's metadata is not that of {what} ({in_words(error)})") from error
 
 
-def _check_cameras(info: SimulatedInfo, cameras: Mapping[str, CameraStreams]) -> None:
+def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
     """ValueError unless all cameras of the scene (none, before the first frame) were recorded as it says."""
-    if cameras and cameras.keys() != {camera.name for camera in info.scene.cameras}:
+    if cameras and cameras.keys() != {camera.name for camera in info.cameras}:
         raise ValueError("the recorded cameras are not those of the scene")
-    for camera in info.scene.cameras if cameras else ():
+    for camera in info.cameras if cameras else ():
         video = cameras[camera.name].video
         if (video.width, video.height, video.fps) != (camera.width, camera.height, info.fps):
             raise ValueError(f"the video of the camera {camera.name!r} has another size or rate than the scene")
         if video.gop < 1:
             raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
+
+
+def _check_videos(info: EpisodeInfo, videos: Mapping[str, VideoSettings]) -> None:
+    """ValueError unless the images of all cameras are of the size and codec that the description says."""
+    for camera in info.cameras:
+        video = videos.get(camera.name)
+        if video is None or (video.width, video.height) != (camera.width, camera.height):
+            raise ValueError(f"the video of the camera {camera.name!r} has another size")
+        if camera.kept and video.codec != camera.kept:
+            raise ValueError(f"the video of the camera {camera.name!r} is {video.codec}, not {camera.kept}")
 
 
 def read_outcome_metadata(record: str, metadata: Mapping[str, str]) -> Outcome:
@@ -148,61 +190,3 @@ def check_seal(name: str, metadata: Mapping[str, str]) -> None:
 def _checksum(metadata: Mapping[str, str]) -> str:
     content = {key: value for key, value in metadata.items() if key != _CHECKSUM}
     return f"{zlib.crc32(json.dumps(content, sort_keys=True).encode()):08x}"
-
-
-_MOST_TOLD = 5
-
-
-def external_metadata(info: EpisodeInfo, cameras: Mapping[str, VideoSettings]) -> dict[str, str]:
-    """The record that makes an MCAP file a recording of an external episode; the first few values are for people.
-
-    The URDF is not in it but a message of its own; its SHA-256 is.
-    """
-    return sealed(
-        {
-            "instruction": info.instruction,
-            "robot": info.robot,
-            "episode_index": str(info.episode_index),
-            "format_version": str(info.format_version),
-            "urdf_sha256": urdf_sha256(info.urdf),
-            "info": to_json(dataclasses.replace(info, urdf="")),
-            "cameras": to_json(dict(cameras)),
-        }
-    )
-
-
-def urdf_sha256(urdf: str) -> str:
-    """SHA-256 (hex) of a URDF, "" of none."""
-    return hashlib.sha256(urdf.encode()).hexdigest() if urdf else ""
-
-
-def read_external_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, VideoSettings], str]:
-    """Inverse of `external_metadata`, with the SHA-256 of the URDF, which `info` lacks.
-
-    Raises:
-        RecordingError: It is damaged, or of an unknown format version.
-    """
-    check_seal(EXTERNAL, metadata)
-    version = metadata.get("format_version", "")
-    if version not in map(str, range(1, EXTERNAL_VERSION + 1)):
-        raise RecordingError(
-            f"The recording of an external episode has format version {version[:20] or 'none'}, this demorec reads 1 "
-            f"to {EXTERNAL_VERSION}: use the demorec that wrote it, or a newer one"
-        )
-    try:
-        info = from_description(metadata["info"], EpisodeInfo)
-        cameras = from_description(metadata["cameras"], dict[str, VideoSettings])
-        wrong = find_problems(info)
-        for camera in info.cameras:
-            video = cameras.get(camera.name)
-            if video is None or (video.width, video.height) != (camera.width, camera.height):
-                wrong.append(f"the video of the camera {camera.name!r} has another size")
-            elif camera.kept and video.codec != camera.kept:
-                wrong.append(f"the video of the camera {camera.name!r} is {video.codec}, not {camera.kept}")
-        if wrong:
-            raise ValueError("; ".join(wrong[:_MOST_TOLD]))
-        return info, cameras, metadata["urdf_sha256"]
-    except (KeyError, ValueError) as error:
-        raise RecordingError(
-            f"The recording's metadata is not that of an external episode ({in_words(error)})"
-        ) from error

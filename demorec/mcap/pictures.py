@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.episode.external import Camera
-from demorec.episode.scene import SceneCamera
+from demorec.episode.info import Camera
 from demorec.mcap import messages
 from demorec.mcap.cdr import CdrReader, encode
 from demorec.mcap.channels import camera_topic, video_topic
@@ -106,7 +105,7 @@ class PictureTopics:
         codec: Of the images.
     """
 
-    def __init__(self, camera: SceneCamera | Camera, codec: str) -> None:
+    def __init__(self, camera: Camera, codec: str) -> None:
         self._codec, self._size = codec, (camera.height, camera.width)
         self._topic, self._again_topic = video_topic(camera.name, codec), camera_topic(camera.name, "video")
         self._frame_id = camera_frame(camera.name)
@@ -145,9 +144,9 @@ class PictureCoder:
         last_ns: Stamp of the last image.
     """
 
-    def __init__(self, camera: SceneCamera | Camera, video: VideoConfig, fps: int, *, compiled: bool = False) -> None:
+    def __init__(self, camera: Camera, video: VideoConfig, fps: int, *, compiled: bool = False) -> None:
         self._encoder, self._pixels = None, PixelCounter(compiled=compiled)
-        if isinstance(camera, Camera) and camera.kept:
+        if camera.kept:
             self.settings = settings_of_coded(camera.kept, camera.width, camera.height, fps)
         else:
             self._encoder = make_encoder(video, camera.width, camera.height, fps)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -12,22 +13,19 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json
-from demorec.episode.episode import Event, JointSample, SimulatedColumns, SimulatedInfo, frame_time_ns
-from demorec.mcap import channels, messages, metadata
+from demorec.episode.episode import NO_PICTURE, Columns, Event, JointSample
+from demorec.mcap import channels, messages
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.lossless import LabelDecoder, decode_depth, from_labels
-from demorec.mcap.streams import ColumnArrays, FrameStream, frame_streams, merged_columns
-from demorec.mcap.video import Rgb, VideoSettings
+from demorec.mcap.lossless import LabelDecoder, from_labels
+from demorec.mcap.numbers import external_columns, frame_times, simulated_columns
+from demorec.mcap.streams import SUBTASK, frame_streams
+from demorec.mcap.video import Rgb
 from demorec.robots.urdf import check_primitives
 
 
-class NotSimulatedError(RecordingError):
-    """The recording is one of an external episode, which `Recording` reads."""
-
-
-class RecordingReader(EpisodeFile[metadata.CameraStreams]):
+class RecordingReader(EpisodeFile):
     """What one file holds: numbers as columns, images as packets or decoded, labels; a context manager.
 
     Attributes:
@@ -38,93 +36,40 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
 
     Raises:
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
+        NotSimulatedError: A method was asked for what only a simulated episode has.
     """
 
-    _record = metadata.EPISODE
-    info: SimulatedInfo
-    _said: tuple[tuple[int, bytes], ...] | None = None
-    """(time_ns, message) of all events, once `columns` has come by them: they lie among the numbers in the file."""
+    _said: Block | None = None
+    """Messages of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
     """topic -> segmentation images and the names in them, once `coded_pictures` has come by them."""
 
-    def _other_file(self) -> RecordingError:
-        if metadata.EXTERNAL in self._container.metadata_names:
-            return NotSimulatedError(
-                "This needs an episode that demorec simulated; this one was recorded by another robot or program "
-                f"and has no scene: {self.path}"
-            )
-        return RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
+    def columns(self) -> Columns:
+        """All numbers, one row a frame, bit-exact as they were written, and which images the frames hold."""
+        return self._columns
 
-    def _read_metadata(self, found: Mapping[str, str]) -> None:
-        self.info, self._cameras = metadata.read_episode_metadata(found)
-        self._read_end(channels.GRIPPER)
-        if self.num_frames and len(self._cameras) != len(self.info.scene.cameras):
-            raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
+    @cached_property
+    def _columns(self) -> Columns:
+        """Read once: an export and a check look at them from several sides."""
+        if self.info.simulation is None:
+            topics = {camera.name: self._picture_topic(camera.name) for camera in self.info.cameras}
+            return external_columns(self._container, self.info, topics)
+        columns, self._said = simulated_columns(self._container, self.info, self.num_frames, self.cameras)
+        return columns
 
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the recorded cameras, in the scene's order."""
-        return tuple(camera.name for camera in self.info.scene.cameras if camera.name in self._cameras)
+    @cached_property
+    def subtasks(self) -> tuple[tuple[int, str], ...]:
+        """(frame, what is begun there), in order, as the source states it; empty where nobody said any."""
+        found = []
+        for time_ns, text in self._read(SUBTASK, messages.read_string):
+            frame = int(np.searchsorted(self._columns.time_ns, time_ns))
+            if frame == self.num_frames or self._columns.time_ns[frame] != time_ns:
+                raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
+            found.append((frame, text))
+        return tuple(found)
 
-    def video_settings(self, camera: str) -> VideoSettings:
-        """How the images of a camera were encoded."""
-        return self._camera(camera).video
-
-    def has_depth(self, camera: str) -> bool:
-        """Whether depth images of a camera were recorded."""
-        return self._camera(camera).depth
-
-    def has_segmentation(self, camera: str) -> bool:
-        """Whether segmentation images of a camera were recorded."""
-        return self._camera(camera).segmentation
-
-    @property
-    def simulated(self) -> SimulatedInfo:
-        """Its `info`."""
-        return self.info
-
-    @property
-    def has_failed(self) -> bool:
-        """Whether it did not succeed, or a crash cut it off."""
-        return self.outcome is None or not self.outcome.success
-
-    def phases(self) -> Sequence[str]:
-        """Phase of each frame."""
-        return self.columns().phase
-
-    def _frame_times(self) -> NDArray[np.int64]:
-        """(T,) `frame_time_ns` of every frame."""
-        fps = self.info.fps
-        return (np.arange(self.num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)
-
-    def columns(self) -> SimulatedColumns:
-        """All numbers, one row a frame, bit-exact as they were written."""
-        streams = frame_streams(self.info)
-        times = self._frame_times()
-        topics = [stream.topic for stream in streams]
-        blocks = self._container.blocks((*topics, channels.PHASE, channels.DELIBERATE_MISS, channels.EVENTS))
-        said = blocks[channels.EVENTS]
-        self._said = tuple(zip(said.time_ns.tolist(), said.messages(), strict=True))
-        joint_states = blocks[channels.JOINT_STATES]  # there may be more of these between the frames
-        blocks[channels.JOINT_STATES] = joint_states.select(np.isin(joint_states.time_ns, times))
-        with damage_as_recording_error(self.path):
-            columns = merged_columns(self._columns_of(stream, blocks[stream.topic], times) for stream in streams)
-            phases = _held(blocks[channels.PHASE], messages.read_string, times, "")
-            misses = _held(blocks[channels.DELIBERATE_MISS], messages.read_boolean, times, False)
-        # Before the first frame nobody knows which cameras there are.
-        columns["world_from_camera"] = {name: columns["world_from_camera"][name] for name in self.cameras}
-        return SimulatedColumns(
-            time_ns=times, phase=tuple(phases), is_deliberate_miss=np.array(misses, dtype=np.bool_), **columns
-        )
-
-    def _columns_of(self, stream: FrameStream, block: Block, times: NDArray[np.int64]) -> ColumnArrays:
-        """The columns of a stream, which must have one message at each of `times` (T,)."""
-        if not np.array_equal(block.time_ns, times):
-            raise RecordingError(
-                f"The recording has {len(block)} messages on {stream.topic} at other times than its "
-                f"{len(times)} frames: {self.path}"
-            )
-        return stream.columns(stream.layout.decode_rows(block.rows(len(stream.layout.constant))))
+    def _picture_topic(self, camera: str) -> str:
+        return channels.video_topic(camera, self.video_settings(camera).codec)
 
     def description(self, body: str = "") -> str:
         """URDF of the robot, or of the body of that name: primitives only, complete without any other file."""
@@ -144,48 +89,43 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
-        read = ((message.time_ns, message.data) for message in self._container.messages((channels.EVENTS,)))
-        for time_ns, data in read if self._said is None else self._said:
+        read: Iterator[tuple[int, bytes]]
+        if self._said is None:
+            read = ((message.time_ns, message.data) for message in self._container.messages((channels.EVENTS,)))
+        else:
+            read = zip(self._said.time_ns.tolist(), self._said.messages(), strict=True)
+        for time_ns, data in read:
             with damage_as_recording_error(self.path):
                 event = messages.read_log(data)
             if event.name != channels.PHASE_EVENT:
                 yield time_ns, event
 
     def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
-        """camera -> its encoded images, one a frame, all read in one pass; they are in memory together."""
-        codecs = {camera: self.video_settings(camera).codec for camera in cameras}
-        topics = {camera: channels.video_topic(camera, codec) for camera, codec in codecs.items()}
+        """camera -> all its encoded images, read in one pass; they are in memory together."""
+        topics = {camera: self._picture_topic(camera) for camera in cameras}
         labels = [self._segmentation_topic(camera) for camera in cameras if self.has_segmentation(camera)]
         labels += [channels.LABELS] if labels else []
         found = self._container.blocks((*topics.values(), *labels))
         self._packed_labels = {topic: found[topic] for topic in labels}
-        times = self._frame_times()
         pictures = {}
         for camera, topic in topics.items():
-            block = found[topic]
-            known = block.time_ns[: self.num_frames]
-            wrong = np.flatnonzero(known != times[: len(known)])
-            if len(wrong) or len(block) > self.num_frames:
-                index = int(wrong[0]) if len(wrong) else self.num_frames
-                raise RecordingError(
-                    f"Image {index} of {topic} is at {block.time_ns[index]} ns, not at its frame's time: {self.path}"
-                )
-            if len(block) != self.num_frames:
-                raise RecordingError(
-                    f"The recording has {self.num_frames} frames, but {len(block)} images of camera {camera}: "
-                    f"{self.path}"
-                )
+            if self.info.simulation is not None:
+                self._check_times(topic, found[topic])
             with damage_as_recording_error(self.path):
-                pictures[camera] = messages.coded_pictures(block, codecs[camera])
+                pictures[camera] = messages.coded_pictures(found[topic], self.video_settings(camera).codec)
         return pictures
 
-    def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """Depth images, (H, W) float32 metres in steps of a millimetre, 0 where nothing was hit, one a frame."""
-        if not self.has_depth(camera):
-            raise RecordingError(f"The recording has no depth images of the camera {camera!r}: {self.path}")
-        topic, size = channels.camera_topic(camera, "depth"), self._size(camera)
-        for _, depth in self._pictures(topic, lambda data: decode_depth(messages.read_compressed_image(data), size)):
-            yield depth
+    def _check_times(self, topic: str, block: Block) -> None:
+        """Raise RecordingError unless there is one image at the time of each frame."""
+        times = frame_times(self.num_frames, self.info.fps)
+        known = block.time_ns[: self.num_frames]
+        wrong = np.flatnonzero(known != times[: len(known)])
+        if len(wrong) or len(block) > self.num_frames:
+            index = int(wrong[0]) if len(wrong) else self.num_frames
+            raise RecordingError(
+                f"Image {index} of {topic} is at {block.time_ns[index]} ns, not at its frame's time: {self.path}"
+            )
+        self._check_num_pictures(topic, len(block))
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation images, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
@@ -204,7 +144,7 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         """
         topics = {camera: self._segmentation_topic(camera) for camera in cameras}
         decoders = {camera: LabelDecoder(self._size(camera)) for camera in cameras}
-        times, counts = self._frame_times(), dict.fromkeys(cameras, 0)
+        times, counts = frame_times(self.num_frames, self.info.fps), dict.fromkeys(cameras, 0)
         is_read = self._packed_labels.keys() >= set(topics.values())
         for blocks in [self._packed_labels] if is_read else self._container.blocks_by_chunk(topics.values()):
             for camera, topic in topics.items():
@@ -225,11 +165,6 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
             raise RecordingError(f"The recording has no segmentation images of the camera {camera!r}: {self.path}")
         return channels.camera_topic(camera, "segmentation")
 
-    def _size(self, camera: str) -> tuple[int, int]:
-        """(height, width) of all images of a camera."""
-        settings = self.video_settings(camera)
-        return settings.height, settings.width
-
     def segment_names(self) -> dict[int, str]:
         """Segmentation value -> name of the body, or ROBOT/LINK; empty when no segmentation was recorded."""
         labels = self.segment_labels()
@@ -245,40 +180,33 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
             return names
         return {}
 
-    def _pictures[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
-        """As `_read`; RecordingError unless there is one image at the time of each frame."""
-        count = 0
-        for time_ns, picture in self._read(topic, read):
-            if count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps):
-                raise RecordingError(
-                    f"Image {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
-                )
-            yield time_ns, picture
-            count += 1
-        self._check_num_pictures(topic, count)
+    def _shown(self, camera: str) -> NDArray[np.int64]:
+        """(T,) number of the image of a camera that each frame holds."""
+        self._camera(camera)
+        return self.columns().pictures[camera] if self.info.simulation is None else np.arange(self.num_frames)
 
-    def _check_num_pictures(self, topic: str, count: int) -> None:
-        if count != self.num_frames:
-            raise RecordingError(
-                f"The recording has {self.num_frames} frames, but {count} images on {topic}: {self.path}"
-            )
+    def image(self, camera: str, frame: int) -> Rgb | None:
+        """The decoded image that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
 
-    def image(self, camera: str, frame: int) -> Rgb:
-        """The decoded image of one frame, (H, W, 3) uint8 RGB, decoded from the keyframe before it on.
+        It is decoded from the keyframe before it on.
 
         Raises:
             IndexError: There is no such frame; negative ones count from the end.
         """
-        return next(self.images_at(camera, [frame]))
+        number = int(self._shown(camera)[range(self.num_frames)[frame]])
+        return None if number == NO_PICTURE else self.picture(camera, number)
 
     def num_images(self, camera: str) -> int:
-        """How many images there are of a camera: one a frame."""
-        self._camera(camera)
-        return self.num_frames
+        """How many images there are of a camera."""
+        return self._container.counts.get(self._picture_topic(camera), 0)
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
-        """As `image`, of several frames, read in one pass."""
-        return self._images(camera, [range(self.num_frames)[frame] for frame in frames])
+        """What some frames, in rising order, show of a camera that has images, (H, W, 3) uint8 RGB; in one pass.
+
+        A frame without an image shows the last one before it, or else the first.
+        """
+        held = np.maximum(np.maximum.accumulate(self._shown(camera)), 0)
+        return self._images(camera, held[list(frames)].tolist())
 
     def calibration(self, camera: str) -> messages.Calibration:
         """What the calibration message of a camera says, which is what other programs go by."""
@@ -294,7 +222,19 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
         older versions keep their digests.
         """
         result = self._digest_of_description()
-        for name, value in _column_bytes(self.columns()):
+        columns = self.columns()
+        if self.info.simulation is None:
+            result.update(columns.time_ns.tobytes())
+            for mapping in (columns.features, columns.stamps, columns.pictures, columns.picture_stamps):
+                for name in sorted(mapping):
+                    result.update(name.encode() + mapping[name].tobytes())
+            for frame, text in self.subtasks:
+                result.update(f"subtask {frame} {text}".encode())
+            for camera in self.info.cameras:
+                for packet in self.packets(camera.name):
+                    result.update(hashlib.sha256(packet.data).digest())
+            return result.hexdigest()
+        for name, value in _column_bytes(columns):
             result.update(name.encode() + value)
         for sample in self.joint_samples():
             result.update(sample.time_ns.to_bytes(8, "little"))
@@ -302,30 +242,29 @@ class RecordingReader(EpisodeFile[metadata.CameraStreams]):
                 result.update(vector.tobytes())
         for time_ns, event in self.events():
             result.update(f"{time_ns} {to_json(event)}".encode())
-        for camera in self.cameras:
-            result.update(camera.encode())
-            for packet in self.packets(camera):
+        for name in self.cameras:
+            result.update(name.encode())
+            for packet in self.packets(name):
                 result.update(hashlib.sha256(packet.data).digest())
-            for depth in self.depth(camera) if self.has_depth(camera) else ():
+            for depth in self.depth(name) if self.has_depth(name) else ():
                 result.update(depth.tobytes())
-            for labels in self.segmentation(camera) if self.has_segmentation(camera) else ():
+            for labels in self.segmentation(name) if self.has_segmentation(name) else ():
                 result.update(labels.tobytes())
         return result.hexdigest()
 
 
-def _column_bytes(columns: SimulatedColumns) -> Iterator[tuple[str, bytes]]:
+_NOT_RECORDED = ("features", "stamps", "pictures", "picture_stamps")
+"""Columns that are the same of every simulated episode, and no part of its digest."""
+
+
+def _column_bytes(columns: Columns) -> Iterator[tuple[str, bytes]]:
     """Name and bytes of every column that was recorded."""
     for field in dataclasses.fields(columns):
+        if field.name in _NOT_RECORDED:
+            continue
         value = getattr(columns, field.name)
         if isinstance(value, Mapping):
             for key in sorted(value):
                 yield key if field.name == "sensed" else f"{field.name}/{key}", value[key].tobytes()
         else:
             yield field.name, value.tobytes() if isinstance(value, np.ndarray) else "\n".join(value).encode()
-
-
-def _held[V](block: Block, read: Callable[[bytes], V], times: NDArray[np.int64], first: V) -> list[V]:
-    """The value that holds at each time, given the messages that tell its changes."""
-    values = [first, *map(read, block.messages())]
-    numbers = np.searchsorted(np.maximum.accumulate(block.time_ns), times, side="right")
-    return [values[number] for number in numbers.tolist()]

@@ -1,4 +1,4 @@
-"""Any recording opened as what it is, and a simulated one as the sequence of its frames, at home in notebooks."""
+"""A recording as the sequence of its frames, at home in notebooks."""
 
 from __future__ import annotations
 
@@ -17,24 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from demorec.core.errors import MissingDependencyError, RecordingError
+from demorec.core.errors import MissingDependencyError, NotSimulatedError
 from demorec.core.text import printable
-from demorec.episode.episode import CameraImages, Event, Frame, JointSample, SimulatedColumns
+from demorec.episode.episode import CameraImages, Columns, Event, Frame, JointSample
 from demorec.episode.sensed import STREAMS
-from demorec.mcap.external_reader import Recording
-from demorec.mcap.reader import NotSimulatedError, RecordingReader
+from demorec.mcap.reader import RecordingReader
 from demorec.mcap.streams import action_at, observation_at, pose_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-class SimulatedRecording(RecordingReader):
+class Recording(RecordingReader):
     """Context manager over one recording, and the sequence of its frames.
 
     `for frame in recording` gives numbers and images together, `recording[120]`, `recording[-1]` and
     `recording[::30]` any of them; `columns` gives all numbers at once, which is much faster where images are not
-    needed.
+    needed. Frames are those of a simulation: asking another episode for them raises NotSimulatedError.
     """
 
     def __len__(self) -> int:
@@ -57,7 +56,7 @@ class SimulatedRecording(RecordingReader):
         return dataclasses.replace(frame, images=_images_at(self, columns, frame.frame_index))
 
     @cached_property
-    def _numbers(self) -> tuple[SimulatedColumns, list[Frame]]:
+    def _numbers(self) -> tuple[Columns, list[Frame]]:
         """All numbers, kept from the first frame on that is asked for."""
         columns = self.columns()
         return columns, list(frames_of(self, columns))
@@ -71,10 +70,11 @@ class SimulatedRecording(RecordingReader):
     def to_pandas(self) -> pd.DataFrame:
         """All numbers as a table, one row a frame, bit-exact float64; the index is `frame_index`.
 
-        Columns are named as in `demorec.episode.episode.SimulatedColumns`, vectors with their component:
+        Columns are named as in `demorec.episode.episode.Columns`, vectors with their component:
         `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
         `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.red_cube.z` (m, world frame),
-        `phase`. `time_ns` is simulated time since the episode's start.
+        `phase`. `time_ns` is simulated time since the episode's start. Of an external episode there are the stamps of
+        its frames and its features: `observation.state.shoulder`.
 
         Raises:
             MissingDependencyError: pandas is not installed.
@@ -84,7 +84,15 @@ class SimulatedRecording(RecordingReader):
         except ImportError as error:
             raise MissingDependencyError("A table of the frames", "pandas", "pip install pandas") from error
         columns = self.columns()
-        table: dict[str, Any] = {"time_ns": columns.time_ns, "phase": columns.phase}
+        table: dict[str, Any] = {"time_ns": columns.time_ns}
+        for feature in self.info.features:
+            table |= _components(feature.name, columns.features[feature.name], feature.names)
+        if self.info.simulation is not None:
+            table |= self._simulated_table(columns)
+        return pd.DataFrame(table, index=pd.RangeIndex(columns.num_frames, name="frame_index"))
+
+    def _simulated_table(self, columns: Columns) -> dict[str, Any]:
+        table: dict[str, Any] = {"phase": columns.phase}
         joints, arm = self.info.robot.joint_names, self.info.robot.arm_joints
         for name in ("joint_position", "joint_velocity", "joint_effort"):
             table |= _components(name, getattr(columns, name), joints)
@@ -100,11 +108,10 @@ class SimulatedRecording(RecordingReader):
             poses: Mapping[str, NDArray[np.float64]] = getattr(columns, group)
             for name, rows in poses.items():
                 table |= _components(f"{group}.{name}", rows, _POSE)
-        table["is_deliberate_miss"] = columns.is_deliberate_miss
-        return pd.DataFrame(table, index=pd.RangeIndex(columns.num_frames, name="frame_index"))
+        return {**table, "is_deliberate_miss": columns.is_deliberate_miss}
 
 
-def frames_of(recording: RecordingReader, columns: SimulatedColumns | None = None) -> Iterator[Frame]:
+def frames_of(recording: RecordingReader, columns: Columns | None = None) -> Iterator[Frame]:
     """Every frame without its images: numbers, phase, events, and the joint samples before it.
 
     Args:
@@ -146,7 +153,7 @@ def _samples_before_frames(recording: RecordingReader, times: list[int]) -> dict
     return result
 
 
-def decoded_images(recording: RecordingReader, columns: SimulatedColumns) -> Iterator[Mapping[str, CameraImages]]:
+def decoded_images(recording: RecordingReader, columns: Columns) -> Iterator[Mapping[str, CameraImages]]:
     """The recorded images of every frame, decoded (so not those that were encoded), with the recorded camera poses."""
     streams = {
         name: (
@@ -175,7 +182,7 @@ def _frames_with_images(recording: RecordingReader) -> Iterator[Frame]:
         yield replace(frame, images=images)
 
 
-def _images_at(recording: RecordingReader, columns: SimulatedColumns, frame: int) -> Mapping[str, CameraImages]:
+def _images_at(recording: RecordingReader, columns: Columns, frame: int) -> Mapping[str, CameraImages]:
     """The images of one frame; only those from the keyframe before it on are decoded."""
 
     def at[P](pictures: Callable[[str], Iterator[P]], camera: str) -> P:
@@ -183,7 +190,7 @@ def _images_at(recording: RecordingReader, columns: SimulatedColumns, frame: int
 
     return {
         name: CameraImages(
-            color=recording.image(name, frame),
+            color=next(recording.images_at(name, [frame])),
             depth=at(recording.depth, name) if recording.has_depth(name) else None,
             segmentation=at(recording.segmentation, name) if recording.has_segmentation(name) else None,
             world_from_camera=pose_of(columns.world_from_camera[name][frame]),
@@ -194,6 +201,7 @@ def _images_at(recording: RecordingReader, columns: SimulatedColumns, frame: int
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _MOMENTS, _PICTURE_HEIGHT = 5, 120
+_OUTCOMES = {True: "success", None: "unknown"}
 
 
 def _described(recording: RecordingReader) -> str:
@@ -204,12 +212,14 @@ def _described(recording: RecordingReader) -> str:
 def _facts(recording: RecordingReader) -> Iterator[tuple[str, str]]:
     info, outcome = recording.info, recording.outcome
     yield "", f"{recording.num_frames} frames ({recording.num_frames / info.fps:.1f} s at {info.fps} Hz)"
-    yield "task", f"{info.task} with {info.robot.name}"
+    task = info.instruction if info.simulation is None else info.task
+    yield "task", f"{task} with {info.robot_name}"
     yield "episode", f"{info.episode_index}, attempt {info.attempt}"
     if outcome is None:
         yield "outcome", "unknown: recovered after a crash"
     else:
-        yield "outcome", "success" if outcome.success else f"{outcome.failure_reason} in phase {outcome.failure_phase}"
+        phase = f" in phase {outcome.failure_phase}" if outcome.failure_phase else ""
+        yield "outcome", _OUTCOMES.get(outcome.success) or f"{outcome.failure_reason}{phase}"
     yield "cameras", " and ".join(recording.cameras) or "none"
 
 
@@ -222,8 +232,8 @@ def _html_page(recording: RecordingReader) -> str:
         for name, value in facts
     ]
     moments = np.linspace(0, recording.num_frames - 1, _MOMENTS).round().astype(int).tolist()
-    for camera in recording.cameras if recording.num_frames else ():
-        pictures = "".join(_picture(recording.image(camera, moment)) for moment in moments)
+    for camera in (name for name in recording.cameras if recording.num_frames and recording.num_images(name)):
+        pictures = "".join(map(_picture, recording.images_at(camera, moments)))
         rows.append(f"<tr><th>{html.escape(printable(camera))}</th><td style='text-align: left'>{pictures}</td></tr>")
     return f"<table>{''.join(rows)}</table>"
 
@@ -242,21 +252,19 @@ def _components(name: str, rows: NDArray[np.float64], parts: Sequence[str]) -> d
     return {f"{name}.{part}": rows[:, number] for number, part in enumerate(parts)}
 
 
-AnyRecording = SimulatedRecording | Recording
+def open_recording(path: str | Path, *, simulated: bool = False) -> Recording:
+    """Open a recording.
 
+    Args:
+        path: Of the file.
+        simulated: Whether only an episode that demorec simulated will do.
 
-def open_recording(path: str | Path) -> AnyRecording:
-    """Open a recording; RecordingError as `SimulatedRecording` and `Recording`."""
-    try:
-        return SimulatedRecording(path)
-    except NotSimulatedError:
-        return Recording(path)
-
-
-def is_external(path: Path) -> bool:
-    """Whether a file is the recording of an external episode; False for what cannot be read."""
-    try:
-        with open_recording(path) as recording:
-            return isinstance(recording, Recording)
-    except RecordingError:
-        return False
+    Raises:
+        NotSimulatedError: It was recorded by another robot or program, and that will not do.
+        RecordingError: As `Recording`.
+    """
+    recording = Recording(path)
+    if simulated and recording.info.simulation is None:
+        recording.close()
+        raise NotSimulatedError("scene", recording.path)
+    return recording

@@ -17,13 +17,11 @@ from mcap.records import Metadata
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.core.files import make_folder
 from demorec.episode.episode import frame_time_ns
-from demorec.episode.external import Origin
+from demorec.episode.info import Origin
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import SalvagedMessage, salvage
-from demorec.mcap.external_reader import Recording
-from demorec.mcap.metadata import read_external_metadata
 from demorec.mcap.part_file import PartFile
-from demorec.mcap.recording import SimulatedRecording, open_recording
+from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.mcap.streams import FRAMES, feature_streams, frame_streams
 
@@ -86,7 +84,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         else:
             file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(frames.num_frames)}))
         file.end()
-        with frames.reader(part) as recording:
+        with Recording(part) as recording:
             recording.columns()  # a recovered file that cannot be read would be worse than none
         file.publish()
     except BaseException:
@@ -118,12 +116,9 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
         origin: That of the recording that is about to be written in its place, as its info has it.
     """
     for item in _items(part):
-        if isinstance(item, Metadata) and item.name == metadata.EPISODE:
-            info, _ = metadata.read_episode_metadata(item.metadata)
-            return bool(origin) and info.origin == origin
-        if isinstance(item, Metadata) and item.name == metadata.EXTERNAL:
-            external, _, _ = read_external_metadata(item.metadata)
-            return external.origin.kind == "import" and external.origin == origin
+        if isinstance(item, Metadata) and item.name in metadata.RECORDS:
+            info, _, _ = metadata.read_episode_metadata(item.name, item.metadata)
+            return info.origin == origin and origin not in ("", Origin())
         if isinstance(item, str):
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
         if item is not None:
@@ -137,12 +132,10 @@ class _Frames(NamedTuple):
     Attributes:
         num_frames: That all streams have in common.
         keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
-        reader: Of such recordings.
     """
 
     num_frames: int
     keeps: Callable[[SalvagedMessage, int], bool]
-    reader: type[SimulatedRecording] | type[Recording]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,23 +189,23 @@ def _survey(source: Path) -> _Survey:
 
 
 def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames:
-    info, cameras = metadata.read_episode_metadata(episode)
+    info, cameras, _ = metadata.read_episode_metadata(metadata.EPISODE, episode)
     topics = [stream.topic for stream in frame_streams(info) if stream.topic != channels.JOINT_STATES]
     for camera, streams in cameras.items():
         topics.append(channels.video_topic(camera, streams.video.codec))
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
     num_frames = min(counts[topic] for topic in topics)
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns, SimulatedRecording)
+    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns)
 
 
 def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
     """Images come before the frames that hold them, so what is there of the frames has its images."""
-    info, _, _ = read_external_metadata(episode)
+    info, _, _ = metadata.read_episode_metadata(metadata.EXTERNAL, episode)
     topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
     num_frames = min(counts[topic] for topic in topics)
 
     def keeps(message: SalvagedMessage, count: int) -> bool:
         return message.topic not in topics | {channels.TF} or count <= num_frames
 
-    return _Frames(num_frames, keeps, Recording)
+    return _Frames(num_frames, keeps)

@@ -1,7 +1,7 @@
 """The streams with one message a frame, one row each: topic, ROS 2 type, layout, encoding and decoding.
 
 `frame_streams` is the table of a simulated episode. A row says which values of a frame its message holds (`parts`) and
-which columns of `SimulatedColumns` they become when a recording is read (`columns`); the writer, the reader, recovery
+which columns of `Columns` they become when a recording is read (`columns`); the writer, the reader, recovery
 and the checks go through the rows and know no topic by name. `since` is the format version that brought a stream: in
 older recordings it is neither expected nor written, and what it would hold is None.
 
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Action, Frame, Observation, SimulatedColumns, SimulatedInfo
-from demorec.episode.external import EpisodeInfo, Feature
+from demorec.episode.episode import Action, Columns, Frame, Observation
+from demorec.episode.info import EpisodeInfo, Feature
 from demorec.episode.sensed import STREAMS, Sensed, Stream
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
@@ -44,7 +44,7 @@ GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""
 
 ColumnArrays = dict[str, Array | dict[str, Array]]
-"""Field of `SimulatedColumns` -> its rows, or name -> rows where the field is a mapping."""
+"""Field of `Columns` -> its rows, or name -> rows where the field is a mapping."""
 
 
 class FrameValues(NamedTuple):
@@ -96,7 +96,7 @@ class FrameStream:
         return self.layout.encode(np.array(time_ns, dtype=np.int64), values)
 
 
-def frame_streams(info: SimulatedInfo) -> tuple[FrameStream, ...]:
+def frame_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
     """The streams of a recording of the version that `info` names.
 
     `/joint_states` comes first; it may have more messages between the frames.
@@ -104,7 +104,7 @@ def frame_streams(info: SimulatedInfo) -> tuple[FrameStream, ...]:
     return tuple(stream for stream in _every_stream(info) if stream.since <= info.format_version)
 
 
-def _every_stream(info: SimulatedInfo) -> Iterator[FrameStream]:
+def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
     """The table of all versions' streams."""
     robot, scene = info.robot, info.scene
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
@@ -138,7 +138,7 @@ def tf_stream(frames: FrameTree) -> FrameStream:
 
 
 def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
-    """The columns of several streams as arguments of `SimulatedColumns`; the mappings are there even when empty."""
+    """The columns of several streams as arguments of `Columns`; the mappings are there even when empty."""
     merged: dict[str, Any] = {"sensed": {}, "object_poses": {}, "world_from_camera": {}}
     for columns in found:
         for name, rows in columns.items():
@@ -152,7 +152,7 @@ def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
 # --------------------------------------------------------------------------- columns back into one frame's values
 
 
-def observation_at(columns: SimulatedColumns, frame: int) -> Observation:
+def observation_at(columns: Columns, frame: int) -> Observation:
     """The observation of a frame, bit-exact."""
     return Observation(
         joint_position=columns.joint_position[frame].copy(),
@@ -166,7 +166,7 @@ def observation_at(columns: SimulatedColumns, frame: int) -> Observation:
     )
 
 
-def action_at(columns: SimulatedColumns, frame: int, kind: Literal["action", "command"]) -> Action:
+def action_at(columns: Columns, frame: int, kind: Literal["action", "command"]) -> Action:
     """What the expert wanted at a frame, or the command that was sent to the motors."""
     return Action(
         joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.episode.episode import Outcome, SuccessCheck
-from demorec.episode.external import NO_PICTURE, Origin
-from demorec.mcap.external_reader import Recording
-from demorec.mcap.recording import AnyRecording, SimulatedRecording, open_recording
+from demorec.episode.episode import NO_PICTURE, Outcome, SuccessCheck
+from demorec.episode.info import Origin
+from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.video import VideoSettings
 
 
@@ -120,7 +119,7 @@ def summarize(path: Path) -> RecordingSummary:
         RecordingError: It is none, or damaged.
     """
     with open_recording(path) as recording:
-        info, simulated = recording.info, recording.simulated
+        info, simulated = recording.info, recording.info.simulation
         outcome = recording.outcome or Outcome(num_frames=recording.num_frames)
         seconds, rate = _length(recording)
         return RecordingSummary(
@@ -133,7 +132,7 @@ def summarize(path: Path) -> RecordingSummary:
             task=None if simulated is None else simulated.task,
             instruction=info.instruction,
             robot=info.robot_name,
-            has_urdf=isinstance(recording, SimulatedRecording) or bool(recording.info.urdf),
+            has_urdf=simulated is not None or bool(info.urdf),
             objects=() if simulated is None else tuple(body.name for body in simulated.scene.movable),
             success=outcome.success,
             is_recovered=recording.is_recovered,
@@ -147,7 +146,7 @@ def summarize(path: Path) -> RecordingSummary:
             physics_hz=None if simulated is None else simulated.physics_hz,
             seconds=seconds,
             rate=rate,
-            features=() if isinstance(recording, SimulatedRecording) else tuple(_features(recording)),
+            features=tuple(_features(recording)),
             cameras=tuple(_cameras(recording)),
             streams=tuple(
                 StreamSummary(topic=topic, type=kind, messages=count)
@@ -161,9 +160,9 @@ def summarize(path: Path) -> RecordingSummary:
         )
 
 
-def _length(recording: AnyRecording) -> tuple[float, float]:
+def _length(recording: Recording) -> tuple[float, float]:
     """Seconds, and mean frames per second."""
-    if isinstance(recording, SimulatedRecording):
+    if recording.info.simulation is not None:
         return recording.num_frames / recording.info.fps, float(recording.info.fps)
     times = recording.columns().time_ns
     seconds = float(times[-1] - times[0]) / 1e9 if len(times) else 0.0
@@ -182,26 +181,16 @@ def _features(recording: Recording) -> Iterator[FeatureSummary]:
         )
 
 
-def _cameras(recording: AnyRecording) -> Iterator[CameraSummary]:
-    if isinstance(recording, SimulatedRecording):
-        mounts = {camera.name: camera.mount for camera in recording.info.scene.cameras}
-        for name in recording.cameras:
-            yield CameraSummary(
-                name=name,
-                mount=mounts[name],
-                video=recording.video_settings(name),
-                depth=recording.has_depth(name),
-                segmentation=recording.has_segmentation(name),
-                pictures=recording.num_images(name),
-            )
-        return
+def _cameras(recording: Recording) -> Iterator[CameraSummary]:
     columns = recording.columns()
-    for camera in recording.info.cameras:
+    recorded = {*recording.cameras, *recording.depth_cameras}
+    for camera in (camera for camera in recording.info.cameras if camera.name in recorded):
         yield CameraSummary(
             name=camera.name,
             mount=camera.mount,
             video=recording.video_settings(camera.name),
-            depth=camera.is_depth,
+            depth=recording.has_depth(camera.name),
+            segmentation=recording.has_segmentation(camera.name),
             is_kept=bool(camera.kept),
             pictures=recording.num_images(camera.name),
             frames_without=int((columns.pictures[camera.name] == NO_PICTURE).sum()),

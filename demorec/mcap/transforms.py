@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, quat_multiply
-from demorec.episode.episode import Observation, SimulatedInfo
-from demorec.episode.external import EpisodeInfo, Feature, SampledFrame, Vector
+from demorec.episode.episode import Observation, SampledFrame, Vector
+from demorec.episode.info import EpisodeInfo, Feature
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
 from demorec.robots.assets import asset_path
@@ -49,7 +49,7 @@ class FrameTree:
         moving: (parent, child) of those that do, in the order of `arrange`.
     """
 
-    def __init__(self, info: SimulatedInfo) -> None:
+    def __init__(self, info: EpisodeInfo) -> None:
         urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
         self._num_joints = len(info.robot.joint_names)
         self._objects = [body.name for body in info.scene.movable]

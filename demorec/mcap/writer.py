@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import CameraImages, Event, Frame, JointSample, SimulatedInfo, frame_time_ns
-from demorec.episode.scene import SceneCamera
+from demorec.episode.episode import CameraImages, Event, Frame, JointSample, frame_time_ns
+from demorec.episode.info import Camera, EpisodeInfo
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.cdr import encode
 from demorec.mcap.channels import camera_topic
@@ -44,7 +44,7 @@ class CameraRecorder(PictureCoder):
         streams: What is recorded; depth and segmentation when the first frame has them.
     """
 
-    def __init__(self, camera: SceneCamera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
+    def __init__(self, camera: Camera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
         self._camera = camera
         super().__init__(camera, video, fps, compiled=True)
         self.streams = CameraStreams(
@@ -127,10 +127,8 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
         RecordingError: It cannot be written, or the robot's joints are not those of its URDF.
     """
 
-    _record = metadata.EPISODE
-
     def __init__(
-        self, path: Path, info: SimulatedInfo, *, video: VideoConfig | None = None, overwrite: bool = False
+        self, path: Path, info: EpisodeInfo, *, video: VideoConfig | None = None, overwrite: bool = False
     ) -> None:
         check_joint_names(info)
         self._info = info
@@ -143,7 +141,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
         self._num_written = 0
         self._phase: str | None = None
         self._is_miss: bool | None = None
-        super().__init__(path, origin=info.origin, overwrite=overwrite)
+        super().__init__(path, info, overwrite=overwrite)
 
     def write(self, frame: Frame) -> None:
         """Add the next frame.
@@ -177,7 +175,7 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
 
     def _begin(self, first: Frame | None) -> None:
         """Write what is said once, as soon as it is known which images there are."""
-        for camera in self._info.scene.cameras if first is not None else ():
+        for camera in self._info.cameras if first is not None else ():
             assert first is not None
             if camera.name not in first.images:
                 raise RecordingError(f"Frame 0 has no image of the camera {camera.name!r}.")

@@ -13,9 +13,10 @@ import numpy as np
 
 from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option
 from demorec.core.geometry import Array
-from demorec.episode.episode import Action, Frame, SimulatedInfo, SuccessCheck
+from demorec.episode.episode import Action, Frame, SuccessCheck
 from demorec.episode.features import ACTION, STATE, ActionKind
-from demorec.mcap import SimulatedRecording
+from demorec.episode.info import EpisodeInfo
+from demorec.mcap import Recording, open_recording
 from demorec.mcap.recording import frames_of
 from demorec.mcap.streams import action_at
 
@@ -78,7 +79,7 @@ class Demonstration:
     """
 
     name: str
-    info: SimulatedInfo
+    info: EpisodeInfo
     fps: int
     joint_position: Array
     joint_velocity: Array | None
@@ -101,7 +102,7 @@ class Demonstration:
         return len(self.joint_position)
 
 
-def open_demonstration(recording: SimulatedRecording, options: ReplayOptions) -> Demonstration:
+def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstration:
     """A recording to be replayed.
 
     Raises:
@@ -141,7 +142,7 @@ def open_demonstration(recording: SimulatedRecording, options: ReplayOptions) ->
 
 def open_file(path: Path, options: ReplayOptions) -> Demonstration:
     """A recording's file to be replayed; errors as `open_demonstration`."""
-    with SimulatedRecording(path) as recording:
+    with open_recording(path, simulated=True) as recording:
         return replace(open_demonstration(recording, options), source=path)
 
 

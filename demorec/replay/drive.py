@@ -289,7 +289,8 @@ def replay_all(
                 yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
                 continue
             blind = replace(demonstration.info.scene, cameras=())
-            world, _ = simulators.acquire(replace(demonstration.info, fps=demonstration.fps, scene=blind, config={}))
+            info = replace(demonstration.info, fps=demonstration.fps).with_simulation(scene=blind, config={})
+            world, _ = simulators.acquire(info)
             yield replay(demonstration, world, options)[0], None
 
 
@@ -311,7 +312,7 @@ def record_replay(
     view = recorded_view(d.info, options.allowed)
     make_folder(out)
     behaviour = view_behaviour(d.info, view)
-    info = replace(d.info, fps=d.fps, behaviour=behaviour, origin=f"replay of {d.digest[:16]}")
+    info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}").with_simulation(behaviour=behaviour)
     video = from_plain(d.info.config.get("video", {}), VideoConfig)
     world, renderer = simulators.acquire(info)
     painter = view_painter(renderer, view, d.info.config) if renderer else None

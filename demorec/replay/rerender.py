@@ -21,11 +21,12 @@ from demorec.core.registry import nearest_match, split_name
 from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
 from demorec.episode.camera_error import told_error, true_camera
-from demorec.episode.episode import Outcome, SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import Columns, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.loop import prepare
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter, open_recording
 from demorec.mcap.recording import frames_of
 from demorec.render import Renderer
 from demorec.render.painter import Painter, WarmRenderer
@@ -101,7 +102,7 @@ class SceneView:
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
 
 
-def recorded_view(info: SimulatedInfo, allowed: Collection[str]) -> SceneView:
+def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
     """The view of a recording.
 
     Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
@@ -134,7 +135,7 @@ def recorded_view(info: SimulatedInfo, allowed: Collection[str]) -> SceneView:
     return SceneView(scene=info.scene, true_cameras=true_cameras, true_from_recorded=errors)
 
 
-def new_view(info: SimulatedInfo, options: RerenderOptions) -> SceneView:
+def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     """The view that the options ask for.
 
     Raises:
@@ -176,7 +177,7 @@ def new_view(info: SimulatedInfo, options: RerenderOptions) -> SceneView:
     return SceneView(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
 
 
-def view_behaviour(info: SimulatedInfo, view: SceneView) -> dict[str, float]:
+def view_behaviour(info: EpisodeInfo, view: SceneView) -> dict[str, float]:
     """What was drawn for an episode, without the calibration errors of cameras that have none in the view."""
     off = {f"calibration_{name}" for name in view.true_from_recorded}
     return {
@@ -186,7 +187,7 @@ def view_behaviour(info: SimulatedInfo, view: SceneView) -> dict[str, float]:
     }
 
 
-def _default_size(info: SimulatedInfo, options: RerenderOptions) -> tuple[int, int]:
+def _default_size(info: EpisodeInfo, options: RerenderOptions) -> tuple[int, int]:
     first = info.scene.cameras[0] if info.scene.cameras else None
     width = options.width or (first.width if first else int(info.config.get("width", 224)))
     height = options.height or (first.height if first else int(info.config.get("height", 224)))
@@ -217,7 +218,7 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
     )
 
 
-def drawing_config(info: SimulatedInfo, options: RerenderOptions) -> dict[str, Any]:
+def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
     """The recording's config with what the options change about the pictures."""
     config = dict(info.config)
     same_names = ("renderer", "antialias", "depth", "segmentation", "width", "height")
@@ -255,20 +256,15 @@ def rerender(
     if out.resolve() == source.resolve():
         raise ConfigError(f"The new recording would replace its own source, choose another --out: {out}")
     allow_models(options.allowed)
-    with SimulatedRecording(source) as recording:
+    with open_recording(source, simulated=True) as recording:
         info, columns = recording.info, recording.columns()
         if columns.num_frames == 0:
             raise RecordingError(f"The recording has no frames: {source}")
         view, config = new_view(info, options), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
         video = from_plain(config.get("video", {}), VideoConfig)
-        new_info = replace(
-            info,
-            scene=view.scene,
-            behaviour=view_behaviour(info, view),
-            config=config,
-            config_digest=digest(config),
-            origin=f"render of {recording.digest()[:16]}",
+        new_info = replace(info, origin=f"render of {recording.digest()[:16]}").with_simulation(
+            scene=view.scene, behaviour=view_behaviour(info, view), config=config, config_digest=digest(config)
         )
         was_there = not overwrite and _is_drawn(out, new_info, _outcome(recording))
         if not was_there:
@@ -292,7 +288,7 @@ def rerender(
 
 
 def _write_drawn(
-    writer: SimulatedWriter, recording: SimulatedRecording, columns: SimulatedColumns, painter: Painter, scene: Scene
+    writer: SimulatedWriter, recording: Recording, columns: Columns, painter: Painter, scene: Scene
 ) -> None:
     """All frames of a recording with new pictures of the scene, and its outcome."""
     world = RecordedWorld(
@@ -305,20 +301,20 @@ def _write_drawn(
     writer.finish(_outcome(recording))
 
 
-def _is_drawn(out: Path, info: SimulatedInfo, outcome: Outcome) -> bool:
+def _is_drawn(out: Path, info: EpisodeInfo, outcome: Outcome) -> bool:
     """Whether a whole recording is there whose description is the one that would be written now.
 
     The description holds the digest of the source, the cameras, the looks and every option of the drawing.
     """
     try:
-        with SimulatedRecording(out) as drawn:
+        with open_recording(out, simulated=True) as drawn:
             is_same = to_json(drawn.info) == to_json(info) and drawn.outcome == outcome
             return is_same and bool(drawn.digest())  # which reads it to its end, against its checksums
     except RecordingError:
         return False
 
 
-def _outcome(recording: SimulatedRecording) -> Outcome:
+def _outcome(recording: Recording) -> Outcome:
     if recording.outcome is not None:
         return recording.outcome
     return Outcome(
@@ -330,7 +326,7 @@ def _outcome(recording: SimulatedRecording) -> Outcome:
     )
 
 
-def _compare(recording: SimulatedRecording, out: Path, options: RerenderOptions) -> dict[str, int | None]:
+def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[str, int | None]:
     """The packets of the cameras that were to stay as they were: equal pictures give equal packets.
 
     Returns:
@@ -339,7 +335,7 @@ def _compare(recording: SimulatedRecording, out: Path, options: RerenderOptions)
     found: dict[str, int | None] = {}
     if options.looks is not None:
         return found
-    with SimulatedRecording(out) as new:
+    with open_recording(out, simulated=True) as new:
         how, how_now = ((c.get("renderer"), c.get("antialias", True)) for c in (recording.info.config, new.info.config))
         if how != how_now:
             return found

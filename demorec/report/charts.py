@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.check.coverage import ticks
 from demorec.core.geometry import Array
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.report.content import ReportedEpisode
 from demorec.report.histogram import Histogram
 
@@ -79,7 +79,7 @@ def coverage(title: str, values: Array, failed: NDArray[np.bool_]) -> Chart:
     return Chart(title, paths, f"{edges[0]:.3g}", f"{edges[-1]:.3g}", f"up to {highest}")
 
 
-def floor_map(members: Sequence[tuple[int, ReportedEpisode, SimulatedInfo]]) -> dict[str, object] | None:
+def floor_map(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) -> dict[str, object] | None:
     """The table from above, the robot below: x points up, y to the left; None without goals.
 
     Args:

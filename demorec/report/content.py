@@ -10,7 +10,8 @@ from typing import Any, Literal
 from numpy.typing import NDArray
 
 from demorec.check.base import Level, Result
-from demorec.episode.episode import Outcome, SimulatedInfo
+from demorec.episode.episode import Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.learn.evaluate.statistics import Rate
 from demorec.report.filmstrip import Filmstrip
 from demorec.report.histogram import Histogram
@@ -51,7 +52,7 @@ class ReportedEpisode:
     flags: tuple[Result, ...] = ()
     filmstrip: Filmstrip | None = None
     facts: tuple[tuple[str, str], ...] = ()
-    info: SimulatedInfo | None = None
+    info: EpisodeInfo | None = None
 
     @property
     def success(self) -> bool | None:

@@ -16,7 +16,7 @@ from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.options import CommonOptions
 from demorec.episode.episode import Outcome
 from demorec.episode.features import ACTION, STATE
-from demorec.mcap import AnyRecording, open_recording
+from demorec.mcap import Recording, open_recording
 from demorec.report.content import (
     CheckSummaries,
     Components,
@@ -143,9 +143,9 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
     return replace(episode, source=source, flags=tuple(flags)), counts, checked
 
 
-def _read_recording(recording: AnyRecording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
+def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
     info, content = recording.info, ExportEpisode(recording, CommonOptions())
-    names = () if content.simulated is None else content.columns.phase
+    names = content.columns.phase
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
@@ -159,7 +159,7 @@ def _read_recording(recording: AnyRecording, camera: str, strip_bytes: int) -> t
     bounds = [0, *changes, len(names)] if names else []
     is_failed = recording.path.parent.name == FAILED
     attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
-    simulated = recording.simulated
+    simulated = info.simulation
     episode = ReportedEpisode(
         name=f"episode {info.episode_index}{attempt}",
         problem="A crash cut the recording off; it was recovered." if recording.outcome is None else "",
@@ -171,7 +171,7 @@ def _read_recording(recording: AnyRecording, camera: str, strip_bytes: int) -> t
         phases=tuple((names[first], first, end) for first, end in pairwise(bounds)),
         filmstrip=strip,
         facts=tuple(_facts_of(recording)),
-        info=simulated,
+        info=None if simulated is None else info,
     )
     return episode, _components(content)
 
@@ -188,8 +188,8 @@ def _components(content: ExportEpisode) -> Components:
     return counts
 
 
-def _facts_of(recording: AnyRecording) -> Iterator[tuple[str, str]]:
-    info, simulated = recording.info, recording.simulated
+def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:
+    info, simulated = recording.info, recording.info.simulation
     if simulated is not None:
         yield "task", simulated.task
     yield "robot", info.robot_name

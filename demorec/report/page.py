@@ -25,8 +25,8 @@ from demorec.check.coverage import MIN_VALUES, drawn_columns, randomised, with_u
 from demorec.core.errors import ConfigError
 from demorec.core.replacing import REPORT, REPORT_MARK, written_whole
 from demorec.core.text import printable
-from demorec.episode.episode import SimulatedInfo
 from demorec.episode.features import ACTION, STATE
+from demorec.episode.info import EpisodeInfo
 from demorec.report import charts
 from demorec.report.charts import Chart, css_color
 from demorec.report.content import LEVELS, Report, ReportedEpisode, State, success_rate
@@ -173,7 +173,7 @@ def _words(episode: ReportedEpisode) -> str:
 
 def _coverage(episodes: Sequence[ReportedEpisode]) -> Iterator[dict[str, object]]:
     """For each task the variables of its part of the section."""
-    by_task: dict[str, list[tuple[int, ReportedEpisode, SimulatedInfo]]] = {}
+    by_task: dict[str, list[tuple[int, ReportedEpisode, EpisodeInfo]]] = {}
     for number, episode in enumerate(episodes):
         if episode.info is not None:
             by_task.setdefault(episode.info.task, []).append((number, episode, episode.info))

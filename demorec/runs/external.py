@@ -17,7 +17,7 @@ from demorec.core.errors import ConfigError, RecordingError, in_words, resource_
 from demorec.core.files import LOCK_NAME, MAX_JSON_BYTES, make_folder, read_json_limited, run_lock
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.replacing import json_object
-from demorec.episode.external import EpisodeInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, recover
 from demorec.runs.run_file import (
     COLLECTED,
@@ -225,7 +225,7 @@ class ExternalFolder:
             return
         session = self._session | ({"ended": utc_now()} if ended else {})
         run = ExternalRun(
-            robot=info.robot, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
+            robot=info.robot_name, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
         )
         plain = to_plain(run)
         lines = plain.pop("episodes")
@@ -290,7 +290,7 @@ def external_line(file: Path) -> ExternalEpisode:
 
 def differences(there: EpisodeInfo, new: EpisodeInfo) -> list[str]:
     """In what two episodes differ that one run or dataset must have in common, in words."""
-    traits = [("robot", there.robot, new.robot), ("fps", str(there.fps), str(new.fps))]
+    traits = [("robot", there.robot_name, new.robot_name), ("fps", str(there.fps), str(new.fps))]
     for kind, old_ones, new_ones in (
         ("feature", _features(there), _features(new)),
         ("camera", _cameras(there), _cameras(new)),

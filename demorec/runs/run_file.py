@@ -308,9 +308,9 @@ def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[s
     Raises:
         RecordingError: It is no complete recording.
     """
-    from demorec.mcap import SimulatedRecording  # which reading run.json alone does not need
+    from demorec.mcap import open_recording  # which reading run.json alone does not need
 
-    with SimulatedRecording(path) as recording:
+    with open_recording(path, simulated=True) as recording:
         info, outcome = recording.info, recording.outcome
         if outcome is None:
             raise RecordingError(f"The recording was cut off by a crash: {path}")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.external import DEPTH_UNITS
+from demorec.episode.info import DEPTH_UNITS
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.fields import frame_id_of
 from demorec.sources.findings import FROZEN, GAP, LOST, NOTE, STILL_S, Finding, of_stream, stream_findings

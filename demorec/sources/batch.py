@@ -15,7 +15,7 @@ from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
 from demorec.core.processes import SPAWN
-from demorec.episode.external import EpisodeInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.runs.external import ExternalEpisode, ExternalFolder, differences
 from demorec.sources.bag import Bag, Files, open_bag
 from demorec.sources.episode_writer import PlannedEpisode

@@ -16,7 +16,8 @@ from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.lerobot.episodes import DatasetRecording, LeRobotDataset
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.videos import why_transcoded
-from demorec.episode.external import Camera, EpisodeInfo, Origin, SourceFile, Vector
+from demorec.episode.episode import Vector
+from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.runs.external import open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of

@@ -15,15 +15,8 @@ import numpy as np
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.files import read_text_limited
-from demorec.episode.episode import Outcome
-from demorec.episode.external import (
-    DEPTH_UNITS,
-    Camera,
-    EpisodeInfo,
-    Feature,
-    Sample,
-    SampledFrame,
-)
+from demorec.episode.episode import Outcome, Sample, SampledFrame
+from demorec.episode.info import DEPTH_UNITS, Camera, EpisodeInfo, Feature
 from demorec.mcap import EpisodeWriter
 from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError

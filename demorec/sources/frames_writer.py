@@ -11,8 +11,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.episode.episode import Outcome, frame_time_ns
-from demorec.episode.external import EpisodeInfo, Sample, SampledFrame, Vector
+from demorec.episode.episode import Outcome, Sample, SampledFrame, Vector, frame_time_ns
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import EpisodeWriter
 from demorec.runs.external import ExternalFolder
 

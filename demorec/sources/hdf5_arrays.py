@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from demorec.core.config import MAX_PIXELS
 from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
-from demorec.episode.external import Camera, Feature, Kept, Vector
+from demorec.episode.episode import Vector
+from demorec.episode.info import Camera, Feature, Kept
 from demorec.sources.fields import FieldError, converted
 from demorec.sources.frames_writer import Picture
 from demorec.sources.mapping import MAX_ELEMENTS, STATE, CameraSource, Source, conversion_factor, recorded_unit

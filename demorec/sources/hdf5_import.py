@@ -22,8 +22,8 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
-from demorec.episode.episode import Outcome
-from demorec.episode.external import EpisodeInfo, Origin, SourceFile, Vector
+from demorec.episode.episode import Outcome, Vector
+from demorec.episode.info import EpisodeInfo, Origin, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import differences, open_external_run
@@ -158,7 +158,7 @@ class _Stored:
         info = EpisodeInfo(
             episode_index=episode_index,
             instruction=task_of(file, place, mapping),
-            robot=mapping.robot.name,
+            robot_name=mapping.robot.name,
             urdf=urdf,
             fps=rate_of(file, place, mapping),
             features=tuple(feature.described(joints) for feature in self.features),

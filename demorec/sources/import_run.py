@@ -16,7 +16,7 @@ import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
-from demorec.episode.external import EpisodeInfo, Origin, SourceFile
+from demorec.episode.info import EpisodeInfo, Origin, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.limits import LimitError, Limits
@@ -169,7 +169,7 @@ class _Importer:
         info = EpisodeInfo(
             episode_index=index,
             instruction=" ".join(task_text(bag, lines.streams, rows.window, self.mapping).split()),
-            robot=self.mapping.robot.name,
+            robot_name=self.mapping.robot.name,
             urdf=urdf,
             fps=self.mapping.clock.fps,
             features=tuple(described_feature(name, feature, lines, joints) for name, feature in rows.features.items()),

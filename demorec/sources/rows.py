@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.external import DEPTH_UNITS, Kept
+from demorec.episode.info import DEPTH_UNITS, Kept
 from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline

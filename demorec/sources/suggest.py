@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.episode.external import DEPTH_UNITS
+from demorec.episode.info import DEPTH_UNITS
 from demorec.mcap.limits import SpentError
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.bag_files import BagError, BagMessage

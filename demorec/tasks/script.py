@@ -12,7 +12,7 @@ from demorec.sim.world import World
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """How the expert does it in one episode; recorded as `SimulatedInfo.behaviour`.
+    """How the expert does it in one episode; recorded as `EpisodeInfo.behaviour`.
 
     Attributes:
         speed: Factor on the speeds of all motions; touching down with an object is never faster than at 1.

@@ -152,8 +152,8 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
     Raises:
         RecordingError: A mesh of the robot's model cannot be read.
     """
-    info, description, positions = episode.simulated, episode.robot_description, episode.joint_position
-    if info is not None:
+    info, description, positions = episode.info, episode.robot_description, episode.joint_position
+    if info.simulation is not None:
         urdf, meshes = robot_model(info.robot.urdf, info.scene.robot.scale, description)
     elif description is not None:
         urdf = Urdf.parse(description)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Event, Outcome, SimulatedInfo
-from demorec.episode.external import EpisodeInfo
+from demorec.episode.episode import Event, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED
 from demorec.robots.robot import RobotSpec
@@ -65,8 +65,7 @@ class PlayedEpisode:
         group: Run or dataset that it belongs to.
         identity: Distinguishes it from all others.
         source: Where it was read from, for people.
-        simulated: Scene, robot, cameras, seed; None of an episode that demorec did not simulate.
-        described: What is known of such a one.
+        info: What is known before the first frame.
         outcome: How it ended, None when nobody knows.
         time_ns: (T,) of the frames, since the first one.
         curves: Name -> measured values.
@@ -91,8 +90,7 @@ class PlayedEpisode:
     group: str
     identity: str
     source: str
-    simulated: SimulatedInfo | None = None
-    described: EpisodeInfo | None = None
+    info: EpisodeInfo
     outcome: Outcome | None
     time_ns: NDArray[np.int64]
     curves: Mapping[str, Curves]
@@ -113,16 +111,9 @@ class PlayedEpisode:
     boxes: Mapping[str, Mapping[int, Sequence[tuple[str, Box]]]] = field(default_factory=dict)
 
     @property
-    def info(self) -> SimulatedInfo | EpisodeInfo:
-        """What is known before the first frame."""
-        info = self.simulated or self.described
-        assert info is not None, "every source describes its episodes"
-        return info
-
-    @property
     def scene(self) -> Scene | None:
         """The world at the start, where it is known."""
-        return None if self.simulated is None else self.simulated.scene
+        return None if self.info.simulation is None else self.info.scene
 
     @property
     def world_from_base(self) -> Pose:

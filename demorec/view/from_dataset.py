@@ -27,8 +27,9 @@ from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places
 from demorec.datasets.lerobot.robots import DatasetRobot
-from demorec.episode.episode import Outcome, SimulatedInfo, SuccessCheck
+from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED
 from demorec.episode.validity import read_episode_info
@@ -119,7 +120,7 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
     time_ns = columns.time_ns - columns.time_ns[0]
     return PlayedEpisode(
         **known,
-        simulated=info,
+        info=info,
         outcome=_outcome(row, len(state)),
         robot_description=None if robot is None else robot.urdf,
         time_ns=time_ns,
@@ -150,7 +151,7 @@ def _boxes(recording: DatasetRecording, camera: str) -> dict[int, list[tuple[str
     return seen
 
 
-def _tcp_poses(info: SimulatedInfo, state: Array, robot: DatasetRobot | None) -> Array:
+def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
     """(T, 7) from the joints, of a dataset that leaves observation.ee_pose out."""
     spec = info.robot
     urdf = Urdf.load(asset_path(spec.urdf), scale=info.scene.robot.scale) if robot is None else robot.model
@@ -165,7 +166,7 @@ def _tcp_poses(info: SimulatedInfo, state: Array, robot: DatasetRobot | None) ->
 
 
 def _object_poses(
-    info: SimulatedInfo, ends: dict[str, Array], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
+    info: EpisodeInfo, ends: dict[str, Array], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
 ) -> dict[str, Array]:
     """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
     if ENVIRONMENT_STATE not in data:
@@ -212,7 +213,7 @@ def _camera_poses(recording: DatasetRecording) -> dict[str, Array]:
 
 
 def _curves(
-    info: SimulatedInfo,
+    info: EpisodeInfo,
     data: dict[str, Array],
     base_from_tcp: Array,
     time_ns: NDArray[np.int64],

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.datasets.lerobot.episodes import DatasetRecording
-from demorec.episode.episode import SimulatedColumns
-from demorec.episode.external import NO_PICTURE, Columns, EpisodeInfo
+from demorec.episode.episode import NO_PICTURE, Columns
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import ObservationRows
-from demorec.mcap import AnyRecording, Recording, SimulatedRecording, open_recording
+from demorec.mcap import Recording, open_recording
 from demorec.mcap.channels import description_topic
 from demorec.mcap.transforms import JointPositions
 from demorec.runs.run_file import EPISODES, FAILED
@@ -38,18 +38,17 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
         "source": path.name,
     }
     with open_recording(path) as recording:
-        match recording:
-            case SimulatedRecording():
-                yield _simulated(recording, known)
-            case Recording():
-                yield external_episode(recording, known, recording.info)
+        if recording.info.simulation is None:
+            yield external_episode(recording, known, recording.info)
+        else:
+            yield _simulated(recording, known)
 
 
-def _simulated(recording: SimulatedRecording, known: dict[str, Any]) -> PlayedEpisode:
+def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
     info, columns = recording.info, recording.columns()
     return PlayedEpisode(
         **known,
-        simulated=info,
+        info=info,
         outcome=recording.outcome,
         robot_description=recording.description(),
         body_description=lambda body: (
@@ -88,7 +87,7 @@ def external_episode(
     values = positions.of(columns.features) if positions.joints else np.zeros((len(time_ns), 0))
     return PlayedEpisode(
         **known,
-        described=info,
+        info=info,
         robot_description=info.urdf or None,
         outcome=recording.outcome,
         time_ns=time_ns,
@@ -125,7 +124,7 @@ def shown_at(columns: Columns, camera: str, time_ns: NDArray[np.int64]) -> NDArr
     return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
 
 
-def video_of(recording: AnyRecording | DatasetRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
+def video_of(recording: Recording | DatasetRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
     """The coded pictures of a camera, each at its time (P,)."""
 
     def packets() -> Iterator[tuple[int, bytes, bool]]:
@@ -135,7 +134,7 @@ def video_of(recording: AnyRecording | DatasetRecording, camera: str, shown_at: 
     return Video(codec=recording.video_settings(camera).codec, packets=packets)
 
 
-def _curves(recording: SimulatedRecording, columns: SimulatedColumns) -> dict[str, Curves]:
+def _curves(recording: Recording, columns: Columns) -> dict[str, Curves]:
     """All plots; joints at the rate at which they were recorded, which may be that of the physics."""
     robot = recording.info.robot
     time_ns = columns.time_ns

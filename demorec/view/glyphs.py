@@ -54,11 +54,11 @@ def drawable_source(source: PlaybackSource, missing: set[str]) -> PlaybackSource
     def opened() -> Iterator[PlayedEpisode]:
         with source.open() as episode:
             spelt = drawable(episode, missing)
-            if episode.simulated is not None:  # models are looked for by their own names
-                bodies = {drawable(body.name, missing): body.name for body in episode.simulated.scene.bodies}
+            if episode.scene is not None:  # models are looked for by their own names
+                bodies = {drawable(body.name, missing): body.name for body in episode.scene.bodies}
                 spelt = replace(
                     spelt,
-                    simulated=replace(spelt.simulated, robot=episode.simulated.robot),
+                    info=spelt.info.with_simulation(robot=episode.info.robot),
                     joint_position=episode.joint_position,
                     body_description=lambda name: episode.body_description(bodies[name]),
                 )

@@ -62,7 +62,7 @@ def new_recording(episode: PlayedEpisode) -> rr.RecordingStream:
 
 def application_id(episode: PlayedEpisode) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
-    words = ["" if episode.simulated is None else episode.simulated.task, *episode.cameras]
+    words = ["" if episode.scene is None else episode.info.task, *episode.cameras]
     return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in (episode.group, *words) if word)
 
 
@@ -118,7 +118,7 @@ def entry(episode: PlayedEpisode) -> str:
 
 def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
     """What the viewer lists beside the recording's name."""
-    info, simulated, outcome = episode.info, episode.simulated, episode.outcome
+    info, outcome = episode.info, episode.outcome
     values: dict[str, str | int | float | bool] = {
         "instruction": info.instruction,
         "outcome": episode.verdict,
@@ -130,10 +130,10 @@ def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
     }
     if outcome is not None and outcome.success is not None:
         values["success"] = outcome.success
-    if simulated is not None:
-        values |= {"task": simulated.task, "seed": simulated.root_seed, "attempt": simulated.attempt}
+    if info.simulation is not None:
+        values |= {"task": info.task, "seed": info.root_seed, "attempt": info.attempt}
         values |= {} if outcome is None else {"retries": outcome.num_retries}
-        values |= {"config_digest": simulated.config_digest} if simulated.config_digest else {}
+        values |= {"config_digest": info.config_digest} if info.config_digest else {}
     if origin := _origin(episode):
         values["origin"] = origin
     return values
@@ -147,9 +147,9 @@ def _origin(episode: PlayedEpisode) -> str:
 
 def summary(episode: PlayedEpisode) -> str:
     """Markdown: task, outcome and its checks, the failed ones first."""
-    info, simulated = episode.info, episode.simulated
-    about = [info.robot_name if simulated is None else simulated.task, f"episode {info.episode_index}"]
-    about += [] if simulated is None else [f"seed {simulated.root_seed}"]
+    info = episode.info
+    about = [info.robot_name if info.simulation is None else info.task, f"episode {info.episode_index}"]
+    about += [] if info.simulation is None else [f"seed {info.root_seed}"]
     length = f"{episode.duration:.1f} s · {episode.num_frames} frames (nominal {info.fps} Hz)"
     origin, checks = _origin(episode), [] if episode.outcome is None else _checks(episode.outcome)
     parts = [f"**{info.instruction}**", " · ".join(about), length, f"Outcome: **{episode.verdict}**"]
@@ -188,7 +188,7 @@ def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpi
         ConfigError: The robots differ, so that nothing can be laid over each other.
         DemorecError: A source is damaged.
     """
-    if a.simulated is None or b.simulated is None:
+    if a.scene is None or b.scene is None:
         raise ConfigError(
             "Only simulated episodes can be laid over each other: of others nobody knows that their robots stand "
             "alike. View them without --compare."

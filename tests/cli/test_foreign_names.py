@@ -51,8 +51,7 @@ def recording_of(name: str, path: Path) -> Path:
     spoilt = Spoilt(SAMPLE)
     camera = spoilt.info.scene.cameras[0].name
     config = GenerateConfig(task=name, robot=name, cameras=(name,), width=64, height=64, variation="full")
-    spoilt.info = replace(
-        spoilt.info,
+    spoilt.info = spoilt.info.with_simulation(
         task=name,
         config={**spoilt.info.config, **to_plain(config)} | {"renderer": "raster"},
         behaviour={**spoilt.info.behaviour, f"calibration_{camera}_x": 0.01},

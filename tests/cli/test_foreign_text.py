@@ -18,7 +18,7 @@ from support.mcap import rewritten
 from support.recording import write_episode
 
 from demorec.cli import COMMANDS, main, run_command
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
 
 HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
@@ -63,7 +63,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a good recording, hostile copies of it, of a run and of a dataset."""
     folder = tmp_path_factory.mktemp("hostile")
     good = write_episode(folder / "good.mcap", num_frames=24, cameras=())
-    with SimulatedRecording(good) as recording:
+    with Recording(good) as recording:
         container = recording._container
         episode, outcome = container.metadata("demorec.episode"), container.metadata("demorec.outcome")
     assert episode is not None

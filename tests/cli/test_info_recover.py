@@ -13,7 +13,7 @@ from support.export import export, files_of
 from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, main, run_command
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.runs.find import find
 
 
@@ -59,7 +59,7 @@ def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -
 def test_info_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", folder / "a.mcap", "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    with SimulatedRecording(folder / "a.mcap") as recording:
+    with Recording(folder / "a.mcap") as recording:
         assert found["digest"] == recording.digest()
     assert (found["kind"], found["frames"], found["success"], found["root_seed"]) == ("recording", 45, True, 0)
     assert found["cameras"][0]["video"]["codec"] == "h264"
@@ -239,7 +239,7 @@ def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     before = part.read_bytes()
     assert run("recover", part) == 0
     assert capsys.readouterr().out == f"Kept 60 frames, then the end is missing: {tmp_path / 'c.mcap'}\n"
-    with SimulatedRecording(tmp_path / "c.mcap") as recording:
+    with Recording(tmp_path / "c.mcap") as recording:
         assert (recording.num_frames, recording.outcome, recording.is_recovered) == (60, None, True)
     assert part.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c.mcap", "c.mcap.part"]
@@ -273,7 +273,7 @@ def test_what_is_recovered_is_no_further_episode_of_its_run(
         monkeypatch.chdir(damaged.parent)
     assert run("recover", damaged.name if is_inside else damaged) == 0
     place = tmp_path / "run" / ("recovered" if mark else "episodes") / "a.recovered.mcap"
-    with SimulatedRecording(place) as recording:
+    with Recording(place) as recording:
         assert recording.num_frames > 0
     if mark:
         assert find(tmp_path / "run").recordings == (damaged,)

@@ -13,7 +13,7 @@ from support.export import make_run
 from support.mcap import rewritten
 from support.viewer import Chromium, chromium, need_chromium, num_colors, pixels
 
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 HOSTILE = "<script>document.title = 'taken'</script><img src=x onerror=\"document.title = 'taken'\">"
 
@@ -23,7 +23,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report on six episodes, one of which failed and one of which says what would be markup."""
     folder = make_run(tmp_path_factory.mktemp("browser") / "cubes", (24,) * 5, failures=(1,), cameras=("front",))
     file = folder / "episodes" / "episode_000004.mcap"
-    with SimulatedRecording(file) as recording:
+    with Recording(file) as recording:
         found = recording._container.metadata("demorec.episode")
     assert found is not None
     info = json.loads(found["info"])

@@ -11,7 +11,7 @@ from support.check import checked, simulate_run
 
 from demorec.cli import main
 from demorec.core.tables import TASKS
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 
 @pytest.mark.slow
@@ -31,7 +31,7 @@ def test_all_tasks_go_into_one_dataset(tmp_path: Path) -> None:
     row = 0
     for run in runs:
         (path,) = (run / "episodes").glob("*.mcap")
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             columns, instruction = recording.columns(), recording.info.instruction
         item = dataset[row]
         assert item["task"] == instruction

@@ -17,7 +17,7 @@ from demorec.datasets.lerobot.verify import Verifier
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.runs.run_file import load_run_file
 
 CONFIG = GenerateConfig(seed=11, width=48, height=32)
@@ -112,7 +112,7 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
     assert reproduce(tmp_path / "few", tmp_path / "copy") == 0
     assert dataset_digest(tmp_path / "copy" / "dataset") == dataset_digest(tmp_path / "few")
     with (
-        SimulatedRecording(reference.folder / "episodes" / "episode_000001.mcap") as recording,
+        Recording(reference.folder / "episodes" / "episode_000001.mcap") as recording,
         open_dataset_episode(tmp_path / "few", 1) as shown,
     ):
         assert shown.base_from_tcp is not None

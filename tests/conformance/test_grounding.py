@@ -20,7 +20,7 @@ from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot import ExportOptions, dataset_digest
 from demorec.datasets.lerobot.boxes import coco_string
 from demorec.datasets.lerobot.prepare import prepare_episode
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 PREFIX = "observation.images."
 Row = dict[str, Any]
@@ -47,7 +47,7 @@ class Truth:
 
     def __init__(self, run: Path) -> None:
         (path,) = (run / "episodes").glob("*.mcap")
-        self.recording = SimulatedRecording(path)
+        self.recording = Recording(path)
         self.columns, self.scene = self.recording.columns(), self.recording.info.scene
         names = self.recording.segment_names()
         self.labels = {camera: list(self.recording.segmentation(camera)) for camera in self.recording.cameras}
@@ -160,7 +160,7 @@ def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
     (frames,) = language_of(dataset)
     (path,) = (run / "episodes").glob("*.mcap")
     step, last = 30, len(frames) - 1
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         options = ExportOptions(language=())
         told = prepare_episode(
             ExportEpisode(recording, options), options, encode_depth=False, about=[2 * step, last]
@@ -280,7 +280,7 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
     (frames,) = language_of(dataset)
     subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
     with open_dataset_episode(dataset, 0) as episode:
-        assert episode.simulated is not None
+        assert episode.info.simulation is not None
         shown = {time_ns: text for time_ns, kind, text in episode.statements if kind == "subtask"}
         assert [round(time_ns / 1e9, 3) for time_ns in shown] == [round(time, 3) for time in subtasks]
         assert list(shown.values()) == list(subtasks.values())

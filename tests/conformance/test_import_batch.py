@@ -24,6 +24,7 @@ from demorec.check.run import ExternalRun
 from demorec.cli import main
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.tables import CHECKS
+from demorec.episode.info import Origin
 from demorec.mcap import Recording
 from demorec.runs.external import load_external_run
 from demorec.sources import import_run
@@ -113,6 +114,12 @@ def batch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return _batch(tmp_path_factory.mktemp("batch"))
 
 
+def _files(recording: Recording) -> list[str]:
+    origin = recording.info.origin
+    assert isinstance(origin, Origin)
+    return [file.name for file in origin.files]
+
+
 def _content(run: Path) -> dict[str, bytes]:
     """All that does not say who imported when."""
     return {path.name: path.read_bytes() for path in [*run.glob("episodes/*"), run / "import.json"]}
@@ -141,7 +148,7 @@ def test_bad_bags_are_skipped_and_listed(
     assert len(load_external_run(run).episodes) == len(BAD)
     for number in range(len(BAD)):
         with Recording(run / "episodes" / f"episode_{number:06d}.mcap") as recording:
-            assert [file.name for file in recording.info.origin.files] == [f"run_{2 * number}.mcap"]
+            assert _files(recording) == [f"run_{2 * number}.mcap"]
     assert _demorec("info", run) == 0
     shown = capsys.readouterr().out
     assert _demorec("info", run, "--json") == 0
@@ -202,7 +209,7 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
         name: data for name, data in before.items() if name != "import.json"
     }
     with Recording(run / "episodes" / f"episode_{len(BAD):06d}.mcap") as recording:
-        assert [file.name for file in recording.info.origin.files] == ["run_1.mcap"]
+        assert _files(recording) == ["run_1.mcap"]
     skipped = json.loads((run / "import.json").read_text())["skipped"]
     assert [bag["name"] for bag in skipped] == [f"run_{2 * number + 1}.mcap" for number in range(1, len(BAD))]
 

@@ -194,7 +194,7 @@ def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> Non
     report = export(run, tmp_path / "dataset", depth=True)
     assert report.depth_left_out == ()
     with open_dataset_episode(tmp_path / "dataset", 0) as episode:
-        assert episode.simulated is None
+        assert episode.info.simulation is None
         times, shown = zip(*episode.depth["wrist_depth"](), strict=True)
     assert list(times) == episode.time_ns.tolist()
     np.testing.assert_allclose(shown, np.nan_to_num(stored, posinf=0).clip(max=10), atol=2e-3)

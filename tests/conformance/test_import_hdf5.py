@@ -80,7 +80,7 @@ def test_numbers_of_robomimic_are_those_of_the_file(robomimic: tuple[Path, Path]
             for name, values in expected.items():
                 assert columns.features[name].dtype == np.float64
                 np.testing.assert_array_equal(columns.features[name], values)
-            assert (info.robot, info.fps, info.instruction) == ("Panda", 20, "Lift")
+            assert (info.robot_name, info.fps, info.instruction) == ("Panda", 20, "Lift")
             assert columns.time_ns.tolist() == [50_000_000 * row for row in range(length)]
             assert {camera.name: (camera.width, camera.height) for camera in info.cameras} == {
                 "agentview": (WIDTH, HEIGHT),

@@ -113,7 +113,7 @@ def assert_imported(root: Path, run: Path) -> None:
     for episode, path in enumerate(found):
         with Recording(path) as recording:
             np.testing.assert_array_equal(recording.columns().features["observation.state"], state(episode))
-            assert (recording.info.instruction, recording.info.robot) == ("push it", "so100")
+            assert (recording.info.instruction, recording.info.robot_name) == ("push it", "so100")
             assert recording.info.cameras[0].kept == "h264"
             levels = [int(image.mean().round()) for image in recording.images("top")]
             np.testing.assert_allclose(levels, 20 * np.arange(LENGTHS[episode]) + 10, atol=2)
@@ -130,7 +130,7 @@ def test_every_tool_reads_it(version: str, tmp_path: Path, capsys: pytest.Captur
     assert exit_code("view", root, "--save", tmp_path / "cups.rrd", "--episodes", "1") == 0
     assert exit_code("report", root, "--out", tmp_path / "cups.html", "--no-checks") == 0
     with open_dataset_episode(root, 1) as episode:
-        assert episode.simulated is None
+        assert episode.info.simulation is None
         np.testing.assert_array_equal(episode.curves["observation.state"].values, state(1))
         assert len(list(episode.videos["top"].packets())) == LENGTHS[1]
 

@@ -20,7 +20,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.seeding import PURPOSES
 from demorec.datasets.lerobot import dataset_digest
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 Row = dict[str, Any]
 
@@ -52,7 +52,7 @@ def test_a_config_without_it_is_written_as_before() -> None:
 
 
 def test_the_hand_goes_for_the_wrong_thing_until_it_is_told(run: Path) -> None:
-    with SimulatedRecording(recording_of(run)) as recording:
+    with Recording(recording_of(run)) as recording:
         columns, info = recording.columns(), recording.info
         ((time_ns, event),) = [item for item in recording.events() if item[1].name == "interjection"]
     assert recording.outcome is not None
@@ -98,7 +98,7 @@ def test_lerobots_own_validator_finds_nothing(dataset: Path, tmp_path: Path) -> 
 
 
 def test_words_say_what_is_meant_and_the_plan_is_another(run: Path, dataset: Path) -> None:
-    with SimulatedRecording(recording_of(run)) as recording:
+    with Recording(recording_of(run)) as recording:
         scene, fps, phase = recording.info.scene, recording.info.fps, recording.columns().phase
     wanted = scene.goals[0].object
     (frames,) = language_of(dataset)

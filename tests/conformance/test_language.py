@@ -25,7 +25,7 @@ from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.tasks.furniture import THINGS
 
 RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"
@@ -58,9 +58,9 @@ def dataset(runs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def _recording(run: Path) -> SimulatedRecording:
+def _recording(run: Path) -> Recording:
     (path,) = (run / "episodes").glob("*.mcap")
-    return SimulatedRecording(path)
+    return Recording(path)
 
 
 def test_lerobots_own_validator_finds_nothing(dataset: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from support.recording import make_episode
 import demorec.datasets.lerobot.writer
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot, verify
 from demorec.datasets.lerobot.depth import code_values, quantised
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)
 CAMERAS = ("front", "wrist")
@@ -52,7 +52,7 @@ def open_dataset(root: Path, **arguments: Any) -> Any:
 
 
 def recorded_pictures(run: Path, episode: int) -> dict[str, list[np.ndarray[Any, Any]]]:
-    with SimulatedRecording(run / "episodes" / f"episode_{episode:06d}.mcap") as recording:
+    with Recording(run / "episodes" / f"episode_{episode:06d}.mcap") as recording:
         return {camera: list(recording.images(camera)) for camera in CAMERAS}
 
 
@@ -165,7 +165,7 @@ def test_depth_is_read_as_metres(tmp_path: Path) -> None:
     export(run, tmp_path / "d", depth=True)
     found = open_dataset(tmp_path / "d", depth_output_unit="m")
     assert found.meta.depth_keys == ["observation.images.front_depth", "observation.images.wrist_depth"]
-    with SimulatedRecording(run / "episodes" / "episode_000001.mcap") as recording:
+    with Recording(run / "episodes" / "episode_000001.mcap") as recording:
         for t, recorded in enumerate(recording.depth("front")):
             seen = found[6 + t]["observation.images.front_depth"].numpy()[0]
             hit = recorded > 0

@@ -20,7 +20,7 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.learn.evaluate.policy import find_checkpoint, trained_action
 from demorec.learn.evaluate.rollouts import evaluate, load_evaluation, settings_for
 from demorec.loop import ScriptAgent, Session, make_world
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # each command of LeRobot takes 15 s of CPU to start
 
@@ -115,7 +115,7 @@ def test_evaluate_records_every_rollout_and_goes_on(trained: Path, capsys: pytes
     assert len({r.digest for r in whole.rollouts}) == 3
     for rollout in whole.rollouts:
         assert rollout.phase == "reach"
-        with SimulatedRecording(trained / "b" / rollout.file) as recording:
+        with Recording(trained / "b" / rollout.file) as recording:
             assert recording.num_frames == 9
             assert recording.info.origin == f"rollout of act {settings.policy_digest}"
             columns = recording.columns()
@@ -143,7 +143,7 @@ def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.
     assert "taken over       2  the policy has had its time" in told
     assert "success       2/2 = 100.0 %" in told
     for path in sorted((trained / "corrections" / "episodes").iterdir()):
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             phases = recording.columns().phase
         assert set(phases[:9]) == {"policy"}
         assert "policy" not in phases[9:]

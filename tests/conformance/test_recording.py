@@ -23,7 +23,8 @@ from support.present import present
 from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
-from demorec.episode.episode import Frame, Outcome, SimulatedInfo
+from demorec.episode.episode import Frame, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.robots.assets import asset_path
 
@@ -39,7 +40,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def episode() -> tuple[SimulatedInfo, list[Frame], Outcome]:
+def episode() -> tuple[EpisodeInfo, list[Frame], Outcome]:
     return make_episode(num_frames=NUM_FRAMES, depth=True, segmentation=True, physics_rate_joints=True)
 
 
@@ -60,7 +61,7 @@ def test_the_mcap_reader_finds_every_checksum_right(path: Path) -> None:
         assert data_end[0].data_section_crc not in (0, zlib.crc32(stream.read()))
 
 
-def test_mcap_decodes_what_was_written(path: Path, episode: tuple[SimulatedInfo, list[Frame], Outcome]) -> None:
+def test_mcap_decodes_what_was_written(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
     _, frames, _ = episode
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -114,7 +115,7 @@ def test_mcap_decodes_what_was_written(path: Path, episode: tuple[SimulatedInfo,
         assert ((picture == 0) == (present(frame.images["front"].segmentation) == -1)).all()
 
 
-def test_rosbags_deserialises_every_message(path: Path, episode: tuple[SimulatedInfo, list[Frame], Outcome]) -> None:
+def test_rosbags_deserialises_every_message(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
     _, frames, _ = episode
     store = get_typestore(Stores.EMPTY)
     for name, definition in DEFINITIONS.items():
@@ -270,7 +271,7 @@ def test_no_description_needs_another_file(path: Path) -> None:
 
 
 def test_coordinate_frames_are_where_pybullet_has_the_links(
-    path: Path, episode: tuple[SimulatedInfo, list[Frame], Outcome]
+    path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]
 ) -> None:
     """Every link's pose from /tf and /tf_static alone, against PyBullet's own forward kinematics."""
     pybullet = pytest.importorskip("pybullet")

@@ -18,7 +18,7 @@ from support.external import TOP, Episode, make_external, write_external
 from demorec.core.geometry import Pose
 from demorec.core.text import printable
 from demorec.datasets.lerobot import dataset_digest
-from demorec.episode.external import Camera
+from demorec.episode.info import Camera
 from demorec.mcap import Recording
 
 MILLIMETRES = Camera(name="near_depth", width=32, height=24, kept="16UC1")
@@ -81,7 +81,7 @@ def test_of_another_robot(exporter: str, run: Path, tmp_path: Path, capsys: pyte
     for before, after in zip(recordings(run), recordings(again), strict=True):
         with Recording(before) as there, Recording(after) as here:
             assert (here.success, here.info.instruction, here.num_frames) == (there.success, "stack the cups", 12)
-            assert here.info.robot == "two_joints"
+            assert here.info.robot_name == "two_joints"
             for name, values in there.columns().features.items():
                 found = here.columns().features[name]
                 np.testing.assert_array_equal(found, values.astype(np.float32) if exporter == "lerobot" else values)

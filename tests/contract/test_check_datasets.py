@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.tables import TASKS
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import prepare
 
 Rows = np.ndarray[Any, Any]
@@ -79,7 +78,7 @@ def test_a_dataset_that_lacks_an_episode(run: Path, tmp_path: Path) -> None:
     assert level_of(spoilt, "run_dataset", "run") == "fail"
 
 
-def _infos(count: int) -> list[SimulatedInfo]:
+def _infos(count: int) -> list[EpisodeInfo]:
     return [prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=i)).info for i in range(count)]
 
 
@@ -274,7 +273,7 @@ def test_coverage_of_a_dataset_comes_from_its_sidecar(dataset: Path) -> None:
 
     infos = Dataset(dataset).infos
     assert [info.episode_index for info in infos] == [0, 1, 2]
-    renamed = [replace(info, task="another") for info in infos]
+    renamed = [info.with_simulation(task="another") for info in infos]
     assert largest_gap(renamed) is None
 
 

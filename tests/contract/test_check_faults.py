@@ -178,7 +178,7 @@ def one_camera_twice(s: Spoilt) -> None:
 
 def other_field_of_view(s: Spoilt) -> None:
     cameras = tuple(replace(camera, fov_y=camera.fov_y * 0.7) for camera in s.info.scene.cameras)
-    s.info = replace(s.info, scene=replace(s.info.scene, cameras=cameras))
+    s.info = s.info.with_simulation(scene=replace(s.info.scene, cameras=cameras))
 
 
 def shifted_pictures(s: Spoilt) -> None:

@@ -16,7 +16,7 @@ from support.check import checked, copy, edit_column, edit_json, simulate_run
 from demorec.cli import main
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.mcap.description import robot_description
 from demorec.robots.panda import PANDA
 
@@ -150,7 +150,7 @@ def make_by_lerobot(run: Path, root: Path, *, frozen: range = range(0)) -> Path:
     }
     dataset = LeRobotDataset.create("local/strange", 30, features, root=root)
     for path in sorted((run / "episodes").glob("*.mcap")):
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             columns, images = recording.columns(), list(recording.images("front"))
         for t in range(columns.num_frames):
             shown = images[frozen.start if t in frozen else t]

@@ -27,7 +27,7 @@ from demorec.learn.evaluate.rollouts import Evaluation, Settings, make_rollout
 from demorec.learn.evaluate.turns import Turns, read_takeover
 from demorec.learn.evaluate.watch import Watch
 from demorec.loop import ScriptAgent, Session, make_world, prepare
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
@@ -85,7 +85,7 @@ def roll_out(folder: Path, policy: Any, rules: TakeOver, *, action: ActionKind) 
 def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Attempt, Path]) -> None:
     attempt, path = rollout
     assert attempt.success
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         phases = recording.columns().phase
         assert recording.info.origin == "correction of lazy 0"
         assert recording.info.behaviour["action_noise"] == 0.0
@@ -117,7 +117,7 @@ def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Pa
     assert "intervention" not in info(tmp_path / "plain")["features"]
     export(rollout[1], tmp_path / "dataset", intervention=True)
     assert info(tmp_path / "dataset")["features"]["intervention"] == {"dtype": "bool", "shape": [1], "names": None}
-    with SimulatedRecording(rollout[1]) as recording:
+    with Recording(rollout[1]) as recording:
         acted = [frame.phase not in ("policy", "halt") for frame in recording]
     column = data_table(tmp_path / "dataset").column("intervention").to_pylist()
     assert column == acted
@@ -142,7 +142,7 @@ def test_what_a_policy_did_alone_can_be_left_out(
     assert (everything.num_episodes, everything.skipped_unwanted) == (3, 0)
     report = export(sources, tmp_path / "corrected.hdf5", exporter, corrected_only=True)
     assert (report.num_episodes, report.skipped_unwanted) == (2, 1)
-    with SimulatedRecording(demonstration) as plain, SimulatedRecording(rollout[1]) as corrected:
+    with Recording(demonstration) as plain, Recording(rollout[1]) as corrected:
         assert report.num_frames == plain.num_frames + corrected.num_frames
     with pytest.raises(ConfigError, match="or were not corrected"):
         export(uncorrected, tmp_path / "none.hdf5", exporter, corrected_only=True)
@@ -258,7 +258,7 @@ def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Arr
     rules = TakeOver(hand_back=True)
     attempt, path = roll_out(tmp_path, Wanderer(expert_poses, astray_from=20, drift=0.01), rules, action="ee")
     assert attempt.success
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         columns = recording.columns()
         assert recording.info.behaviour["action_noise"] > 0.0
     by_policy = np.array([phase == POLICY_PHASE for phase in columns.phase])

@@ -19,7 +19,7 @@ from demorec.cli import main
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.mcap import SimulatedRecording, channels
+from demorec.mcap import Recording, channels
 
 CAMERA = "observation.images.front"
 Fault = Callable[[Path], None]
@@ -277,7 +277,7 @@ def test_a_recording_with_nan_is_not_exported(tmp_path: Path) -> None:
         return data[:-40] + np.float64(np.nan).tobytes() + data[-32:]  # position, then two sequences of one number
 
     (tmp_path / "b.mcap").write_bytes(rewritten(source, messages=spoil))
-    with SimulatedRecording(tmp_path / "b.mcap") as recording:
+    with Recording(tmp_path / "b.mcap") as recording:
         assert np.flatnonzero(np.isnan(recording.columns().gripper_width)).tolist() == [11]
     with pytest.raises(ExportError, match=r"observation.state is not finite in frame 11"):
         export_lerobot([tmp_path / "b.mcap"], tmp_path / "ds", ExportOptions(verify=False))

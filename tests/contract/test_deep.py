@@ -22,7 +22,7 @@ from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
 from demorec.generate.options import RunResult
 from demorec.loop import SimulatorCache
-from demorec.mcap import SimulatedRecording, recover
+from demorec.mcap import Recording, recover
 from demorec.mcap.metadata import EPISODE, OUTCOME
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.replay.deep import DeepReport, deep_check, deep_checks
@@ -69,7 +69,7 @@ def test_good_recordings_come_out_the_same(filmed: Path, blind: Path, simulators
 
 def test_a_failed_attempt_comes_out_the_same(tmp_path: Path, simulators: SimulatorCache) -> None:
     path = simulate(tmp_path / "failed.mcap", seed=7, fps=FPS, max_episode_seconds=2.0)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         assert recording.outcome is not None
         assert recording.outcome.failure_reason == "time_limit"
     assert deep_check(path, simulators).level == "pass"
@@ -116,7 +116,7 @@ def other(value: Any) -> Any:
 
 def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     """One value of one message each, all in one file: every one is named with its frame, and nothing else is."""
-    with SimulatedRecording(filmed) as recording:
+    with Recording(filmed) as recording:
         topics = recording.topics
     kinds = {kind for kind, _ in topics.values()}
     decoders = {kind: generate_dynamic(kind, DEFINITIONS[kind])[kind] for kind in kinds}
@@ -210,7 +210,7 @@ def leaves(value: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
 def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
     """One value each, in turn: it is named, and nothing else is."""
     again = Contents.of(filmed)
-    with SimulatedRecording(filmed) as recording:
+    with Recording(filmed) as recording:
         info = recording.info
     count = 0
     for key, text in again.metadata[record].items():
@@ -254,7 +254,7 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
 def test_a_changed_description(
     place: tuple[Any, ...], value: Any, named: str, blind: Path, tmp_path: Path, simulators: SimulatorCache
 ) -> None:
-    with SimulatedRecording(blind) as recording:
+    with Recording(blind) as recording:
         info = to_plain(recording.info)
     target = info
     for key in place[:-1]:
@@ -271,7 +271,7 @@ def test_a_changed_description(
 def test_other_versions_are_said_first(
     blind: Path, tmp_path: Path, simulators: SimulatorCache, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with SimulatedRecording(blind) as recording:
+    with Recording(blind) as recording:
         info = to_plain(recording.info)
     info["versions"]["pybullet"] = "3.2.5"
     spoilt = tmp_path / "spoilt.mcap"
@@ -418,7 +418,7 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
     assert "2 episodes made again" in found
     assert not [failure for failure in failures if "made again" in failure]
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         info = to_plain(recording.info)
     info["instruction"] = "Do something else."
     path.write_bytes(rewritten(path, change={EPISODE: {"info": json.dumps(info)}}))

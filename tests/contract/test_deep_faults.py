@@ -22,7 +22,7 @@ from support.mcap import sealed
 from demorec.core.geometry import Pose
 from demorec.episode.camera_error import error_values
 from demorec.episode.episode import Event, SuccessCheck
-from demorec.mcap import SimulatedRecording, channels, messages
+from demorec.mcap import Recording, channels, messages
 from demorec.mcap.pictures import pixel_statistics, read_pixel_statistics
 from demorec.mcap.streams import frame_streams
 from demorec.replay.deep import deep_check
@@ -366,7 +366,7 @@ def test_joint_states_off_the_physics_clock(tmp_path: Path, judge: Judge) -> Non
 def test_values_that_become_no_column(
     topic: str, slot: int, at: int | None, good: Path, tmp_path: Path, judge: Judge
 ) -> None:
-    with SimulatedRecording(good) as recording:
+    with Recording(good) as recording:
         layout = next(stream.layout for stream in frame_streams(recording.info) if stream.topic == topic)
 
     def edit(m: Message) -> list[Message]:

@@ -9,7 +9,7 @@ from support.sim import episode, run
 
 from demorec.core.plain import from_json, to_json
 from demorec.core.tables import ROBOTS, TASKS
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.variation import PRESET_NAMES
 from demorec.loop import make_world
 
@@ -20,7 +20,7 @@ FAST = [case for case in CASES if case[0] == "pick_place" and case[2] == "full"]
 def check(task: str, robot: str, variation: str) -> None:
     prepared = episode(3, task=task, robot=robot, variation=variation)
     frames, outcome = run(prepared)
-    info = from_json(to_json(prepared.info), SimulatedInfo)
+    info = from_json(to_json(prepared.info), EpisodeInfo)
     with make_world(info) as world:
         run(episode(4, task=task, robot=robot, variation=variation, max_episode_seconds=2.0), world)
         assert run(prepared, world)[1].final_state_digest == outcome.final_state_digest

@@ -17,7 +17,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.tables import EXPORTERS
 from demorec.episode.sensed import SENSED
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.mcap.recover import recover
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
@@ -49,7 +49,7 @@ def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: 
 @pytest.mark.parametrize("name", [*SENSED, "command"])
 def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, features=(name,), episodes="0")
-    with SimulatedRecording(run / "episodes" / "episode_000000.mcap") as recording:
+    with Recording(run / "episodes" / "episode_000000.mcap") as recording:
         columns = recording.columns()
     expected = {
         "observation.effort": columns.joint_effort[:, :7],

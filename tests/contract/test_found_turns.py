@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +13,15 @@ from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import draw_episode
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_plain
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import prepare
 
 
-def older(info: SimulatedInfo) -> SimulatedInfo:
+def older(info: EpisodeInfo) -> EpisodeInfo:
     """As recordings were before they told about which axis a camera is turned."""
     behaviour = {name: value for name, value in info.behaviour.items() if name[-3:] not in ("_qx", "_qy", "_qz")}
     assert len(behaviour) < len(info.behaviour)
-    return replace(info, behaviour=behaviour)
+    return info.with_simulation(behaviour=behaviour)
 
 
 @pytest.mark.slow

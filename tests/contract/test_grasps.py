@@ -35,7 +35,7 @@ def with_cube(made: Episode, *, side: float, mass: float, friction: float) -> Ep
         lateral_friction=friction,
     )
     bodies = tuple(cube if body.name == cube.name else body for body in scene.bodies)
-    return replace(made, info=replace(made.info, scene=replace(scene, bodies=bodies)))
+    return replace(made, info=made.info.with_simulation(scene=replace(scene, bodies=bodies)))
 
 
 @pytest.mark.parametrize("robot", ROBOTS.names())

@@ -22,12 +22,13 @@ from demorec.core.errors import ConfigError, SceneError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
-from demorec.episode.episode import SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import Columns
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import SENSED, ObservationRows, Sensed
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 FRAMES = 45
 VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes")
@@ -59,7 +60,7 @@ def test_gymnasium_accepts_the_environment(task: str) -> None:
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_path: Path) -> None:
     """The numbers of the exported features of a file on disk, against those that a policy would see."""
-    with SimulatedRecording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
+    with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, columns = recording.info, recording.columns()
     rows = ObservationRows.of_columns(columns)
     expected = features.observation_vectors(rows, info.robot, info.scene, privileged=True)
@@ -85,7 +86,7 @@ def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> 
     export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False, features=(*SENSED, "command")))
     table = data_table(tmp_path / "ds")
     exported = {name: np.array(table.column(name).to_pylist(), np.float32) for name in (*SENSED, "command", "action")}
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         columns = recording.columns()
     env = make(split="all", sensed=tuple(SENSED))
     observation, _ = env.reset(seed=3)
@@ -113,17 +114,15 @@ def test_a_new_sensed_feature_needs_no_change_of_the_environment(monkeypatch: py
 
 
 @pytest.fixture(scope="module")
-def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedInfo, SimulatedColumns]:
+def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, Columns]:
     """What the expert did in an episode without noise, read from a file."""
     path = simulate(tmp_path_factory.mktemp("expert") / "e.mcap", episode_index=2, variation="none")
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         return recording.info, recording.columns()
 
 
 @pytest.mark.parametrize("kind", ACTION_KINDS)
-def test_exported_actions_solve_the_task(
-    expert: tuple[SimulatedInfo, SimulatedColumns], kind: features.ActionKind
-) -> None:
+def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, Columns], kind: features.ActionKind) -> None:
     """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
     info, columns = expert
     actions = features.action_vectors(columns, info.scene, kind)

@@ -21,7 +21,7 @@ from demorec.core.own_versions import changed_sources, own_versions, source_dige
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.generate.worker import make_episode
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.robots.assets import asset_path
 from demorec.runs.run_file import load_run_file
@@ -63,7 +63,7 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     assert "2 of 2 asked" in told
     assert re.search(r"checks +none failed", told)
     recording = run / "episodes" / "episode_000000.mcap"
-    with SimulatedRecording(recording) as opened:
+    with Recording(recording) as opened:
         assert opened.cameras == ("front", "corner")
         assert opened.info.robot.urdf == "my_robots:xarm6.urdf"  # and no path of this machine
         assert opened.info.versions == load_run_file(run).versions
@@ -98,7 +98,7 @@ def test_the_robot_does_a_task_and_replays(folder: Path, tmp_path: Path) -> None
     path = simulate(
         tmp_path / "e.mcap", robot=XARM6, cameras=("my_robots:CORNER",), renderer="tiny", width=32, height=32
     )
-    with SimulatedRecording(path) as opened:
+    with Recording(path) as opened:
         assert opened.cameras == ("corner",)
         assert opened.outcome is not None
         assert opened.outcome.success

@@ -13,7 +13,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.own_versions import source_digest
 from demorec.core.tables import ROBOTS
 from demorec.loop import ScriptAgent, Session, make_world, prepare
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
@@ -44,7 +44,7 @@ def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch
     monkeypatch.syspath_prepend(str(tmp_path))
     for robot in ROBOTS.names():
         path = simulate(tmp_path / f"{robot}.mcap", task="my_pushing_tasks:PushToMark", robot=robot, seed=3)
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             columns, outcome, scene = recording.columns(), recording.outcome, recording.info.scene
         assert outcome is not None
         assert outcome.success, outcome

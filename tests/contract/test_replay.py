@@ -18,7 +18,7 @@ from support.tasks import tasks_with_slow_ones
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
 
 
@@ -106,7 +106,7 @@ def test_options_that_cannot_be(recorded: Path) -> None:
 def test_a_recording_of_the_replay(tmp_path: Path) -> None:
     source = simulate(tmp_path / "e.mcap", seed=11, cameras=("front",), width=64, height=64)
     assert exit_code("replay", source, "--out", tmp_path / "out") == 0
-    with SimulatedRecording(source) as a, SimulatedRecording(tmp_path / "out" / "e.mcap") as b:
+    with Recording(source) as a, Recording(tmp_path / "out" / "e.mcap") as b:
         assert b.info.origin == f"replay of {a.digest()[:16]}"
         x, y = a.columns(), b.columns()
         assert np.array_equal(x.joint_position, y.joint_position)
@@ -184,7 +184,9 @@ def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytes
 
 def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     info, frames, outcome = make_episode(num_frames=3, cameras=())
-    info = replace(info, robot=replace(info.robot, gripper=replace(info.robot.gripper, joints=(), finger_links=())))
+    info = info.with_simulation(
+        robot=replace(info.robot, gripper=replace(info.robot.gripper, joints=(), finger_links=()))
+    )
     with SimulatedWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:
             seen = frame.observation

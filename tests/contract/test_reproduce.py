@@ -13,7 +13,7 @@ from support.mcap import rewritten
 from demorec.cli import main
 from demorec.core.plain import to_plain
 from demorec.generate.reproduce import read_original
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.mcap.metadata import EPISODE
 
 
@@ -44,7 +44,7 @@ def test_what_is_no_longer_what_was_made(run: Path, tmp_path: Path, capsys: pyte
     names[1].write_bytes(one_bit(names[1]))
     names[2].unlink()
     names[3].write_bytes(names[3].read_bytes()[:-100])
-    with SimulatedRecording(names[4]) as recording:
+    with Recording(names[4]) as recording:
         info = to_plain(recording.info)
     info["versions"]["pybullet"] = "3.2.5"
     names[4].write_bytes(rewritten(names[4], change={EPISODE: {"info": json.dumps(info)}}))

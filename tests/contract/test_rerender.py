@@ -13,7 +13,7 @@ from support.check import checked, simulate
 from support.commands import exit_code
 
 from demorec.core.errors import ConfigError
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.render.painter import WarmRenderer
 from demorec.replay.free_camera import read_cameras
 from demorec.replay.rerender import RerenderOptions, rerender
@@ -36,7 +36,7 @@ def test_own_cameras_and_looks_give_the_recorded_pictures_again(filmed: Path, tm
     report = rerender(filmed, tmp_path / "again.mcap", RerenderOptions())
     assert report.compared == ("front", "wrist")
     assert not report.differing
-    with SimulatedRecording(filmed) as a, SimulatedRecording(tmp_path / "again.mcap") as b:
+    with Recording(filmed) as a, Recording(tmp_path / "again.mcap") as b:
         for camera in a.cameras:
             assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
             assert np.array_equal(a.pixel_statistics(camera).counts, b.pixel_statistics(camera).counts)
@@ -64,7 +64,7 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
     rerender(source, tmp_path / "again.mcap", RerenderOptions())
     rerender(tmp_path / "again.mcap", tmp_path / "thrice.mcap", RerenderOptions())
-    with SimulatedRecording(source) as first, SimulatedRecording(tmp_path / "thrice.mcap") as last:
+    with Recording(source) as first, Recording(tmp_path / "thrice.mcap") as last:
         assert first.info.scene.cameras == last.info.scene.cameras
         off = [
             np.abs(a.astype(int) - b.astype(int)).max()
@@ -83,7 +83,7 @@ def test_other_cameras_sizes_and_looks_pass_the_checks(filmed: Path, tmp_path: P
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
     passed = {r.check for r in report.results if r.level == "pass"}
     assert {"projection", "depth_matches_scene", "segmentation_matches_scene"} <= passed
-    with SimulatedRecording(filmed) as a, SimulatedRecording(out / "filmed.mcap") as b:
+    with Recording(filmed) as a, Recording(out / "filmed.mcap") as b:
         assert b.cameras == ("side", "front")
         assert next(b.images("side")).shape == (96, 128, 3)
         assert b.info.scene.light != a.info.scene.light
@@ -96,7 +96,7 @@ def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
         for name, seed, renderers in (("a", 1, None), ("b", 2, warm), ("c", 1, warm)):
             options = RerenderOptions(looks=seed, cameras=("front",))
             rerender(filmed, tmp_path / f"{name}.mcap", options, renderers=renderers)
-            with SimulatedRecording(tmp_path / f"{name}.mcap") as recording:
+            with Recording(tmp_path / f"{name}.mcap") as recording:
                 scenes.append((recording.info.scene, recording.digest()))
     assert scenes[0] == scenes[2]
     assert scenes[0][0] != scenes[1][0]
@@ -181,7 +181,7 @@ def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str,
     )
     assert done.returncode == 0, done.stderr
     assert "2 of 2 unchanged cameras reproduce the recorded images bit-exactly" in done.stdout
-    with SimulatedRecording(source) as a, SimulatedRecording(tmp_path / "again.mcap") as b:
+    with Recording(source) as a, Recording(tmp_path / "again.mcap") as b:
         for camera in a.cameras:
             assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
             assert np.array_equal(a.columns().world_from_camera[camera], b.columns().world_from_camera[camera])

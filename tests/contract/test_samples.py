@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from demorec.episode.episode import FORMAT_VERSION
-from demorec.mcap import SimulatedRecording
+from demorec.episode.info import FORMAT_VERSION
+from demorec.mcap import Recording
 
 FOLDER = Path(__file__).parents[2] / "recordings" / "sample"
 # Never change a row: the file of a version that is out in the world stays what it is.
@@ -35,7 +35,7 @@ def test_there_is_one_for_every_version() -> None:
 @pytest.mark.parametrize("version", SAMPLES)
 def test_a_sample_is_read(version: int) -> None:
     digest, num_frames, instruction = SAMPLES[version]
-    with SimulatedRecording(FOLDER / f"format_{version}.mcap") as recording:
+    with Recording(FOLDER / f"format_{version}.mcap") as recording:
         assert recording.info.format_version == version
         assert recording.info.instruction == instruction
         assert recording.outcome is not None

@@ -20,7 +20,7 @@ from demorec.episode.features import Vectors
 from demorec.gym_env import DemorecEnv
 from demorec.learn.evaluate.policy import CONFIG_NAME
 from demorec.learn.evaluate.rollouts import settings_for
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 STATE = "observation.state"
 SMALL = ExportOptions(verify=False, action="ee_delta", state="joint_ee", features=(STATE,))
@@ -52,7 +52,7 @@ def states(dataset: Path) -> Vectors:
 
 def test_the_state_is_joints_gripper_and_the_recorded_pose(run: Path, dataset: Path) -> None:
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
-    with SimulatedRecording(first) as recording:
+    with Recording(first) as recording:
         columns = recording.columns()
     found = states(dataset)[: columns.num_frames]
     assert found.shape == (columns.num_frames, 15)
@@ -89,7 +89,7 @@ def test_late_actions_are_found_by_the_pose_in_the_state(small: Path) -> None:
 def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path) -> None:
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
     export_lerobot([first], tmp_path / "one", SMALL)
-    with SimulatedRecording(first) as recording:
+    with Recording(first) as recording:
         columns = recording.columns()
     config = GenerateConfig(cameras=(), seed=3, variation="none")
     env = DemorecEnv(config=config, state="joint_ee", privileged=False)

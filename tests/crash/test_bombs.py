@@ -22,7 +22,7 @@ from support.recording import write_episode
 
 from demorec.core.errors import ConfigError, ExportError, RecordingError
 from demorec.datasets.lerobot.files import check_video
-from demorec.mcap import SimulatedRecording, recover
+from demorec.mcap import Recording, recover
 from demorec.robots.urdf import check_primitives
 
 
@@ -98,14 +98,14 @@ def test_the_limit_can_be_raised(good: Path, tmp_path: Path, monkeypatch: pytest
     chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
     path.write_bytes(rewritten(good, extra_chunks=[chunk]))
     with pytest.raises(RecordingError, match=r"84 MB, allowed are 67 MB; DEMOREC_UNPACKED_MB raises this"):
-        SimulatedRecording(path)
+        Recording(path)
     monkeypatch.setenv("DEMOREC_UNPACKED_MB", "100")
-    with SimulatedRecording(path) as recording, SimulatedRecording(good) as original:
+    with Recording(path) as recording, Recording(good) as original:
         assert recording.digest() == original.digest()
     for wrong in ("many", "-1", "0", "1e9", "9" * 5000, "٣"):
         monkeypatch.setenv("DEMOREC_UNPACKED_MB", wrong)
         with pytest.raises(ConfigError, match="must be a number of megabytes"):
-            SimulatedRecording(path)
+            Recording(path)
 
 
 def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
                 replace(frames[0], frame_index=index, time_ns=frame_time_ns(index, 30), images=black, events=())
             )
         writer.finish(replace(outcome, num_frames=60))
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         limits, places = recording._container._limits, recording._container._chunks
         unpacked = sum(place.uncompressed_size for place in places)
         assert unpacked > 10 * path.stat().st_size
@@ -158,13 +158,13 @@ def test_metadata_nested_without_end(opening: str, depth: int, good: Path, tmp_p
     path = tmp_path / "nested.mcap"
     path.write_bytes(rewritten(good, change={"demorec.episode": {"info": text}}))
     with pytest.raises(RecordingError) as caught:
-        SimulatedRecording(path)
+        Recording(path)
     assert len(str(caught.value)) < 600
 
 
 def test_a_description_of_very_many_values(good: Path, commands: Commands, tmp_path: Path) -> None:
     path = tmp_path / "many.mcap"
-    with SimulatedRecording(good) as recording:
+    with Recording(good) as recording:
         found = recording._container.metadata("demorec.episode")
     assert found is not None
     info = json.loads(found["info"])
@@ -177,14 +177,14 @@ def test_frames_that_only_the_index_has(good: Path, tmp_path: Path) -> None:
     path = tmp_path / "claims.mcap"
     path.write_bytes(rewritten(good, counts=lambda topic, count: 2**60))
     with pytest.raises(RecordingError, match="records, too many for a file of its size"):
-        SimulatedRecording(path)
+        Recording(path)
 
 
 def test_a_fifo_is_no_recording(commands: Commands, tmp_path: Path) -> None:
     path = tmp_path / "episode.mcap"
     os.mkfifo(path)
     with pytest.raises(RecordingError, match="it is a FIFO"):
-        SimulatedRecording(path)
+        Recording(path)
     with pytest.raises(RecordingError, match="it is a FIFO"):
         recover(path, tmp_path / "kept.mcap")
     for name in ("info", "check"):
@@ -197,7 +197,7 @@ def test_files_without_checksums_are_read(good: Path, tmp_path: Path) -> None:
     path = tmp_path / "bare.mcap"
     path.write_bytes(rewritten(good, with_checksums=False))
     assert struct.unpack("<I", path.read_bytes()[-12:-8]) == (0,)
-    with SimulatedRecording(path) as recording, SimulatedRecording(good) as original:
+    with Recording(path) as recording, Recording(good) as original:
         assert recording.digest() == original.digest()
 
 

@@ -20,7 +20,7 @@ from support.recording import write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.mcap import SimulatedRecording, recover
+from demorec.mcap import Recording, recover
 
 Damage = Callable[[bytes, random.Random], bytes]
 
@@ -96,7 +96,7 @@ DAMAGES: tuple[Damage, ...] = (
 
 def content(path: Path) -> tuple[Any, ...]:
     """Everything that a recording gives, read through every method."""
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         statistics = tuple(
             (camera, recording.pixel_statistics(camera).counts.tobytes(), recording.pixel_statistics(camera).num_images)
             for camera in recording.cameras
@@ -177,7 +177,7 @@ class Fuzz:
             assert not kept.exists()
             self.results["nothing to recover"] += 1
             return
-        with SimulatedRecording(kept) as recording:
+        with Recording(kept) as recording:
             pictures = tuple(picture.tobytes() for picture in recording.images("front"))
             assert recording.info == expected[1]
         assert 0 < len(pictures) <= expected[3]
@@ -259,7 +259,7 @@ def test_files_that_are_no_recordings(tmp_path: Path, data: bytes, message: str)
     path = tmp_path / "a.mcap"
     path.write_bytes(data)
     with pytest.raises(RecordingError, match=message):
-        SimulatedRecording(path)
+        Recording(path)
 
 
 def test_a_foreign_mcap_file(tmp_path: Path) -> None:
@@ -273,14 +273,14 @@ def test_a_foreign_mcap_file(tmp_path: Path) -> None:
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
     with pytest.raises(RecordingError, match="no demorec recording"):
-        SimulatedRecording(path)
+        Recording(path)
 
 
 def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="it is a folder, not a regular file"):
-        SimulatedRecording(tmp_path)
+        Recording(tmp_path)
     with pytest.raises(RecordingError, match="No such file"):
-        SimulatedRecording(tmp_path / "nothing.mcap")
+        Recording(tmp_path / "nothing.mcap")
 
 
 def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
@@ -296,4 +296,4 @@ def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
             writer.write(frame)
         writer.finish(outcome)
     with pytest.raises(RecordingError, match=r"format version 99, this demorec reads 1 to 2"):
-        SimulatedRecording(tmp_path / "a.mcap")
+        Recording(tmp_path / "a.mcap")

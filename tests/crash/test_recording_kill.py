@@ -21,14 +21,15 @@ from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import Frame, SimulatedInfo
-from demorec.mcap import SimulatedRecording, SimulatedWriter, recover
+from demorec.episode.episode import Frame
+from demorec.episode.info import EpisodeInfo
+from demorec.mcap import Recording, SimulatedWriter, recover
 
 FPS = 30
 MOST_FRAMES = 300
 
 
-def write_until_killed(path: Path, info: SimulatedInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
+def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
     """Write frames, each as soon as the one before is written, and note every one in the pipe."""
     os.write(notes, b"r")
     with SimulatedWriter(path, info, video=video) as writer:
@@ -89,7 +90,7 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
         else:
             kept = recovered.num_frames
             assert not recovered.is_complete
-            with SimulatedRecording(recovered.path) as recording:
+            with Recording(recovered.path) as recording:
                 assert recording.outcome is None
                 assert recording.is_recovered
                 assert recording.columns().num_frames == kept

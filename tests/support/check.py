@@ -19,9 +19,10 @@ import pytest
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.episode.episode import CameraImages, Frame, Outcome, SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import CameraImages, Columns, Frame, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.part_file import PartFile
@@ -86,9 +87,9 @@ class Spoilt:
     """
 
     def __init__(self, path: Path) -> None:
-        with SimulatedRecording(path) as recording:
-            self.info: SimulatedInfo = recording.info
-            self.columns: SimulatedColumns = recording.columns()
+        with Recording(path) as recording:
+            self.info: EpisodeInfo = recording.info
+            self.columns: Columns = recording.columns()
             self.outcome: Outcome | None = recording.outcome
             self.pictures: Pictures = [dict(images) for images in decoded_images(recording, self.columns)]
             self._frames = list(frames_of(recording, self.columns))
@@ -125,7 +126,7 @@ class Spoilt:
 
     def write(self, path: Path) -> Path:
         """Record it."""
-        with SimulatedRecording(self._source) as recording:
+        with Recording(self._source) as recording:
             frames = list(frames_of(recording, self.columns))
         outcome = self.outcome
         assert outcome is not None

@@ -12,14 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.episode.episode import Outcome
-from demorec.episode.external import (
-    Camera,
-    EpisodeInfo,
-    Feature,
-    Sample,
-    SampledFrame,
-)
+from demorec.episode.episode import Outcome, Sample, SampledFrame
+from demorec.episode.info import Camera, EpisodeInfo, Feature
 from demorec.mcap import EpisodeWriter
 
 URDF = """<robot name="two_joints">
@@ -74,7 +68,7 @@ def make_external(
     info = EpisodeInfo(
         episode_index=episode_index,
         instruction="stack the cups",
-        robot="two_joints",
+        robot_name="two_joints",
         urdf=urdf,
         fps=30,
         features=(STATE, ACTION, FORCE),

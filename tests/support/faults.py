@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,8 @@ from demorec.check.cells import CellGrid, ImageKind
 from demorec.check.drawn import PictureComparison
 from demorec.check.episode import CheckedEpisode, PictureSummary
 from demorec.core.tables import CHECKS
-from demorec.episode.episode import Outcome, SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import Columns, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
 
 Rows = NDArray[Any]
@@ -75,8 +77,8 @@ class Good:
 class Changed:
     """What is put in a recording's place; None leaves it."""
 
-    columns: SimulatedColumns
-    info: SimulatedInfo
+    columns: Columns
+    info: EpisodeInfo
     outcome: Outcome
 
     def with_columns(self, **arrays: Any) -> Changed:
@@ -89,7 +91,8 @@ class Changed:
 
     def with_info(self, **fields: Any) -> Changed:
         """With another description, which must differ."""
-        info = replace(self.info, **fields)
+        of_episode = {known.name for known in dataclasses.fields(EpisodeInfo)} & fields.keys()
+        info = replace(self.info, **{name: fields.pop(name) for name in of_episode}).with_simulation(**fields)
         assert info != self.info
         return replace(self, info=info)
 

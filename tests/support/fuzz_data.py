@@ -21,7 +21,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.plain import to_plain
 from demorec.core.tables import CHECKS
 from demorec.learn.evaluate.rollouts import Evaluation, Settings
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from support import hdf5
 from support.export import export, make_run
 from support.external import write_external
@@ -93,7 +93,7 @@ class FuzzedData:
         export(self._good, folder / "own")
         write_foreign(folder / "foreign")
         hdf5.write_robomimic(folder / "robomimic.hdf5")
-        with SimulatedRecording(self._good) as recording:
+        with Recording(self._good) as recording:
             names = ("demorec.episode", "demorec.outcome")
             self._metadata = {name: recording._container.metadata(name) or {} for name in names}
 
@@ -180,7 +180,7 @@ class FuzzedData:
             what = f"{name}: {_change_json(data, chance)}"
             path.write_bytes(rewritten(self._good, change={name: {key: json.dumps(data)}}))
         elif chance.random() < 0.5:
-            with SimulatedRecording(self._good) as recording:
+            with Recording(self._good) as recording:
                 wanted = chance.choice(sorted(recording.topics))
             share, what = chance.choice((0.05, 1.0)), f"messages of {wanted}"
 

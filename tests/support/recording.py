@@ -23,10 +23,10 @@ from demorec.episode.episode import (
     JointSample,
     Observation,
     Outcome,
-    SimulatedInfo,
     SuccessCheck,
     frame_time_ns,
 )
+from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, SceneCamera, Shape
 from demorec.mcap import SimulatedWriter
 from demorec.robots.robot import ParallelGripper, RobotSpec
@@ -73,27 +73,29 @@ def make_episode(
     segmentation: bool = False,
     physics_rate_joints: bool = False,
     seed: int = 0,
-) -> tuple[SimulatedInfo, list[Frame], Outcome]:
+) -> tuple[EpisodeInfo, list[Frame], Outcome]:
     """An episode in memory: what is known before it, its frames, how it ended.
 
     `physics_rate_joints` adds joint samples between the frames. Camera "front" stands in the world, every other one
     sits on the hand.
     """
     specs = tuple(_camera(name, width, height) for name in cameras)
-    info = SimulatedInfo(
+    info = EpisodeInfo(
         episode_index=episode_index,
         attempt=0,
-        root_seed=seed,
-        task="pick_place",
         instruction="pick up the red cube and place it on the green target",
-        robot=PANDA,
-        scene=_scene(specs, physics_hz),
         fps=fps,
-        physics_hz=physics_hz,
-        behaviour={"speed": 0.8 + 0.01 * episode_index, "approach_height": 0.1},
-        config={"task": "pick_place", "seed": seed, "video": {"codec": "h264"}},
-        config_digest="0123456789abcdef",
         versions={"demorec": "0.1.0", "pybullet": "3.2.7", "numpy": "2.2.6"},
+        simulation=Simulation(
+            root_seed=seed,
+            task="pick_place",
+            robot=PANDA,
+            scene=_scene(specs, physics_hz),
+            physics_hz=physics_hz,
+            behaviour={"speed": 0.8 + 0.01 * episode_index, "approach_height": 0.1},
+            config={"task": "pick_place", "seed": seed, "video": {"codec": "h264"}},
+            config_digest="0123456789abcdef",
+        ),
     )
     substeps = physics_hz // fps
     frames = []

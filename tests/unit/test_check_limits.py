@@ -18,7 +18,7 @@ def test_the_opening_of_a_scaled_gripper_is_scaled_once(width: float, beyond: fl
     """A Panda opens by 0.08 m; at 1.3 times the size, as in the tutorial, by 0.104 m."""
     info, frames, outcome = make_episode(num_frames=5)
     placement = replace(info.scene.robot, scale=1.3)
-    info = replace(info, robot=PANDA.scaled(1.3), scene=replace(info.scene, robot=placement))
+    info = info.with_simulation(robot=PANDA.scaled(1.3), scene=replace(info.scene, robot=placement))
     with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
         for frame in frames:
             home = replace(frame.observation, gripper_width=width)

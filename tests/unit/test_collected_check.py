@@ -14,7 +14,7 @@ from support.external import FORCE, TOP, Episode, make_external, write_external
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
-from demorec.episode.external import Sample, SampledFrame
+from demorec.episode.episode import Sample, SampledFrame
 from demorec.mcap import recover
 from demorec.runs.external import open_external_run
 

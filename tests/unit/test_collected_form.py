@@ -24,15 +24,8 @@ from support.external import (
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
-from demorec.episode.external import (
-    NO_PICTURE,
-    Camera,
-    EpisodeInfo,
-    Origin,
-    Sample,
-    SampledFrame,
-    SourceFile,
-)
+from demorec.episode.episode import NO_PICTURE, Sample, SampledFrame
+from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.mcap import EpisodeWriter, Recording, recover
 
 

@@ -17,7 +17,7 @@ from demorec.view.sources import find_episodes
 
 def opened(path: Path) -> PlayedEpisode:
     with find_episodes([path])[0].open() as episode:
-        assert episode.simulated is None
+        assert episode.info.simulation is None
         return episode
 
 
@@ -25,7 +25,7 @@ def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
     given = make_external()
     path = write_external(tmp_path / "a.mcap", given)
     with find_episodes([path])[0].open() as episode:
-        assert episode.simulated is None
+        assert episode.info.simulation is None
         times = [frame.time_ns - given.frames[0].time_ns for frame in given.frames]
         assert episode.time_ns.tolist() == times
         assert set(episode.curves) == {"observation.state", "action", "observation.force"}

@@ -22,7 +22,7 @@ from support.external import TOP, URDF, Episode, make_external, write_external
 from demorec.core.errors import MissingDependencyError
 from demorec.core.plain import digest, from_json, to_json
 from demorec.datasets.lerobot.robots import RobotRecord, portable_urdf, read_robot
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
 from demorec.view import bodies as played_robot
 from demorec.view.from_dataset import open_dataset_episode
@@ -61,7 +61,7 @@ def test_another_program_places_the_arm_as_it_was_recorded(exported: Path, tmp_p
     record = json.loads(record_file.read_text())
     alone = Path(shutil.copy(urdf_file, tmp_path))
     rows = data_table(exported).to_pylist()
-    with SimulatedRecording(SAMPLE) as recording:
+    with Recording(SAMPLE) as recording:
         recorded = recording.columns().base_from_tcp
     client = pybullet.connect(pybullet.DIRECT)
     try:
@@ -201,7 +201,7 @@ def test_a_dataset_of_before_is_as_good_as_it_was(dataset: Path) -> None:
     assert level_of(dataset, "dataset_robots", "dataset") == "skip"
     assert level_of(dataset, "forward_kinematics", "dataset") == "pass"
     with open_dataset_episode(dataset, 0) as episode:
-        assert episode.simulated is not None
+        assert episode.info.simulation is not None
         assert episode.robot_description is None
     export(SAMPLE, dataset, append=True, allow_duplicates=True)
     assert level_of(dataset, "dataset_robots", "dataset") == "pass"
@@ -236,7 +236,7 @@ def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     export(write_external(tmp_path / "a.mcap", given), tmp_path / "d")
     assert level_of(tmp_path / "d", "dataset_robots", "dataset") == "pass"
     with open_dataset_episode(tmp_path / "d", 0) as episode:
-        assert episode.simulated is None
+        assert episode.info.simulation is None
         state = np.array([frame.samples["observation.state"].vector for frame in given.frames])
         np.testing.assert_allclose(episode.joint_position["shoulder"], np.deg2rad(state[:, 0]), atol=1e-7)
         np.testing.assert_array_equal(episode.joint_position["elbow"], state[:, 1])
@@ -249,11 +249,11 @@ def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(e
     strange = tmp_path / "strange"
     shutil.copytree(exported, strange)
     with open_dataset_episode(exported, 0) as known:
-        assert known.simulated is not None
-        arm_joints = known.simulated.robot.arm_joints
+        assert known.info.simulation is not None
+        arm_joints = known.info.robot.arm_joints
     shutil.rmtree(strange / "demorec")
     with open_dataset_episode(strange, 0) as episode:
-        assert episode.simulated is None
+        assert episode.info.simulation is None
         for name in arm_joints:
             np.testing.assert_array_equal(episode.joint_position[name], known.joint_position[name])
         assert (episode.info.instruction, episode.verdict) == (known.info.instruction, known.verdict)
@@ -282,6 +282,6 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
     imported = import_lerobot(tmp_path / "d", tmp_path / "run")
     assert (imported.num_new, "demorec/robots" in imported.left_out) == (4, True)
     with open_dataset_episode(tmp_path / "d", 1) as played:
-        assert played.simulated is None
+        assert played.info.simulation is None
         assert 'xyz="0.4 0 0"' in str(played.robot_description)
     assert level_of(tmp_path / "d", "dataset_robots", "dataset") == "pass"

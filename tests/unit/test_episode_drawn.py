@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -26,7 +24,7 @@ def test_a_calibration_error_is_taken_back(index: int) -> None:
 def test_of_an_older_recording_the_offset_is_taken_back(index: int) -> None:
     episode = prepare(EpisodePlan(config=GenerateConfig(variation="full"), episode_index=index))
     older = {name: value for name, value in episode.info.behaviour.items() if name[-3:] not in ("_qx", "_qy", "_qz")}
-    info = replace(episode.info, behaviour=older)
+    info = episode.info.with_simulation(behaviour=older)
     assert len(older) == len(episode.info.behaviour) - 6
     for true, recorded, found in zip(episode.cameras, info.scene.cameras, drawable_scene(info).cameras, strict=True):
         before, after, truth = recorded.mount_from_camera, found.mount_from_camera, true.mount_from_camera

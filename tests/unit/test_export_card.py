@@ -22,7 +22,7 @@ from demorec.core.config import GenerateConfig, VideoConfig
 from demorec.datasets.lerobot.card import flags
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.variation import Ranges
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 
 def commands_of(dataset: Path) -> list[str]:
@@ -119,7 +119,7 @@ def test_nothing_foreign_acts_in_a_card(tmp_path: Path) -> None:
     """Markdown's own words, HTML and what a terminal obeys, in the texts of a recording that somebody passed on."""
     hostile = "# <script>alert(1)</script> ![x](http://e.org) | `y` *z* \x1b[2J \u202e"
     good = write_episode(tmp_path / "good.mcap", num_frames=6, cameras=())
-    with SimulatedRecording(good) as recording:
+    with Recording(good) as recording:
         info = json.loads(recording._container.metadata("demorec.episode")["info"])  # type: ignore[index]
     info["instruction"] = hostile
     info["config"]["renderer"] = hostile

@@ -21,7 +21,7 @@ from demorec.core.errors import ConfigError, ExportError, RecordingError
 from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.inspect import attempt_counts
 from demorec.datasets.options import parse_episodes
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_a_dataset_holds_what_was_recorded(run: Path, tmp_path: Path) -> None:
     for camera in ("front", "wrist"):
         found = video_frames(tmp_path / "d", camera)
         for path in recordings(run):
-            with SimulatedRecording(path) as recording:
+            with Recording(path) as recording:
                 for picture in recording.images(camera):
                     assert np.array_equal(next(found), picture)
         assert next(found, None) is None
@@ -121,7 +121,7 @@ def test_jpeg_recordings_are_transcoded_and_it_is_said(tmp_path: Path) -> None:
     coding = info(tmp_path / "d")["features"]["observation.images.front"]["info"]
     assert (coding["video.codec"], coding["video.crf"]) == ("av1", 20)
     assert "coded anew" in (tmp_path / "d" / "README.md").read_text()
-    with SimulatedRecording(tmp_path / "e.mcap") as recording:
+    with Recording(tmp_path / "e.mcap") as recording:
         for found, expected in zip(video_frames(tmp_path / "d", "front"), recording.images("front"), strict=True):
             assert np.abs(found.astype(int) - expected).mean() < 5
 
@@ -147,7 +147,7 @@ def test_fewer_frames_a_second(run: Path, tmp_path: Path, fps: int, stride: int,
     pictures = list(video_frames(out, "front"))
     expected = []
     for path in recordings(run):
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             expected += list(recording.images("front"))[::stride]
     assert len(pictures) == len(expected)
     difference = max(np.abs(a.astype(int) - b).mean() for a, b in zip(pictures, expected, strict=True))

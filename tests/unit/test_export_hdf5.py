@@ -12,7 +12,7 @@ import pytest
 from support.export import export, make_run
 
 from demorec.core.errors import ConfigError
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 
 @pytest.fixture(scope="module")
@@ -20,8 +20,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run") / "run", (8, 7, 5), failures=(1,), depth=True)
 
 
-def recording(run: Path, index: int) -> SimulatedRecording:
-    return SimulatedRecording(run / "episodes" / f"episode_{index:06d}.mcap")
+def recording(run: Path, index: int) -> Recording:
+    return Recording(run / "episodes" / f"episode_{index:06d}.mcap")
 
 
 def test_numbers_are_those_of_the_recording(run: Path, tmp_path: Path) -> None:

@@ -20,8 +20,9 @@ from demorec.check.physics import gripper_width
 from demorec.core.geometry import Array
 from demorec.core.plain import from_json, from_plain, to_json, to_plain
 from demorec.core.tables import ROBOTS
-from demorec.episode.episode import Action, SimulatedInfo
+from demorec.episode.episode import Action
 from demorec.episode.features import VELOCITY, observation_vectors
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import ObservationRows
 from demorec.mcap.streams import FrameValues, frame_streams
 from demorec.robots.robot import ParallelGripper, RobotSpec
@@ -68,7 +69,7 @@ def test_files_of_every_version_hold_the_gripper_among_the_robots_keys(version: 
         text = next(m.metadata["info"] for m in make_reader(file).iter_metadata() if m.name == "demorec.episode")
     recorded = json.loads(text)["robot"]
     assert recorded["gripper_joints"] == ["panda_finger_joint1", "panda_finger_joint2"]
-    info = from_json(text, SimulatedInfo)
+    info = from_json(text, EpisodeInfo)
     assert info.robot.gripper.max_width == recorded["gripper_max_width"] == 0.08
     assert info.robot.gripper.palm_clearance == recorded["palm_clearance"]
     assert json.loads(to_json(info.robot)) == recorded
@@ -95,7 +96,7 @@ def test_a_gripper_that_makes_no_sense_is_refused(change: dict[str, object], wor
 
 def test_whoever_has_joints_asks_the_gripper_for_the_opening() -> None:
     info, frames, _ = make_episode(num_frames=3, cameras=())
-    info = replace(info, robot=replace(info.robot, gripper=CURVED))
+    info = info.with_simulation(robot=replace(info.robot, gripper=CURVED))
     seen = frames[1].observation
     q, v = seen.joint_position[7], seen.joint_velocity[7]
     speed = 0.08 / CRANK * np.cos(q / CRANK) * v

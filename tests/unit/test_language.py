@@ -20,7 +20,7 @@ from demorec.datasets.lerobot import files
 from demorec.datasets.lerobot.language import EpisodeLanguage, language_arrays
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, RobotPlacement, Scene, Shape
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 
 
 def scene(*cubes: tuple[str, float, float, float], yaw: float = 0.0) -> Scene:
@@ -91,7 +91,7 @@ def told(folder: Path, script: list[tuple[str, str, str]], **arguments: object) 
             events = (Event(name=name, message=message),) if name and number % 2 == 0 else ()
             writer.write(replace(frame, phase=phase, events=events, is_deliberate_miss=False))
         writer.finish(outcome)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         columns = recording.columns()
         rows = np.arange(len(columns.time_ns))
         return [

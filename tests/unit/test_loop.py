@@ -15,7 +15,8 @@ from support.sim import episode, run
 
 import demorec.loop
 from demorec.core.plain import from_json, to_json
-from demorec.episode.episode import Frame, Outcome, SimulatedInfo
+from demorec.episode.episode import Frame, Outcome
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import Episode, ScriptAgent, Session, make_world
 
 
@@ -51,7 +52,7 @@ def test_observation_comes_before_the_action(ran: tuple[Episode, list[Frame], Ou
 
 def test_replaying_the_commands_gives_the_same_bits(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     prepared, frames, outcome = ran
-    info = from_json(to_json(prepared.info), SimulatedInfo)  # as a recording would hold it
+    info = from_json(to_json(prepared.info), EpisodeInfo)  # as a recording would hold it
     with make_world(info) as world:
         world.reset(info.scene)
         for frame in frames:

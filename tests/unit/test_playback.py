@@ -15,7 +15,7 @@ from support.recording import make_episode, write_episode
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.view import bodies
@@ -59,7 +59,7 @@ def _column(chunks: list[Any], component: str) -> list[Any]:
 
 
 def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], recording: Path) -> None:
-    with SimulatedRecording(recording) as source:
+    with Recording(recording) as source:
         samples = list(source.joint_samples())
         num_frames, joints = source.num_frames, len(source.info.robot.arm_joints)
     assert len(samples) > 7 * (num_frames - 1)  # the physics' rate
@@ -70,14 +70,14 @@ def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], 
 
 @pytest.mark.parametrize("camera", ["front", "wrist"])
 def test_coded_pictures_are_passed_on_unchanged(saved: dict[str, list[Any]], recording: Path, camera: str) -> None:
-    with SimulatedRecording(recording) as source:
+    with Recording(recording) as source:
         packets = list(source.packets(camera))
     rows = _column(saved[f"/world/cameras/{camera}"], "VideoStream:sample")
     assert [(time, bytes(value[0])) for time, value in rows] == [(packet.time_ns, packet.data) for packet in packets]
 
 
 def test_depth_and_segments_are_there(saved: dict[str, list[Any]], recording: Path) -> None:
-    with SimulatedRecording(recording) as source:
+    with Recording(recording) as source:
         metres = next(iter(source.depth("front")))
     _, value = _column(saved["/world/cameras/front/depth"], "DepthImage:buffer")[0]
     millimetres = np.frombuffer(bytes(value[0]), dtype=np.uint16).reshape(metres.shape)
@@ -100,7 +100,7 @@ def _has(chunks: list[Any], component: str) -> bool:
 
 
 def test_the_recorded_description_stands_in_for_a_model_that_is_not_installed(recording: Path) -> None:
-    with SimulatedRecording(recording) as source:
+    with Recording(recording) as source:
         description = source.description()
     urdf, meshes = robot_model("nowhere/robot.urdf", 1.0, description)
     assert "panda_hand" in {joint.child for joint in urdf.joints}
@@ -132,7 +132,7 @@ BRICK = Body(
 def with_models(tmp_path: Path) -> Path:
     """A recording with a mesh and a URDF beside the table and the cube."""
     info, frames, outcome = make_episode(num_frames=3, cameras=())
-    info = replace(info, scene=replace(info.scene, bodies=(*info.scene.bodies, DUCK, BRICK)))
+    info = info.with_simulation(scene=replace(info.scene, bodies=(*info.scene.bodies, DUCK, BRICK)))
     with SimulatedWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)

@@ -16,7 +16,7 @@ from support.recording import write_episode
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.episodes import LeRobotDataset
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.view.from_dataset import held, open_dataset_episode
 from demorec.view.save import save
 from demorec.view.sources import find_episodes
@@ -27,7 +27,7 @@ SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
 
 @pytest.fixture(scope="module")
 def recorded() -> Array:
-    with SimulatedRecording(SAMPLE) as recording:
+    with Recording(SAMPLE) as recording:
         return recording.columns().object_poses["red_cube"]
 
 
@@ -40,7 +40,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> None:
     with open_dataset_episode(dataset, 0) as episode:
-        assert episode.simulated is not None
+        assert episode.info.simulation is not None
         drawn = episode.object_poses["red_cube"]
     assert np.ptp(recorded[:, 2]) > 0.1  # lifted
     assert drawn.shape == recorded.shape
@@ -53,7 +53,7 @@ def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> No
 def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path, recorded: Array) -> None:
     export(SAMPLE, tmp_path / "cubes", privileged=True)
     with open_dataset_episode(tmp_path / "cubes", 0) as episode:
-        assert episode.simulated is not None
+        assert episode.info.simulation is not None
         np.testing.assert_allclose(episode.object_poses["red_cube"], recorded, atol=1e-6)
 
 
@@ -76,12 +76,12 @@ def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path)
     run = make_run(tmp_path / "run", (3, 4), depth=True, cameras=("front",))
     export(run, tmp_path / "d", depth=True)
     with open_dataset_episode(tmp_path / "d", 1) as episode:  # the second in its file
-        assert episode.simulated is not None
+        assert episode.info.simulation is not None
         times, pictures = zip(*episode.depth["front"](), strict=True)
         shown = np.array(pictures)
         assert list(times) == episode.time_ns.tolist()
         packets = list(episode.videos["front"].packets())
-    with SimulatedRecording(run / "episodes" / "episode_000001.mcap") as recording:
+    with Recording(run / "episodes" / "episode_000001.mcap") as recording:
         measured = np.array(list(recording.depth("front")))
     assert shown.shape == measured.shape
     assert len(packets) == 4
@@ -106,9 +106,9 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
     scale |= {"video.use_log": False, "video.depth_min": 0.5, "video.depth_max": 4.595}
     info.write_text(json.dumps(written))
     with open_dataset_episode(tmp_path / "d", 0) as episode:
-        assert episode.simulated is not None
+        assert episode.info.simulation is not None
         _, shown = list(episode.depth["front"]())[2]
-    with SimulatedRecording(tmp_path / "e.mcap") as recording:
+    with Recording(tmp_path / "e.mcap") as recording:
         measured = list(recording.depth("front"))[2]
     low, high = np.log(3.51), np.log(13.5)
     codes = np.rint((np.log(measured + 3.5) - low) / (high - low) * 4095).clip(0)  # as docs/dataset-format.md has them
@@ -117,7 +117,7 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
         written["features"]["observation.images.front_depth"]["info"] = spoilt
         info.write_text(json.dumps(written))
         with open_dataset_episode(tmp_path / "d", 0) as episode:
-            assert episode.simulated is not None
+            assert episode.info.simulation is not None
             assert (list(episode.videos), list(episode.depth)) == (["front"], [])
             assert "depth is" in LeRobotDataset(tmp_path / "d").left_out["observation.images.front_depth"]
 
@@ -134,7 +134,7 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
     colour["info"]["video.codec"] = "av1"
     info.write_text(json.dumps(written))
     with open_dataset_episode(tmp_path / "d", 0) as episode:
-        assert episode.simulated is not None
+        assert episode.info.simulation is not None
         with pytest.raises(ExportError, match=f"it has {width}x{height} pixels, and meta/info.json says 9x8"):
             list(episode.depth["front"]())
         with pytest.raises(ExportError, match=r"its codec is h264, and meta/info\.json says av1"):

@@ -37,7 +37,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cameras=(replace(camera, name="前"),),
     )
     path = tmp_path_factory.mktemp("运行") / "episode_000000.mcap"
-    with SimulatedWriter(path, replace(info, instruction=INSTRUCTION, scene=scene)) as writer:
+    with SimulatedWriter(path, replace(info, instruction=INSTRUCTION).with_simulation(scene=scene)) as writer:
         for frame in frames:
             seen = frame.observation
             poses = {("方块" if name == cube else name): pose for name, pose in seen.object_poses.items()}
@@ -87,12 +87,14 @@ def test_joints_of_a_robot_without_a_scene_still_belong_together(tmp_path: Path)
     features = tuple(
         replace(f, joints=tuple("关节" if j == joint else j for j in f.joints)) for f in given.info.features
     )
-    info = replace(given.info, urdf=given.info.urdf.replace(f'"{joint}"', '"关节"'), features=features, robot="机器人")
+    info = replace(
+        given.info, urdf=given.info.urdf.replace(f'"{joint}"', '"关节"'), features=features, robot_name="机器人"
+    )
     write_external(path, replace(given, info=info))
     (source,) = find_episodes([path])
     missing: set[str] = set()
     with drawable_source(source, missing).open() as episode:
-        assert episode.simulated is None
+        assert episode.info.simulation is None
         assert missing == set("关节机器人")
         assert "U+5173U+8282" in episode.joint_position
         assert "U+5173U+8282" in {found.name for found in Urdf.parse(str(episode.robot_description)).joints}

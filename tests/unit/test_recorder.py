@@ -19,7 +19,8 @@ from support.external import URDF
 from demorec import Recorder
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.episode.external import NO_PICTURE, Camera, Feature
+from demorec.episode.episode import NO_PICTURE
+from demorec.episode.info import Camera, Feature
 from demorec.mcap import Recording
 from demorec.mcap.external_writer import EpisodeWriter
 from demorec.mcap.recorder.encoder import Encoder
@@ -56,7 +57,7 @@ def test_what_was_given_is_recorded_to_the_bit(tmp_path: Path) -> None:
         assert columns.features["observation.force"].tobytes() == forces.tobytes()
         assert columns.features["action"].tobytes() == actions.tobytes()
         assert columns.time_ns.tolist() == [1_000_000_000 + 33_000_000 * index for index in range(40)]
-        assert (found.info.robot, found.info.instruction, found.info.fps) == ("so101", "stack", 30)
+        assert (found.info.robot_name, found.info.instruction, found.info.fps) == ("so101", "stack", 30)
         assert found.outcome is not None
         assert (found.outcome.success, found.outcome.num_frames, found.outcome.drops) == (True, 40, {})
         for index, picture in enumerate(found.images("top")):

@@ -13,7 +13,8 @@ from support.recording import make_episode
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
-from demorec.episode.episode import Frame, SimulatedInfo
+from demorec.episode.episode import Frame
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import SimulatedWriter
 
 NAN = float("nan")
@@ -122,8 +123,8 @@ def test_a_frame_that_does_not_fit_is_refused_at_once(fault: str, tmp_path: Path
             writer.write(spoil(frames[2]))
 
 
-def renamed(info: SimulatedInfo, *names: str) -> SimulatedInfo:
-    return replace(info, robot=replace(info.robot, arm_joints=(*names, *info.robot.arm_joints[len(names) :])))
+def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
+    return info.with_simulation(robot=replace(info.robot, arm_joints=(*names, *info.robot.arm_joints[len(names) :])))
 
 
 @pytest.mark.parametrize(

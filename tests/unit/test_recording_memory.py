@@ -15,9 +15,9 @@ from support.external import TOP, make_external
 from support.recording import make_episode
 
 from demorec.episode.episode import frame_time_ns
-from demorec.mcap import EpisodeWriter, Recording, SimulatedRecording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording, SimulatedWriter
 
-READERS: dict[str, Callable[[SimulatedRecording], Iterable[object]]] = {
+READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
     "packets": lambda recording: recording.packets("front"),
     "images": lambda recording: recording.images("front"),
     "depth": lambda recording: recording.depth("front"),
@@ -38,7 +38,7 @@ def write_long(path: Path, num_frames: int) -> None:
         writer.finish(replace(outcome, num_frames=num_frames))
 
 
-def read_through(read: Callable[[SimulatedRecording], Iterable[object]], recording: SimulatedRecording) -> None:
+def read_through(read: Callable[[Recording], Iterable[object]], recording: Recording) -> None:
     deque(read(recording), maxlen=1)
 
 
@@ -61,7 +61,7 @@ def test_memory_does_not_grow_with_length(
     for count in (10, *num_frames):  # the first loads and compiles what is loaded and compiled once
         path = tmp_path / f"{count}.mcap"
         peaks["writing"].append(peak_bytes(partial(write_long, path, count)))
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             assert recording.num_frames == count
             for name, read in READERS.items():
                 peaks[name].append(peak_bytes(partial(read_through, read, recording)))

@@ -16,7 +16,7 @@ from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.episode.episode import Frame
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 NUM_FRAMES = 47
 
@@ -50,7 +50,7 @@ def same_frame(found: Frame, true: Frame) -> None:
 
 
 def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -> None:
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         assert len(recording) == NUM_FRAMES
         count = 0
         for found, true in zip(recording, truth, strict=True):
@@ -62,14 +62,14 @@ def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
 def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path: Path, codec: Codec) -> None:
     file = write_episode(tmp_path / "a.mcap", num_frames=12, video=VideoConfig(codec=codec, gop=5))
-    with SimulatedRecording(file) as recording:
+    with Recording(file) as recording:
         whole = list(recording.images("wrist"))
         for index in (11, 0, 4, 5, -3):
-            assert np.array_equal(recording.image("wrist", index), whole[index])
+            assert np.array_equal(np.asarray(recording.image("wrist", index)), whole[index])
 
 
 def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         table = recording.to_pandas()
     assert table.index.name == "frame_index"
     assert list(table.index) == list(range(NUM_FRAMES))
@@ -111,7 +111,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_of_a_notebook(path: Path) -> None:
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         page = Page(recording._repr_html_())
         line = repr(recording)
     text = " ".join(page.texts)
@@ -126,7 +126,7 @@ def test_the_page_of_a_notebook(path: Path) -> None:
 def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Path) -> None:
     evil = tmp_path / "<script>alert(1)<\\script>\x1b[2J.mcap"
     evil.write_bytes(path.read_bytes())
-    with SimulatedRecording(evil) as recording:
+    with Recording(evil) as recording:
         assert Page(recording._repr_html_()).tags <= {"table", "tr", "th", "td", "img"}
         assert "\x1b" not in repr(recording) + recording._repr_html_()
 

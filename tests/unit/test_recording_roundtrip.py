@@ -13,15 +13,16 @@ from support.recording import frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import Event, Frame, Outcome, SimulatedInfo
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.episode.episode import Event, Frame, Outcome
+from demorec.episode.info import EpisodeInfo
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.mcap.container import Container
 
 CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), VideoConfig(gop=30, crf=30)]
 
 
 def record(
-    path: Path, frames: list[Frame], info: SimulatedInfo, outcome: Outcome, video: VideoConfig | None = None
+    path: Path, frames: list[Frame], info: EpisodeInfo, outcome: Outcome, video: VideoConfig | None = None
 ) -> Path:
     with SimulatedWriter(path, info, video=video) as writer:
         for frame in frames:
@@ -35,7 +36,7 @@ def record(
 def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, cameras: tuple[str, ...]) -> None:
     info, frames, outcome = make_episode(num_frames=num_frames, cameras=cameras)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         assert recording.info == info
         assert recording.outcome == outcome
         assert recording.num_frames == num_frames
@@ -74,7 +75,7 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
 def test_pictures(tmp_path: Path, video: VideoConfig) -> None:
     info, frames, outcome = make_episode(num_frames=64)
     path = record(tmp_path / "a.mcap", frames, info, outcome, video)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         for camera in recording.cameras:
             packets = list(recording.packets(camera))
             assert [packet.frame_index for packet in packets] == list(range(64))
@@ -99,7 +100,7 @@ def test_pictures(tmp_path: Path, video: VideoConfig) -> None:
 def test_depth_and_segmentation(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=33, depth=True, segmentation=True)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         assert recording.has_depth("front")
         assert recording.has_segmentation("wrist")
         for camera in recording.cameras:
@@ -119,7 +120,7 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
 
 
 def test_without_depth_it_says_so(tmp_path: Path) -> None:
-    with SimulatedRecording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
+    with Recording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
         assert not recording.has_depth("front")
         with pytest.raises(RecordingError, match="no depth images"):
             next(recording.depth("front"))
@@ -135,7 +136,7 @@ def test_statistics_are_of_every_other_picture(tmp_path: Path, width: int, heigh
     """Every fourth row of it, each quarter in turn; large pictures thinned as LeRobot thins them."""
     info, frames, outcome = make_episode(num_frames=7, width=width, height=height)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         found = recording.pixel_statistics("wrist")
     thinned = [frame.images["wrist"].color[::step, ::step] for frame in frames[::2]]
     chosen = np.concatenate([picture[number % 4 :: 4].reshape(-1, 3) for number, picture in enumerate(thinned)])
@@ -153,12 +154,12 @@ def test_the_digest_is_of_the_content(tmp_path: Path) -> None:
 
     def digest(name: str, **changes: Any) -> str:
         path = record(tmp_path / name, changes.get("frames", frames), changes.get("info", info), outcome)
-        with SimulatedRecording(path) as recording:
+        with Recording(path) as recording:
             return recording.digest()
 
     original = digest("a.mcap")
     assert digest("b.mcap", info=replace(info, versions={"demorec": "9"})) == original
-    assert digest("c.mcap", info=replace(info, root_seed=1)) != original
+    assert digest("c.mcap", info=info.with_simulation(root_seed=1)) != original
     observation = frames[3].observation
     effort = observation.joint_effort.copy()
     effort[2] = np.nextafter(effort[2], 99.0)
@@ -175,7 +176,7 @@ def test_the_digest_is_of_the_content(tmp_path: Path) -> None:
 def test_no_frames_at_all(tmp_path: Path) -> None:
     info, _, outcome = make_episode(num_frames=1)
     path = record(tmp_path / "a.mcap", [], info, replace(outcome, num_frames=0, success=False))
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         assert recording.num_frames == 0
         assert recording.columns().joint_position.shape == (0, 9)
         assert recording.cameras == ()
@@ -192,7 +193,7 @@ def test_numbers_are_read_without_touching_the_pictures(tmp_path: Path, monkeypa
         return original(container, at, size)
 
     monkeypatch.setattr(Container, "_read_at", remember)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         opened = sum(read)
         recording.columns()
         numbers = sum(read) - opened

@@ -10,8 +10,9 @@ from support.check import level_of, rewrite_messages
 from support.recording import make_episode, write_episode
 
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import FORMAT_VERSION, Frame, Outcome, SimulatedInfo
-from demorec.mcap import SimulatedRecording, SimulatedWriter, recover
+from demorec.episode.episode import Frame, Outcome
+from demorec.episode.info import FORMAT_VERSION, EpisodeInfo
+from demorec.mcap import Recording, SimulatedWriter, recover
 from demorec.mcap.streams import frame_streams
 
 LATER = {stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since > 1}
@@ -19,7 +20,7 @@ LATER = {stream.topic for stream in frame_streams(make_episode(num_frames=1)[0])
 NEWEST = [stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since == FORMAT_VERSION]
 
 
-def record(path: Path, info: SimulatedInfo, frames: list[Frame], outcome: Outcome) -> Path:
+def record(path: Path, info: EpisodeInfo, frames: list[Frame], outcome: Outcome) -> Path:
     with SimulatedWriter(path, info) as writer:
         for frame in frames:
             writer.write(frame)
@@ -36,8 +37,8 @@ def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
     old = replace(info, format_version=1)
     path = record(tmp_path / "old.mcap", old, without_wrench(frames), outcome)
     with (
-        SimulatedRecording(path) as recording,
-        SimulatedRecording(write_episode(tmp_path / "new.mcap", num_frames=5, cameras=())) as new,
+        Recording(path) as recording,
+        Recording(write_episode(tmp_path / "new.mcap", num_frames=5, cameras=())) as new,
     ):
         assert set(new.topics) - set(recording.topics) == LATER
         assert not recording.columns().sensed
@@ -51,7 +52,7 @@ def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
     assert level_of(path, "topics") == "pass"
     # A crash loses nothing either.
     rescued = recover(path, tmp_path / "rescued.mcap").path
-    with SimulatedRecording(rescued) as recording:
+    with Recording(rescued) as recording:
         assert recording.digest() == digest
 
 
@@ -60,7 +61,7 @@ def test_a_stream_that_the_version_must_have_is_missed(topic: str, tmp_path: Pat
     whole = write_episode(tmp_path / "a.mcap", num_frames=5, cameras=())
     path = rewrite_messages(whole, tmp_path / "b.mcap", lambda m: [] if m[0] == topic else [m])
     with (
-        SimulatedRecording(path) as recording,
+        Recording(path) as recording,
         pytest.raises(RecordingError, match=f"has 0 messages on {topic} at other times"),
     ):
         recording.columns()
@@ -85,4 +86,4 @@ def test_a_description_of_another_version_than_its_record_is_refused(tmp_path: P
     with pytest.raises(
         RecordingError, match=r"not that of format version 1 \(its description is of format version 2\)"
     ):
-        SimulatedRecording(path)
+        Recording(path)

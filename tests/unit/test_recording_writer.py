@@ -13,7 +13,7 @@ from support.recording import make_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import Frame, Outcome
-from demorec.mcap import SimulatedRecording, SimulatedWriter, part_file, recover
+from demorec.mcap import Recording, SimulatedWriter, part_file, recover
 
 
 def names(folder: Path) -> list[str]:
@@ -56,7 +56,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> Non
             writer.finish(outcome)
     assert path.read_bytes() == b"mine"
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
-    with SimulatedRecording(tmp_path / "b.mcap") as recording:
+    with Recording(tmp_path / "b.mcap") as recording:
         assert recording.outcome == outcome
 
 
@@ -69,7 +69,7 @@ def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
         stats = writer.finish(outcome)
     assert names(tmp_path) == ["a.mcap"]
     assert (stats.path, stats.num_frames, stats.num_bytes) == (path, 3, path.stat().st_size)
-    with SimulatedRecording(path) as recording:
+    with Recording(path) as recording:
         for camera in ("front", "wrist"):
             assert stats.video_bytes[camera] == sum(len(packet.data) for packet in recording.packets(camera))
 
@@ -80,7 +80,7 @@ def test_leaving_without_finish_leaves_a_part_that_can_be_recovered(tmp_path: Pa
         write_all(writer, frames)
     assert names(tmp_path) == ["a.mcap.part"]
     with pytest.raises(RecordingError, match="never finished"):
-        SimulatedRecording(tmp_path / "a.mcap.part")
+        Recording(tmp_path / "a.mcap.part")
     assert recover(tmp_path / "a.mcap.part", tmp_path / "a.mcap").num_frames >= 40
 
 
@@ -163,7 +163,7 @@ def test_what_a_killed_rendering_left_is_replaced_by_the_same_rendering(tmp_path
     with SimulatedWriter(tmp_path / "a.mcap", replace(info, origin="render of 0123")) as writer:
         write_all(writer, frames, outcome)
     assert names(tmp_path) == ["a.mcap"]
-    assert SimulatedRecording(tmp_path / "a.mcap").num_frames == 5
+    assert Recording(tmp_path / "a.mcap").num_frames == 5
 
 
 @pytest.mark.parametrize(("left", "new"), [("", ""), ("", "render of 0123"), ("render of 4567", "render of 0123")])
@@ -184,7 +184,7 @@ def test_what_another_process_is_writing_is_left_alone(tmp_path: Path) -> None:
             with pytest.raises(ConfigError, match="Another process is writing"):
                 SimulatedWriter(tmp_path / "a.mcap", info, overwrite=overwrite)
         writer.finish(outcome)
-    assert SimulatedRecording(tmp_path / "a.mcap").num_frames == 40
+    assert Recording(tmp_path / "a.mcap").num_frames == 40
 
 
 def test_a_writer_killed_before_its_first_frame_leaves_nothing_to_keep(tmp_path: Path) -> None:

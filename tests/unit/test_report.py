@@ -21,7 +21,7 @@ from support.mcap import rewritten
 from support.recording import frame_number, write_episode
 
 from demorec.check.report import CheckOptions
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.report.content import Report
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, strip_budget
 from demorec.report.gather import gather
@@ -189,7 +189,7 @@ def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path)
 def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
     """Whatever a recording says is text: the page has the same elements as without it."""
     good = run / "episodes" / "episode_000000.mcap"
-    with SimulatedRecording(good) as recording:
+    with Recording(good) as recording:
         episode, outcome = (recording._container.metadata(f"demorec.{name}") for name in ("episode", "outcome"))
     assert episode is not None
     assert outcome is not None

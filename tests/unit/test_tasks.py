@@ -199,7 +199,7 @@ def test_an_object_out_of_reach_gives_up_with_its_phase() -> None:
     )
     bodies = tuple(far if b.name == "red_cube" else b for b in prepared.info.scene.bodies)
     scene = dataclasses.replace(prepared.info.scene, bodies=bodies)
-    frames, outcome = run(dataclasses.replace(prepared, info=dataclasses.replace(prepared.info, scene=scene)))
+    frames, outcome = run(dataclasses.replace(prepared, info=prepared.info.with_simulation(scene=scene)))
     assert not outcome.success
     assert (outcome.failure_phase, outcome.failure_reason) == ("perceive", "unreachable")
     assert [event.name for frame in frames for event in frame.events] == ["unreachable"]
@@ -210,7 +210,7 @@ def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries() -> None:
     slippery = dataclasses.replace(prepared.info.scene.body("red_cube"), lateral_friction=0.0, mass=2.0)
     bodies = tuple(slippery if b.name == "red_cube" else b for b in prepared.info.scene.bodies)
     scene = dataclasses.replace(prepared.info.scene, bodies=bodies)
-    _, outcome = run(dataclasses.replace(prepared, info=dataclasses.replace(prepared.info, scene=scene)))
+    _, outcome = run(dataclasses.replace(prepared, info=prepared.info.with_simulation(scene=scene)))
     assert not outcome.success
     assert outcome.num_retries == 2
     assert outcome.failure_phase in ("lift", "close", "transport")

@@ -207,7 +207,7 @@ def test_a_texture_reaches_the_picture() -> None:
         for body in prepared.info.scene.bodies
     )
     scene = replace(prepared.info.scene, bodies=bodies)
-    frame = first_frame(replace(prepared, info=replace(prepared.info, scene=scene)))
+    frame = first_frame(replace(prepared, info=prepared.info.with_simulation(scene=scene)))
     table = frame.images["front"].color[45:60].max(axis=2)
     assert table.min() < 40
     assert table.max() > 150

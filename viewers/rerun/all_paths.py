@@ -10,7 +10,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 GREEN, RED = (80, 220, 120), (240, 80, 80)
 
@@ -23,7 +23,7 @@ def main(run: Path, target: Path) -> None:
     stream.save(target, default_blueprint=rrb.Blueprint(rrb.Spatial3DView(name="gripper paths"), collapse_panels=True))
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for file in files:
-        with SimulatedRecording(file) as recording:
+        with Recording(file) as recording:
             base, outcome = recording.info.scene.robot.world_from_base, recording.outcome
             points = base.apply(recording.columns().base_from_tcp[:, :3])
         color = GREEN if outcome is not None and outcome.success else RED

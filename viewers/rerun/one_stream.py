@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 
 def main(recording_path: Path, target: Path) -> None:
-    with SimulatedRecording(recording_path) as recording:
+    with Recording(recording_path) as recording:
         columns, joints = recording.columns(), recording.info.robot.arm_joints
     # Action t is reached at t + 1: the target of frame t is compared with the position one frame later.
     error = columns.joint_position[1:, : len(joints)] - columns.action_joint_target[:-1]

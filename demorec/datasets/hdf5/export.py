@@ -27,8 +27,9 @@ from demorec.datasets.hdf5.file import (
 from demorec.datasets.hdf5.options import Hdf5Options
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
-from demorec.episode.episode import SimulatedColumns, SimulatedInfo
+from demorec.episode.episode import Columns
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_recording
 
 
@@ -159,8 +160,8 @@ class RobomimicWriter:
             demo["rewards"] = (dones * success).astype(np.float32)
         demo["dones"] = dones
         _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
-        if (simulated := episode.simulated) is not None:
-            _add_vectors(demo, "states", *_states(episode.columns, episode.rows, simulated.info))
+        if episode.info.simulation is not None:
+            _add_vectors(demo, "states", *_states(episode.columns, episode.rows, episode.info))
         group = demo.create_group("obs")
         for name, (feature, elements) in observations.items():
             _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
@@ -189,7 +190,7 @@ def _observation_names(episode: ExportEpisode) -> dict[str, tuple[str, slice]]:
     wanted = [name for name in episode.names if episode.options.takes(name)]
     if ACTION not in wanted:
         raise ConfigError(f"robomimic's layout needs actions, and the episode has none: {episode.recording.path}")
-    known = {} if episode.simulated is None else _ROBOSUITE
+    known = {} if episode.info.simulation is None else _ROBOSUITE
     found = [
         (name, (feature, elements))
         for feature in wanted
@@ -222,15 +223,15 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
         "fps": episode.fps,
         "cameras": [camera.name for camera in episode.cameras if not camera.is_depth],
     }
-    if (simulated := episode.simulated) is None:
+    if episode.info.simulation is None:
         arguments["observations"] = [*_observation_names(episode), *_image_names(episode)]
         assert arguments.keys() == EXTERNAL_ARGUMENTS
         described = {"env_name": EXTERNAL_ENVIRONMENT, "type": _GYM, "env_kwargs": arguments}
         return {"env_args": json.dumps(described), "fps": episode.fps}
-    return {**_environment(simulated.info, episode, arguments), "fps": episode.fps}
+    return {**_environment(episode.info, episode, arguments), "fps": episode.fps}
 
 
-def _environment(info: SimulatedInfo, episode: ExportEpisode, arguments: dict[str, object]) -> dict[str, str | int]:
+def _environment(info: EpisodeInfo, episode: ExportEpisode, arguments: dict[str, object]) -> dict[str, str | int]:
     options = episode.options
     cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
     arguments |= {
@@ -244,9 +245,7 @@ def _environment(info: SimulatedInfo, episode: ExportEpisode, arguments: dict[st
     return {"env_args": json.dumps(described), "task": info.task}
 
 
-def _states(
-    columns: SimulatedColumns, rows: NDArray[np.intp], info: SimulatedInfo
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+def _states(columns: Columns, rows: NDArray[np.intp], info: EpisodeInfo) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """(T, D) float64 state of the simulated world as recorded, and the names of its components.
 
     Positions (rad, fingers m) and velocities (rad/s, m/s) of all joints, then world_from_object of every movable body:

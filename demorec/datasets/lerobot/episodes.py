@@ -36,9 +36,9 @@ from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, RowStream, 
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot, recognised_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages, codec_of, opened_video
-from demorec.episode.episode import Outcome, frame_time_ns
-from demorec.episode.external import Camera, Columns, EpisodeInfo, Feature, Kept, Origin
+from demorec.episode.episode import Columns, Outcome, frame_time_ns
 from demorec.episode.features import DEPTH_SUFFIX, IMAGE_PREFIX, STATE
+from demorec.episode.info import Camera, EpisodeInfo, Feature, Kept, Origin
 from demorec.mcap.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
@@ -269,7 +269,7 @@ class DatasetRecording:
         info = EpisodeInfo(
             episode_index=self.place.episode_index,
             instruction=self._instruction(),
-            robot=self.dataset.info.robot_type or _UNNAMED_ROBOT,
+            robot_name=self.dataset.info.robot_type or _UNNAMED_ROBOT,
             fps=int(self.dataset.info.fps),
             features=self.dataset.features,
             cameras=tuple(cameras),

@@ -344,7 +344,7 @@ def read(path: Path, options: ExportOptions) -> Reading | None:
             ),
             depth_left_out=episode.depth_left_out,
             transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
-            is_simulated=episode.simulated is not None,
+            is_simulated=episode.info.simulation is not None,
             data=prepare_episode(episode, options),
             record=EpisodeRecord.of(episode),
             boxes=episode_boxes(episode) if options.boxes else {},

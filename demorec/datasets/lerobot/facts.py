@@ -37,9 +37,9 @@ from demorec.annotate.progress import (
 from demorec.core.errors import ExportError, in_words
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.staging import sync_file
-from demorec.episode.episode import SimulatedColumns, SuccessCheck
+from demorec.episode.episode import Columns, SuccessCheck
 from demorec.episode.scene import Scene
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 
 PROGRESS_PATH = "sarm_progress.parquet"
 PROPORTIONS_PATH = "meta/temporal_proportions_{head}.json"
@@ -192,7 +192,7 @@ def facts_of(root: Path) -> tuple[str, ...]:
     return tuple(item.name for item in schema if (kind := fact_type(item.name)) is not None and kind == item.type)
 
 
-def episode_facts(recording: SimulatedRecording, columns: SimulatedColumns) -> dict[str, Any]:
+def episode_facts(recording: Recording, columns: Columns) -> dict[str, Any]:
     """Name -> value; positions in the world frame at the start, metres."""
     info, outcome = recording.info, recording.outcome
     checks = () if outcome is None else outcome.checks
@@ -227,7 +227,7 @@ def first_goal(scene: Scene | None) -> dict[str, Any]:
     return found
 
 
-def _drawn(recording: SimulatedRecording) -> Mapping[str, float]:
+def _drawn(recording: Recording) -> Mapping[str, float]:
     """What was drawn for the episode: behaviour, the first object's size, mass and friction, gravity, light."""
     info, scene = recording.info, recording.info.scene
     drawn = dict(info.behaviour)

@@ -27,7 +27,7 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.stats import PixelHistogram, colour_levels
 from demorec.datasets.lerobot.writer import EpisodeData
 from demorec.episode.features import ACTION, IMAGE_PREFIX
-from demorec.mcap import AnyRecording, VideoSettings
+from demorec.mcap import Recording, VideoSettings
 from demorec.mcap.video import make_encoder
 
 
@@ -106,27 +106,30 @@ def _language(episode: ExportEpisode, options: ExportOptions, about: Collection[
     """What the dataset shall say about the episode; nothing unless it was asked for."""
     if options.language is None:
         return EpisodeLanguage()
-    if (simulated := episode.simulated) is None:
-        stated = [Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in episode.subtasks]
+    recording = episode.recording
+    if episode.info.simulation is None:
+        stated = [
+            Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in recording.subtasks
+        ]
         return episode_language(stated, fps=episode.fps)
-    cameras = [camera for camera in simulated.cameras if options.takes(IMAGE_PREFIX + camera)]
-    if "vqa" in (options.language or ()) and not any(map(simulated.has_segmentation, cameras)):
+    cameras = [camera for camera in recording.cameras if options.takes(IMAGE_PREFIX + camera)]
+    if "vqa" in (options.language or ()) and not any(map(recording.has_segmentation, cameras)):
         raise ConfigError(
             "Questions about images (vqa) need recordings with segmentation (generate --segmentation), leave them "
-            f"out: {simulated.path}"
+            f"out: {recording.path}"
         )
-    told = narrate(simulated, episode.columns, episode.rows, options.spoken, cameras, about=about)
+    told = narrate(recording, episode.columns, episode.rows, options.spoken, cameras, about=about)
     return episode_language(told, fps=episode.fps)
 
 
 def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
     """What is known of a simulated episode, its stages among it if they were asked for."""
-    if (simulated := episode.simulated) is None:
+    if episode.info.simulation is None:
         return {}
-    facts = episode_facts(simulated, episode.columns)
+    facts = episode_facts(episode.recording, episode.columns)
     if options.progress:
-        runs = dense_runs(story_of(simulated, episode.columns), episode.rows)
-        num_goals = len(simulated.info.scene.goals)
+        runs = dense_runs(story_of(episode.recording, episode.columns), episode.rows)
+        num_goals = len(episode.info.scene.goals)
         facts |= EpisodeProgress(num_goals=num_goals, dense=tuple(runs)).row()
     return facts
 
@@ -138,11 +141,11 @@ def episode_boxes(episode: ExportEpisode) -> dict[str, SeenByCamera]:
         ConfigError: None has.
     """
     boxes = {}
-    if (simulated := episode.simulated) is not None:
+    if episode.info.simulation is not None:
         taken = {camera.name for camera in episode.cameras}
-        for camera in simulated.info.scene.cameras:
-            if camera.name in taken and simulated.has_segmentation(camera.name):
-                seen = seen_objects(simulated, episode.columns, episode.rows, camera)
+        for camera in episode.info.scene.cameras:
+            if camera.name in taken and episode.recording.has_segmentation(camera.name):
+                seen = seen_objects(episode.recording, episode.columns, episode.rows, camera)
                 width, height = camera.width, camera.height
                 entries = tuple(box_entry(item, width=width, height=height) for item in seen)
                 boxes[IMAGE_PREFIX + camera.name] = width, height, entries
@@ -181,7 +184,7 @@ def _ordinal(number: int) -> str:
     return {1: "1st", 2: "2nd", 3: "3rd"}.get(number, f"{number}th")
 
 
-def _lead(recording: AnyRecording, camera: str, number: int) -> int:
+def _lead(recording: Recording, camera: str, number: int) -> int:
     """How many images from the last keyframe on come before one: recordings of video begin with a keyframe."""
     if number == 0:
         return 0

@@ -86,7 +86,7 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     Raises:
         RecordingError: The recording is damaged.
     """
-    spec = None if episode.simulated is None else episode.simulated.info.robot
+    spec = None if episode.info.simulation is None else episode.info.robot
     if not (text := episode.urdf):
         return None
     urdf = portable_urdf(text) if spec is None else text

@@ -36,9 +36,9 @@ from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
 from demorec.datasets.lerobot.writer import WrittenEpisode, write_text
-from demorec.episode.episode import SimulatedColumns
+from demorec.episode.episode import Columns
 from demorec.episode.scene import Scene
-from demorec.mcap import AnyRecording, SimulatedRecording
+from demorec.mcap import Recording
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
@@ -120,31 +120,30 @@ class EpisodeRecord:
     @classmethod
     def of(cls, episode: ExportEpisode) -> EpisodeRecord:
         """Of an episode; frame numbers are those of the dataset."""
-        recording, rows, attempt = episode.recording, episode.rows, attempt_row(episode.recording)
+        info, rows, attempt = episode.info, episode.rows, attempt_row(episode.recording)
         row = {
             **{name: attempt[name] for name in ("source", "run_episode_index", "attempt", "success", "failure_reason")},
             "origin": episode.origin,
-            "frame_stride": recording.info.fps // episode.fps if len(rows) > 1 else 1,
+            "frame_stride": info.fps // episode.fps if len(rows) > 1 else 1,
             "cameras": episode.described_cameras(),
         }
         moving: dict[str, Array] = {}
-        if (simulated := episode.simulated) is not None:
-            row |= _simulated_row(episode, simulated)
-            cameras = simulated.info.scene.cameras
+        if (simulation := info.simulation) is not None:
+            row |= _simulated_row(episode)
             poses = episode.columns.world_from_camera
-            moving = {camera.name: poses[camera.name][rows] for camera in cameras if camera.mount != "world"}
+            moving = {camera.name: poses[camera.name][rows] for camera in info.cameras if camera.mount != "world"}
         return cls(
             row=row,
             moving_cameras=moving,
-            config_digest="" if simulated is None else simulated.info.config_digest,
-            config={} if simulated is None else simulated.info.config,
+            config_digest="" if simulation is None else simulation.config_digest,
+            config={} if simulation is None else simulation.config,
             robot=robot_of(episode),
         )
 
 
-def _simulated_row(episode: ExportEpisode, simulated: SimulatedRecording) -> dict[str, Any]:
+def _simulated_row(episode: ExportEpisode) -> dict[str, Any]:
     """What is known of a simulated episode; it failed where its recording ends without an outcome."""
-    info, columns, outcome = simulated.info, episode.columns, simulated.outcome
+    info, columns, outcome = episode.info, episode.columns, episode.recording.outcome
     return {
         "root_seed": info.root_seed,
         "task": info.task,
@@ -161,7 +160,7 @@ def _simulated_row(episode: ExportEpisode, simulated: SimulatedRecording) -> dic
     }
 
 
-def _phases(columns: SimulatedColumns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
+def _phases(columns: Columns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
     """Name, first frame and frame after the last, of each phase."""
     phases = []
     for name, group in groupby(range(len(rows)), key=lambda index: columns.phase[rows[index]]):
@@ -170,7 +169,7 @@ def _phases(columns: SimulatedColumns, rows: NDArray[np.intp]) -> list[dict[str,
     return phases
 
 
-def _things(scene: Scene, columns: SimulatedColumns) -> dict[str, list[dict[str, Any]]]:
+def _things(scene: Scene, columns: Columns) -> dict[str, list[dict[str, Any]]]:
     """Where the objects and goals are, at the start and at the end."""
     return {
         "objects": [
@@ -286,7 +285,7 @@ ATTEMPT_SCHEMA = pa.schema(
 )
 
 
-def attempt_row(recording: AnyRecording) -> dict[str, Any]:
+def attempt_row(recording: Recording) -> dict[str, Any]:
     """One attempt, as far as success rates need it, from the recording's metadata alone, less `in_dataset`.
 
     Positions are in the world frame, metres, at the start; `success` is None where nobody said.
@@ -299,5 +298,5 @@ def attempt_row(recording: AnyRecording) -> dict[str, Any]:
         "success": recording.success,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "failure_reason": "cut off by a crash" if outcome is None else outcome.failure_reason,
-        **first_goal(info.scene),
+        **first_goal(None if info.simulation is None else info.scene),
     }

@@ -29,7 +29,7 @@ from demorec.datasets.lerobot.depth import code_values, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.prepare import prepare_episode, reason_to_transcode
-from demorec.mcap import AnyRecording, open_recording
+from demorec.mcap import Recording, open_recording
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
 """What pip has to install for a verification; a test compares it with pyproject.toml."""
@@ -137,7 +137,7 @@ def _verify(root: Path, samples: Sequence[tuple[int, Path]], options: ExportOpti
 
 
 def _compare_episode(
-    dataset: Any, episode_index: int, recording: AnyRecording, options: ExportOptions, number: int
+    dataset: Any, episode_index: int, recording: Recording, options: ExportOptions, number: int
 ) -> int:
     first = int(dataset.meta.episodes[episode_index]["dataset_from_index"])
     episode = ExportEpisode(recording, options)

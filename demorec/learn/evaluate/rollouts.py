@@ -236,10 +236,11 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     """Run the policy once and record it; the work of a worker (see `demorec.generate.executor.Maker`)."""
     settings, env, policy, world = _stage(folder)
     observation, _ = env.reset(seed=plan.episode_index)
-    info = replace(env.info, origin=f"rollout of {settings.policy_type} {settings.policy_digest}")
+    info, kind = env.info, "rollout"
     if settings.takeover is not None:
         behaviour = {**info.behaviour, **correcting_behaviour(env.episode, noise=settings.takeover.noise).as_mapping()}
-        info = replace(info, origin=info.origin.replace("rollout", "correction", 1), behaviour=behaviour)
+        info, kind = info.with_simulation(behaviour=behaviour), "correction"
+    info = replace(info, origin=f"{kind} of {settings.policy_type} {settings.policy_digest}")
     turns = Turns(env, policy, observation, seed=plan.episode_index, rules=settings.takeover, rehearsal_world=world)
     name = f"episode_{plan.episode_index:06d}.mcap"
     path = folder / name

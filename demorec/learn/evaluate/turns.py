@@ -20,7 +20,7 @@ from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.policy import Policy
 from demorec.learn.evaluate.watch import Watch, correcting_behaviour
 from demorec.loop.agents import ActionNoise, Decision
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import open_recording
 from demorec.sim.world import World
 from demorec.tasks.recovery import TAKE_OVER
 from demorec.tasks.script import Step
@@ -185,7 +185,7 @@ def read_takeover(path: Path) -> TakenOver | None:
     Raises:
         RecordingError: It cannot be read.
     """
-    with SimulatedRecording(path) as recording:
+    with open_recording(path, simulated=True) as recording:
         messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
         if not messages:
             return None

@@ -19,7 +19,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.external import Camera, EpisodeInfo, SampledFrame
+from demorec.episode.episode import SampledFrame
+from demorec.episode.info import Camera, EpisodeInfo
 from demorec.mcap import EpisodeWriter
 
 WhenFull = Literal["error", "drop", "wait"]

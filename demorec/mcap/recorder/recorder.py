@@ -18,14 +18,8 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError, in_words
 from demorec.core.files import Closing
 from demorec.core.registry import nearest_match
-from demorec.episode.episode import Outcome
-from demorec.episode.external import (
-    Camera,
-    EpisodeInfo,
-    Feature,
-    Sample,
-    SampledFrame,
-)
+from demorec.episode.episode import Outcome, Sample, SampledFrame
+from demorec.episode.info import Camera, EpisodeInfo, Feature
 from demorec.episode.validity import find_problems
 from demorec.mcap import EpisodeWriter
 from demorec.mcap.frame_check import SampledFrameCheck
@@ -354,7 +348,7 @@ class Recorder(Closing):
         return EpisodeInfo(
             episode_index=episode_index,
             instruction=instruction,
-            robot=self._robot.name,
+            robot_name=self._robot.name,
             urdf=self._robot.urdf,
             fps=self._fps,
             features=features,

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from demorec.core.errors import ConfigError, RecordingError, SceneError, in_words
 from demorec.core.files import read_text_limited
 from demorec.core.registry import nearest_match
-from demorec.episode.external import Feature
 from demorec.episode.features import ACTION, STATE
+from demorec.episode.info import Feature
 from demorec.mcap.description import robot_description, self_contained
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml

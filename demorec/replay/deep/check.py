@@ -14,9 +14,9 @@ from demorec.core.config import deciding_versions
 from demorec.core.errors import DemorecError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.processes import in_turn
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import SimulatorCache
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording, open_recording
 from demorec.replay.deep.contents import Contents, coded_topics, content_differences
 from demorec.replay.deep.difference import Difference
 from demorec.replay.deep.pictures import picture_differences
@@ -72,7 +72,10 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
     """
     report = DeepReport(path=path)
     try:
-        with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder, SimulatedRecording(path) as recording:
+        with (
+            tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder,
+            open_recording(path, simulated=True) as recording,
+        ):
             info = recording.info
             versions = version_differences(info.versions, versions_here(info, allowed))
             report = replace(report, versions=versions, num_frames=recording.num_frames, is_derived=bool(info.origin))
@@ -88,7 +91,7 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
         return replace(report, error=str(error))
 
 
-def versions_here(info: SimulatedInfo, allowed: Sequence[str]) -> Mapping[str, str]:
+def versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
     """package -> version of what would make such an episode here."""
     with suppress(DemorecError):
         return deciding_versions(recorded_config(info, allowed))
@@ -96,11 +99,11 @@ def versions_here(info: SimulatedInfo, allowed: Sequence[str]) -> Mapping[str, s
 
 
 def _differences(
-    recording: SimulatedRecording, again: Path, simulators: SimulatorCache, allowed: Sequence[str]
+    recording: Recording, again: Path, simulators: SimulatorCache, allowed: Sequence[str]
 ) -> Iterator[Difference]:
     """Ordered by the first frame."""
     found, made = Contents.of(recording.path), Contents.of(again)
-    with SimulatedRecording(again) as remade:
+    with open_recording(again, simulated=True) as remade:
         if recording.is_recovered:
             made.cut_off(found)
         differences, pictures = content_differences(found, made, remade.info, recording.info.fps)
@@ -112,7 +115,7 @@ def _differences(
     yield from sorted(differences, key=lambda difference: difference.first_frame)
 
 
-def _replayed(recording: SimulatedRecording, simulators: SimulatorCache, allowed: Sequence[str]) -> str:
+def _replayed(recording: Recording, simulators: SimulatorCache, allowed: Sequence[str]) -> str:
     """Whether the fault is in what was recorded, or in how it is made again: the commands alone, in the scene alone."""
     options = ReplayOptions(allowed=tuple(allowed))
     try:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.plain import parse_json
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap.channels import camera_topic
 from demorec.mcap.container import Container
 from demorec.mcap.messages import Value, message_fields
@@ -89,13 +89,13 @@ class Contents:
             other.metadata.pop(name, None)
 
 
-def coded_topics(info: SimulatedInfo) -> dict[str, str]:
+def coded_topics(info: EpisodeInfo) -> dict[str, str]:
     """Topic -> camera, of all streams of coded pictures."""
     return {camera_topic(camera.name, stream): camera.name for camera in info.scene.cameras for stream in CODED}
 
 
 def content_differences(
-    recorded: Contents, again: Contents, info: SimulatedInfo, fps: int
+    recorded: Contents, again: Contents, info: EpisodeInfo, fps: int
 ) -> tuple[list[Difference], dict[str, list[int]]]:
     """What differs, less the coded pictures; and topic -> frames, ascending, whose coded pictures differ.
 

@@ -12,7 +12,7 @@ from demorec.check.run_dataset import DatasetEpisode, dataset_episodes, episode_
 from demorec.core.errors import ConfigError, DemorecError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import SimulatorCache
 from demorec.replay.deep.check import DeepReport, versions_here
 from demorec.replay.deep.difference import Difference
@@ -46,7 +46,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
 def _report(
     name: Path,
     episode: DatasetEpisode,
-    info: SimulatedInfo,
+    info: EpisodeInfo,
     options: ExportOptions,
     simulators: SimulatorCache,
     allowed: Sequence[str],

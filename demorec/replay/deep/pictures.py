@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
-from demorec.mcap import SimulatedRecording
+from demorec.mcap import Recording
 from demorec.mcap.lossless import decode_depth, decode_labels
 from demorec.mcap.messages import message_fields
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
@@ -37,7 +37,7 @@ _LEVELS_OF_THE_MEAN = 3.0
 def picture_differences(
     recorded: Contents,
     again: Contents,
-    remade: SimulatedRecording,
+    remade: Recording,
     painter: Painter,
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
@@ -90,7 +90,7 @@ def _coded(contents: Contents, topic: str) -> list[bytes]:
     return pictures
 
 
-def _drawn(remade: SimulatedRecording, painter: Painter, camera: str) -> Iterator[Rgb]:
+def _drawn(remade: Recording, painter: Painter, camera: str) -> Iterator[Rgb]:
     columns, info = remade.columns(), remade.info
     world = RecordedWorld(
         info.robot, info.scene, joint_position=columns.joint_position, object_poses=columns.object_poses

@@ -10,9 +10,9 @@ from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.plain import digest, from_plain
 from demorec.core.tables import RENDERERS
-from demorec.episode.episode import SimulatedInfo
+from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import SimulatedRecording, SimulatedWriter
+from demorec.mcap import Recording, SimulatedWriter
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
@@ -21,7 +21,7 @@ from demorec.replay.rerender import recorded_view, view_painter
 from demorec.robots.assets import allow_models
 
 
-def recorded_config(info: SimulatedInfo, allowed: Collection[str]) -> GenerateConfig:
+def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:
     """The config that an episode says it was made with.
 
     Raises:
@@ -34,7 +34,7 @@ def recorded_config(info: SimulatedInfo, allowed: Collection[str]) -> GenerateCo
     return config
 
 
-def remake(recording: SimulatedRecording, path: Path, simulators: SimulatorCache, allowed: Sequence[str] = ()) -> None:
+def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str] = ()) -> None:
     """Make the episode of a recording again, as a recording of the same format version.
 
     A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
@@ -56,9 +56,7 @@ def remake(recording: SimulatedRecording, path: Path, simulators: SimulatorCache
         generate_again(recording.info, path, simulators, allowed)
 
 
-def generate_again(
-    recorded: SimulatedInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str] = ()
-) -> None:
+def generate_again(recorded: EpisodeInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str] = ()) -> None:
     """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
     config = recorded_config(recorded, allowed)
     episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
@@ -71,11 +69,11 @@ def generate_again(
         writer.finish(session.outcome)
 
 
-def _send_again(recording: SimulatedRecording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
     allow_models(allowed)
     options = ReplayOptions(allowed=tuple(allowed))
     demonstration = open_demonstration(recording, options)
-    info = replace(recording.info, config_digest=digest(recording.info.config))
+    info = recording.info.with_simulation(config_digest=digest(recording.info.config))
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
     painter = recorded_painter(info, renderer, allowed)
@@ -101,7 +99,7 @@ def _recorded[T](config: object, kind: type[T]) -> T:
         raise ConfigError(f"The recorded config is none of this version ({error}).") from error
 
 
-def recorded_painter(info: SimulatedInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
+def recorded_painter(info: EpisodeInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
     """Draws what the recording shows, from where its cameras really were; None without cameras."""
     if renderer is None:
         return None

@@ -1,0 +1,230 @@
+"""What is known of an episode before its first frame: one description, of which not all must be there.
+
+A simulated episode is an episode that also has a `Simulation`: a scene, a seed, the robot's model. Of any other nothing
+is known but what came: vectors and images, each with the stamp of its own clock. What is not known is absent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from demorec.core.errors import NotSimulatedError
+from demorec.core.geometry import Pose
+from demorec.core.plain import write_optional_part
+from demorec.episode.scene import Scene
+from demorec.robots.robot import RobotSpec
+
+FORMAT_VERSION = 2
+"""Of the recordings of simulated episodes. A reader knows every version up to this one; `recordings/sample/` holds a
+file of each."""
+EXTERNAL_VERSION = 1
+"""The same, of the recordings of external episodes."""
+
+Kept = Literal["", "h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
+DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
+"""Encoding of distances -> how many of its units a metre has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feature:
+    """A vector that every frame has.
+
+    Attributes:
+        name: As datasets call it: "observation.state", "action", "observation.force".
+        dtype: Of its numbers, kept as it came.
+        names: Of its elements; there are D.
+        units: Of its elements ("rad", "deg", "m"), or none where they are unknown.
+        joints: For each element the joint of the URDF of which it is the position ("" for none); empty where none is.
+            Positions are in rad and m, or in degrees where the unit is "deg".
+        source: Where it came from, in words: "/joint_states position, latest before, header stamps".
+    """
+
+    name: str
+    dtype: Literal["float32", "float64"] = "float64"
+    names: tuple[str, ...]
+    units: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+    source: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A camera, as far as it is known.
+
+    Attributes:
+        name: Unique; also its topic.
+        width, height: Pixels.
+        kept: The codec of its images where they come encoded and stay as they are; "" where they come as pixels, which
+            the recorder codes. Of a depth camera ROS's name for its distances, whose every bit stays: "16UC1" (whole
+            millimetres, 0 where nothing was measured) or "32FC1" (metres, 0 or not finite where nothing was).
+        intrinsics: K row by row, 9 numbers in pixels; None when unknown.
+        distortion: Of the plumb bob model (k1, k2, p1, p2, k3); empty for none.
+        mount: The link of the URDF that carries it, "world" for one that stands in a scene; "" when unknown.
+        mount_from_camera: Pose in the frame of that link, OpenCV axes; None when unknown.
+        source: Where its images came from, in words.
+    """
+
+    name: str
+    width: int
+    height: int
+    kept: Kept = ""
+    intrinsics: tuple[float, ...] | None = None
+    distortion: tuple[float, ...] = ()
+    mount: str = ""
+    mount_from_camera: Pose | None = None
+    source: str = ""
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether its images are distances."""
+        return self.kept in DEPTH_UNITS
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceFile:
+    """A file that an episode was read from: its name, and the SHA-256 (hex) of its bytes.
+
+    The name is without folders, but for the files of a dataset: their places in there.
+    """
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """How an external episode came here.
+
+    Attributes:
+        kind: By the `Recorder` in somebody's program, by `demorec import`, or read in place from a dataset.
+        files: What was imported.
+        mapping_digest: Of the mapping by which it was imported.
+    """
+
+    kind: Literal["recorder", "import", "dataset"] = "recorder"
+    files: tuple[SourceFile, ...] = ()
+    mapping_digest: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """What is known of an episode that demorec simulated, and of no other.
+
+    Attributes:
+        root_seed: Of the run.
+        task: Name of the task (or "package.module:Name").
+        robot: The arm.
+        scene: The world at the start, cameras with intrinsics and mounts included.
+        physics_hz: Steps per second.
+        behaviour: name -> value of everything else that was drawn for this episode (speed, approach height,
+            noise level), for the card and for analysis.
+        config: The resolved GenerateConfig as plain JSON data.
+        config_digest: SHA-256 of it, 16 hex digits.
+    """
+
+    root_seed: int
+    task: str
+    robot: RobotSpec
+    scene: Scene
+    physics_hz: int
+    behaviour: Mapping[str, float] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    config_digest: str = ""
+
+
+class _Simulated[V]:
+    """A value of the simulation, read as one of the episode's; NotSimulatedError where there is no simulation."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, info: EpisodeInfo, _: type | None = None) -> V:
+        if info.simulation is None:
+            raise NotSimulatedError(self._name)
+        value: V = getattr(info.simulation, self._name)
+        return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeInfo:
+    """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
+
+    Attributes:
+        format_version: Of the recording; 0 stands for the newest.
+        episode_index: Which episode of the run.
+        attempt: Which attempt at it.
+        instruction: What the robot is asked to do, in words; LeRobot's task text.
+        robot_name: What the robot is called.
+        urdf: Its description as text, "" when unknown; that of a simulated robot is in the scene's models.
+        fps: Nominal frames per second; the frames' own stamps say what they were.
+        features: Vectors that every frame has; a simulated episode has the fixed ones of `Columns` instead.
+        cameras: None to many; those of a simulation are its scene's.
+        origin: How the episode came here; of a simulated one "" for a generated one, "replay of DIGEST", "render of
+            DIGEST" for a derived one.
+        versions: package -> version, of what wrote it; for a simulated one of what decides the bits (demorec, pybullet,
+            numpy, numba, av), with the sources of modules of one's own.
+        simulation: Scene, seed, task; None of an episode that demorec did not simulate. Its values can be read as
+            those of the episode (`info.scene`); that raises NotSimulatedError where there are none.
+    """
+
+    format_version: int = 0
+    episode_index: int
+    attempt: int = 0
+    instruction: str
+    robot_name: str = ""
+    urdf: str = ""
+    fps: int
+    features: tuple[Feature, ...] = ()
+    cameras: tuple[Camera, ...] = ()
+    origin: str | Origin = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    simulation: Simulation | None = None
+
+    root_seed = _Simulated[int]()
+    task = _Simulated[str]()
+    robot = _Simulated[RobotSpec]()
+    scene = _Simulated[Scene]()
+    physics_hz = _Simulated[int]()
+    behaviour = _Simulated[Mapping[str, float]]()
+    config = _Simulated[Mapping[str, Any]]()
+    config_digest = _Simulated[str]()
+
+    def with_simulation(self, **changes: Any) -> EpisodeInfo:
+        """The same episode with other values of its simulation; NotSimulatedError where it has none."""
+        if self.simulation is None:
+            raise NotSimulatedError("simulation")
+        return replace(self, simulation=replace(self.simulation, **changes))
+
+    def __post_init__(self) -> None:
+        if self.simulation is None:
+            known: dict[str, Any] = {"format_version": self.format_version or EXTERNAL_VERSION}
+            known["origin"] = self.origin or Origin()
+        else:
+            known = {"format_version": self.format_version or FORMAT_VERSION}
+            known["robot_name"] = self.simulation.robot.name
+            known["cameras"] = tuple(
+                Camera(
+                    name=camera.name,
+                    width=camera.width,
+                    height=camera.height,
+                    intrinsics=tuple(np.ravel(camera.intrinsics).tolist()),
+                    mount=camera.mount,
+                    mount_from_camera=camera.mount_from_camera,
+                )
+                for camera in self.simulation.scene.cameras
+            )
+        for name, value in known.items():
+            object.__setattr__(self, name, value)
+
+
+write_optional_part(
+    EpisodeInfo,
+    "simulation",
+    Simulation,
+    with_part={"origin": str, "robot_name": None, "urdf": None, "features": None, "cameras": None},
+    without_part={"origin": Origin, "robot_name": "robot", "attempt": None},
+)
