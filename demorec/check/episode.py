@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import struct
+import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from itertools import combinations
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +21,15 @@ from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells, correl
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
 from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode
-from demorec.check.evidence import Motion, motion_of_simulated
-from demorec.check.motion import Motions
+from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
+from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.core.errors import RecordingError, SceneError
 from demorec.core.geometry import Array
 from demorec.episode.episode import Columns, Event, Outcome, frame_time_ns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
-from demorec.mcap import Recording, channels, open_recording
+from demorec.mcap import Recording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
@@ -69,13 +71,13 @@ class CheckedEpisode(ExitStack):
 
     Args:
         path: The recording.
+        named_urdf: Text of the robot's description that the user names, for a recording that is not simulated; "" for
+            none.
     """
 
-    form: ClassVar[Form] = "simulated"
-
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, named_urdf: str = "") -> None:
         super().__init__()
-        self.path = path
+        self.path, self._named_urdf = path, named_urdf
         self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
@@ -89,7 +91,14 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def recording(self) -> Recording:
         """The open recording."""
-        return self.enter_context(open_recording(self.path, simulated=True))
+        return self.enter_context(Recording(self.path))
+
+    @cached_property
+    def form(self) -> Form:
+        """By whether there is a scene; one that cannot be opened counts as simulated."""
+        with suppress(RecordingError):
+            return "simulated" if self.info.simulation is not None else "external"
+        return "simulated"
 
     @property
     def info(self) -> EpisodeInfo:
@@ -160,24 +169,32 @@ class CheckedEpisode(ExitStack):
 
     @property
     def message_counts(self) -> dict[str, int]:
-        """Topic -> messages that are there."""
-        return {topic: len(scan.time_ns) for topic, scan in self.scan.items()}
+        """Topic -> messages that are there; every chunk's checksum is verified on the way."""
+        if self.form == "simulated":
+            return {topic: len(scan.time_ns) for topic, scan in self.scan.items()}
+        return Counter(message.topic for message in self.container.messages(tuple(self.container.channels)))
 
     @property
     def num_words(self) -> int:
-        """How many events there are."""
-        return len(self.events)
+        """How many events and subtasks there are."""
+        return len(self.events) + len(self.recording.subtasks)
 
     # ------------------------------------------------------------------------------------------- the robot
 
     @cached_property
     def motions(self) -> Motions:
-        """The one of its robot."""
-        return Motions(lambda: [motion_of_simulated(self.info, self.columns, self.urdf)] if self.num_frames else [])
+        """The one of its robot, if it has a state."""
+        return Motions(lambda: [self._motion] if self._motion is not None else [])
+
+    @cached_property
+    def _motion(self) -> Motion | None:
+        if self.form == "external":
+            return motion_of_recording(self.info, self.columns, self._named_urdf)
+        return motion_of_simulated(self.info, self.columns, self.urdf) if self.num_frames else None
 
     def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
         """The torques that its motion needs."""
-        return self.dynamics
+        return self.dynamics if self.form == "simulated" else point_masses(motion)
 
     @cached_property
     def dynamics(self) -> Dynamics | NotMeasured:
@@ -299,7 +316,11 @@ class CheckedEpisode(ExitStack):
         return self._pictures[camera.name, kind]
 
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
-        """(two cameras in different places, correlation of their images)."""
+        """(two cameras in different places, correlation of their images); where nobody knows the places, whether the
+        encoded images are the same."""
+        if self.form == "external":
+            yield from self._equal_cameras()
+            return
         poses = self.columns.world_from_camera
         for camera, other in combinations(self.cameras, 2):
             first, second = self.pictures(camera).cells, self.pictures(other).cells
@@ -307,6 +328,14 @@ class CheckedEpisode(ExitStack):
             is_near = np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3
             if first.shape[1:] == second.shape[1:] and count >= 2 and not is_near:
                 yield f"{camera.name} and {other.name}", correlation(first[:count], second[:count])
+
+    def _equal_cameras(self) -> Iterator[tuple[str, float]]:
+        digests = dict.fromkeys(self.recording.cameras, 0)
+        for camera in digests:
+            for packet in self.recording.packets(camera):
+                digests[camera] = zlib.crc32(packet.data, digests[camera])
+        for one, other in combinations(sorted(digests), 2):
+            yield f"{one} and {other}", float(digests[one] == digests[other] != 0)
 
     @cached_property
     def _drawn(self) -> DrawnEpisode | NotMeasured:

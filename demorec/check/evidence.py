@@ -22,7 +22,6 @@ from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
 from demorec.episode.episode import Columns
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import Recording
 from demorec.robots.urdf import Urdf
 
 EFFORT = "observation.effort"
@@ -130,9 +129,8 @@ def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:
     )
 
 
-def motion_of_recording(recording: Recording, urdf: str) -> Motion | None:
+def motion_of_recording(info: EpisodeInfo, columns: Columns, urdf: str) -> Motion | None:
     """Of a recording that somebody else made, by the URDF that the user names or its own; None without a state."""
-    info, columns = recording.info, recording.columns()
     described = {feature.name: feature for feature in info.features}
     if STATE not in described or not columns.num_frames:
         return None

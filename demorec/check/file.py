@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from demorec.check.base import Measurement, file_check
 from demorec.check.episode import CheckedEpisode
-from demorec.check.external import CheckedRecording
 from demorec.mcap import channels, messages
 from demorec.mcap.streams import frame_streams
 
@@ -16,7 +15,7 @@ from demorec.mcap.streams import frame_streams
     on=("simulated", "external"),
     needs="a recording",
 )
-def opens(episode: CheckedEpisode | CheckedRecording) -> Measurement:
+def opens(episode: CheckedEpisode) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
     return Measurement(value=0, detail=f"format version {episode.recording.info.format_version}")
 
@@ -26,7 +25,7 @@ def opens(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     on=("simulated", "external"),
     needs="a recording",
 )
-def checksums(episode: CheckedEpisode | CheckedRecording) -> Measurement:
+def checksums(episode: CheckedEpisode) -> Measurement:
     """Every byte that holds a message or an attachment passes its checksum, and the index counts them right."""
     counts = episode.message_counts
     wrong = [
@@ -85,7 +84,7 @@ def _picture_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str
     on=("simulated", "external"),
     needs="a recording",
 )
-def readable(episode: CheckedEpisode | CheckedRecording) -> Measurement:
+def readable(episode: CheckedEpisode) -> Measurement:
     """Every message has the layout that the metadata promises, at its frame's time."""
     return Measurement(value=0, detail=f"{episode.columns.num_frames} frames, {episode.num_words} events and subtasks")
 
@@ -96,7 +95,7 @@ def readable(episode: CheckedEpisode | CheckedRecording) -> Measurement:
     on=("simulated", "external"),
     needs="a recording",
 )
-def complete(episode: CheckedEpisode | CheckedRecording) -> Measurement:
+def complete(episode: CheckedEpisode) -> Measurement:
     """The episode was recorded to its end."""
     cut = episode.recording.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")

@@ -11,14 +11,12 @@ from typing import Literal
 from demorec.check.base import Check, Form, Group, Level, Result
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
-from demorec.check.external import CheckedRecording
 from demorec.check.run import CheckedRun, ExternalRun
-from demorec.core.errors import OptionError, RecordingError, check_option, resource_error
+from demorec.core.errors import OptionError, check_option, resource_error
 from demorec.core.processes import SPAWN
 from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import open_recording
 from demorec.robots.assets import allow_models, modules_of_models
 from demorec.runs.external import is_external_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
@@ -201,13 +199,10 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     allow_models(options.allowed)
     infos: Sequence[EpisodeInfo] = ()
     scene: tuple[Form, ...] = ()  # what is asked of others that have a scene
-    if subject.kind == "recording" and _is_external(subject.path):
-        scene = ("simulated",)
-        with CheckedRecording(subject.path, options.urdf) as recording:
-            found = _run(options, recording, ("opens", "readable"), lambda: recording.columns)
-    elif subject.kind == "recording":
-        with CheckedEpisode(subject.path) as episode:
+    if subject.kind == "recording":
+        with CheckedEpisode(subject.path, options.urdf) as episode:
             found = _run(options, episode, ("opens", "readable"), lambda: episode.columns)
+            scene = ("simulated",) if episode.form == "external" else ()
             if any(result.needs_allow for result in found):
                 infos = [episode.info]
     elif subject.kind == "run" and is_external_run(subject.path):
@@ -232,16 +227,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     return SubjectReport(**vars(subject), results=results, needs_allow=modules)
 
 
-def _is_external(path: Path) -> bool:
-    """Whether a recording is that of an external episode; False for what cannot be read."""
-    try:
-        with open_recording(path) as recording:
-            return recording.info.simulation is None
-    except RecordingError:
-        return False
-
-
-Checked = CheckedEpisode | CheckedRecording | Dataset | CheckedRun | ExternalRun
+Checked = CheckedEpisode | Dataset | CheckedRun | ExternalRun
 
 
 def _within(path: Path, detail: str) -> str:

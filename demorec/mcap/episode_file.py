@@ -104,14 +104,17 @@ class EpisodeFile(Closing):
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the recorded cameras that see colours."""
-        return tuple(
-            camera.name for camera in self.info.cameras if camera.name in self._cameras and not camera.is_depth
-        )
+        return tuple(name for name, streams in self._cameras_in_order if streams.video.codec not in DEPTH_UNITS)
 
     @property
     def depth_cameras(self) -> tuple[str, ...]:
-        """Names of the cameras that measure distances and see no colours."""
-        return tuple(camera.name for camera in self.info.cameras if camera.is_depth)
+        """Names of the recorded cameras that measure distances, beside colours or in place of them."""
+        return tuple(name for name, streams in self._cameras_in_order if streams.depth)
+
+    @property
+    def _cameras_in_order(self) -> Iterator[tuple[str, CameraStreams]]:
+        names = (camera.name for camera in self.info.cameras if camera.name in self._cameras)
+        return ((name, self._cameras[name]) for name in names)
 
     def _camera(self, name: str) -> CameraStreams:
         if name not in self._cameras:
@@ -207,7 +210,7 @@ class EpisodeFile(Closing):
 
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded images of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
-        if camera in self.depth_cameras:
+        if self.video_settings(camera).codec in DEPTH_UNITS:
             raise RecordingError(f"The camera {camera!r} measures distances and sees no colours: {self.path}")
         return decode(self.video_settings(camera), self.packets(camera))
 

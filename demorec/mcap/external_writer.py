@@ -24,8 +24,8 @@ from demorec.mcap.file_writer import FileWriter
 from demorec.mcap.frame_check import SampledFrameCheck
 from demorec.mcap.lossless import encode_distances
 from demorec.mcap.pictures import PictureCoder
-from demorec.mcap.streams import FRAMES, SUBTASK, feature_streams, frames_layout
-from demorec.mcap.transforms import ExternalTree, camera_frame
+from demorec.mcap.streams import FRAMES, SUBTASK, feature_streams, frames_layout, tf_stream
+from demorec.mcap.transforms import FrameTree, camera_frame
 
 _SECOND_NS = 1_000_000_000
 
@@ -115,7 +115,8 @@ class EpisodeWriter(FileWriter[_Pictures]):
         self._check = SampledFrameCheck(info)
         self._streams = feature_streams(info)
         self._frames_layout = frames_layout(info)
-        self._tree = ExternalTree(info) if info.urdf else None
+        self._tree = FrameTree(info) if info.urdf else None
+        self._tf = tf_stream(self._tree) if self._tree is not None and self._tree.moving else None
 
     def _write_description(self) -> None:
         """Write what is said once, or leave nothing."""
@@ -193,8 +194,9 @@ class EpisodeWriter(FileWriter[_Pictures]):
             samples = [frame.samples[name] for frame in frames]
             data = stream.encode([sample.stamp_ns for sample in samples], [sample.vector for sample in samples])
             encoded.append((self._file.logger(stream.topic, stream.schema), data))
-        if self._tree is not None and self._tree.is_moving:
-            encoded.append((self._file.logger(TF, messages.TRANSFORMS), self._tree.encode(frames)))
+        if self._tree is not None and self._tf is not None:
+            data = self._tf.encode(times, self._tree.parts_of_samples(frames))
+            encoded.append((self._file.logger(TF, messages.TRANSFORMS), data))
         rows = np.array([self._row(frame) for frame in frames], dtype=np.int64)
         rows_data = self._frames_layout.encode(np.array(times, dtype=np.int64), rows)
         encoded.append((self._file.logger(FRAMES, messages.INT64_ARRAY), rows_data))

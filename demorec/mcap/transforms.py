@@ -1,7 +1,7 @@
 """The coordinate frames of an episode (ROS: TF): which frame hangs on which, and how the moving ones move.
 
-Every link of the robot, every body and every camera is a frame, of an episode that demorec did not simulate every link
-of a robot that is described. What the joints and the physics move is on `/tf` at each frame, the rest on `/tf_static`.
+Every link of a robot that is described, every body and every camera that is placed is a frame. What the joints and the
+physics move is on `/tf` at each frame, the rest on `/tf_static`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from demorec.core.geometry import Array, Pose, quat_multiply
 from demorec.episode.episode import Observation, SampledFrame, Vector
 from demorec.episode.info import EpisodeInfo, Feature
+from demorec.episode.scene import Body
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
 from demorec.robots.assets import asset_path
@@ -42,7 +43,7 @@ def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
 
 
 class FrameTree:
-    """The frames of one episode.
+    """The frames of one episode whose robot is described; a joint that is not recorded stays at 0.
 
     Attributes:
         static: Rows that never change.
@@ -50,17 +51,28 @@ class FrameTree:
     """
 
     def __init__(self, info: EpisodeInfo) -> None:
-        urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
-        self._num_joints = len(info.robot.joint_names)
-        self._objects = [body.name for body in info.scene.movable]
-        self._joints = MovingJoints(urdf, info.robot.joint_names)
+        self._positions = JointPositions(info.features)
+        world_from_base, joints, bodies = Pose(), self._positions.joints, tuple[Body, ...]()
+        if info.simulation is None:
+            urdf = Urdf.parse(info.urdf)
+        else:
+            urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
+            world_from_base, joints = info.scene.robot.world_from_base, info.robot.joint_names
+            bodies = info.scene.bodies
+        self._num_joints = len(joints)
+        self._objects = [body.name for body in bodies if body.movable]
+        self._joints = MovingJoints(urdf, joints)
         self.moving = (*self._joints.moving, *((WORLD, name) for name in self._objects))
         self.static: tuple[Row, ...] = (
             (RERUN_ROOT, WORLD, Pose()),
-            (WORLD, urdf.root, info.scene.robot.world_from_base),
+            (WORLD, urdf.root, world_from_base),
             *self._joints.static,
-            *((WORLD, body.name, body.world_from_body) for body in info.scene.bodies if not body.movable),
-            *((camera.mount, camera_frame(camera.name), camera.mount_from_camera) for camera in info.scene.cameras),
+            *((WORLD, body.name, body.world_from_body) for body in bodies if not body.movable),
+            *(
+                (camera.mount or urdf.root, camera_frame(camera.name), camera.mount_from_camera)
+                for camera in info.cameras
+                if camera.mount_from_camera is not None
+            ),
         )
 
     def parts(self, observation: Observation) -> list[Array]:
@@ -70,6 +82,11 @@ class FrameTree:
             pose = observation.object_poses[name]
             result += [pose.position, pose.quat_xyzw]
         return result
+
+    def parts_of_samples(self, frames: Sequence[SampledFrame]) -> Array:
+        """(N, n) what `arrange` needs of frames that hold features."""
+        features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in frames[0].samples}
+        return self._positions.of(features)
 
     def arrange(self, parts: Array) -> Array:
         """(N, 7 n) position and quaternion xyzw of every moving row at N frames."""
@@ -152,37 +169,3 @@ class JointPositions:
         """(..., n) rad or m, from features (..., D)."""
         columns = [features[name][..., index] * factor for name, index, factor in self._places]
         return np.stack(columns, axis=-1).astype(np.float64)
-
-
-class ExternalTree:
-    """Which coordinate frames hang on which; a joint of the URDF that is not observed stays at 0.
-
-    Attributes:
-        static: Rows that never change.
-        is_moving: Whether any joint is known to move.
-    """
-
-    def __init__(self, info: EpisodeInfo) -> None:
-        urdf = Urdf.parse(info.urdf)
-        self._positions = JointPositions(info.features)
-        self._joints = MovingJoints(urdf, self._positions.joints)
-        self._layout = transforms_layout(self._joints.moving)
-        self.is_moving = bool(self._joints.moving)
-        self.static: tuple[Row, ...] = (
-            (RERUN_ROOT, WORLD, Pose()),
-            (WORLD, urdf.root, Pose()),
-            *self._joints.static,
-            *(
-                (camera.mount or urdf.root, camera_frame(camera.name), camera.mount_from_camera)
-                for camera in info.cameras
-                if camera.mount_from_camera is not None
-            ),
-        )
-
-    def encode(self, frames: Sequence[SampledFrame]) -> list[bytes]:
-        """tf2_msgs/TFMessage of each frame, at its time."""
-        names = frames[0].samples
-        features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in names}
-        values = self._joints.values(self._positions.of(features))
-        times = np.array([frame.time_ns for frame in frames], dtype=np.int64)
-        return self._layout.encode(times, values.reshape(len(frames), -1))

@@ -37,7 +37,7 @@ from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.urdf import Urdf, check_primitives
 from demorec.view.episode import Box, Curves, PlayedEpisode, Statements, millimetres, sensed_curves, timed
-from demorec.view.from_recording import external_episode, shown_at, video_of
+from demorec.view.from_recording import played_episode, shown_at, video_of
 
 
 def dataset_episodes(root: Path) -> list[int]:
@@ -83,7 +83,7 @@ def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
     if not info.urdf and robot is not None:
         info = with_robot(info, robot)
     known["identity"] = hashlib.sha256(f"{root.resolve()} {episode_index}".encode()).hexdigest()[:16]
-    return replace(external_episode(recording, known, info), statements=_statements(recording))
+    return replace(played_episode(recording, known, info), statements=_statements(recording))
 
 
 def _statements(recording: DatasetRecording) -> Statements:

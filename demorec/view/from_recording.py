@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from demorec.mcap import Recording, open_recording
 from demorec.mcap.channels import description_topic
 from demorec.mcap.transforms import JointPositions
 from demorec.runs.run_file import EPISODES, FAILED
-from demorec.view.episode import Curves, PlayedEpisode, Video, millimetres, sensed_curves, timed
+from demorec.view.episode import Curves, PlayedEpisode, Video, sensed_curves, timed
 
 
 @contextmanager
@@ -38,23 +39,20 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
         "source": path.name,
     }
     with open_recording(path) as recording:
-        if recording.info.simulation is None:
-            yield external_episode(recording, known, recording.info)
-        else:
-            yield _simulated(recording, known)
+        yield _recorded(recording, known)
 
 
-def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
+def _recorded(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
     info, columns = recording.info, recording.columns()
-    return PlayedEpisode(
-        **known,
-        info=info,
-        outcome=recording.outcome,
+    episode = played_episode(recording, known, info)
+    if info.simulation is None:
+        return episode
+    return replace(
+        episode,
         robot_description=recording.description(),
         body_description=lambda body: (
             recording.description(body) if description_topic(body) in recording.topics else None
         ),
-        time_ns=columns.time_ns,
         joint_position=dict(zip(info.robot.joint_names, columns.joint_position.T, strict=True)),
         base_from_tcp=columns.base_from_tcp,
         object_poses=columns.object_poses,
@@ -62,12 +60,6 @@ def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
         phase=columns.phase,
         events=tuple(recording.events()),
         curves=_curves(recording, columns),
-        videos={name: video_of(recording, name, columns.time_ns) for name in recording.cameras},
-        depth={
-            name: partial(timed, columns.time_ns, partial(millimetres, partial(recording.depth, name)))
-            for name in recording.cameras
-            if recording.has_depth(name)
-        },
         segmentation={
             name: partial(recording.segmentation, name)
             for name in recording.cameras
@@ -77,10 +69,8 @@ def _simulated(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
     )
 
 
-def external_episode(
-    recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo
-) -> PlayedEpisode:
-    """An episode of which nothing is known but what came; `info` may describe its robot."""
+def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo) -> PlayedEpisode:
+    """What every episode has: features and images; `info` may describe its robot."""
     columns = recording.columns()
     time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
     positions = JointPositions(info.features)
