@@ -91,6 +91,8 @@ class Dataset:
     """
 
     form: ClassVar[Form] = "dataset"
+    has_equal_starts: ClassVar[bool] = False
+    """Nobody says so."""
 
     def __init__(self, path: Path, urdf: str = "") -> None:
         self.path, self.urdf = path, urdf

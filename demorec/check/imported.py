@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from demorec.check.base import Found, Measurement, check
-from demorec.check.run import ExternalRun
+from demorec.check.run import CheckedRun
 
 if TYPE_CHECKING:
     from demorec.sources.import_file import ImportFile
@@ -29,7 +29,7 @@ import_check = partial(check, on=("external run",), needs="a run that was import
     group="time",
     measures="findings about times in the bags that were imported: clocks, losses, gaps, repeats, jitter, order",
 )
-def import_times(run: ExternalRun) -> Found:
+def import_times(run: CheckedRun) -> Found:
     """The streams of the bags were whole, in order and on one clock."""
     return _found(run, lambda kind: kind in _TIMES)
 
@@ -38,7 +38,7 @@ def import_times(run: ExternalRun) -> Found:
     group="pictures",
     measures="findings about cameras in the bags that were imported: frozen, swapped, of several sizes",
 )
-def import_pictures(run: ExternalRun) -> Found:
+def import_pictures(run: CheckedRun) -> Found:
     """Each camera showed its own pictures, of one size and kind."""
     return _found(run, lambda kind: kind in _PICTURES)
 
@@ -47,7 +47,7 @@ def import_pictures(run: ExternalRun) -> Found:
     group="physics",
     measures="findings about numbers in the bags that were imported: NaN, stuck sensors, spikes, units",
 )
-def import_numbers(run: ExternalRun) -> Found:
+def import_numbers(run: CheckedRun) -> Found:
     """The numbers of the bags were such as robots have."""
     return _found(run, lambda kind: kind not in _TIMES | _PICTURES)
 
@@ -56,7 +56,7 @@ def import_numbers(run: ExternalRun) -> Found:
     group="run",
     measures="episodes that an import dropped, since something was missing or too old, and bags that it skipped",
 )
-def import_dropped(run: ExternalRun) -> Found:
+def import_dropped(run: CheckedRun) -> Found:
     """Every episode that the bags hold is in the run, but those that a marker discards."""
     if (found := _import(run)) is None:
         return None
@@ -65,13 +65,13 @@ def import_dropped(run: ExternalRun) -> Found:
     return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_TOLD]))
 
 
-def _import(run: ExternalRun) -> ImportFile | None:
+def _import(run: CheckedRun) -> ImportFile | None:
     from demorec.sources.import_file import load_import_file
 
     return load_import_file(run.path)
 
 
-def _found(run: ExternalRun, is_mine: Callable[[str], bool]) -> Found:
+def _found(run: CheckedRun, is_mine: Callable[[str], bool]) -> Found:
     if (found := _import(run)) is None:
         return None
     told = [

@@ -11,14 +11,13 @@ from typing import Literal
 from demorec.check.base import Check, Form, Group, Level, Result
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
-from demorec.check.run import CheckedRun, ExternalRun
+from demorec.check.run import CheckedRun
 from demorec.core.errors import OptionError, check_option, resource_error
 from demorec.core.processes import SPAWN
 from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
 from demorec.episode.info import EpisodeInfo
 from demorec.robots.assets import allow_models, modules_of_models
-from demorec.runs.external import is_external_run
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
@@ -207,11 +206,10 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
             scene = ("simulated",) if episode.form == "external" else ()
             if any(result.needs_allow for result in found):
                 infos = [episode.info]
-    elif subject.kind == "run" and is_external_run(subject.path):
-        scene = ("run",)
-        found = _run(options, ExternalRun(subject.path), (), lambda: None)
     elif subject.kind == "run":
-        found = _run(options, CheckedRun(subject.path), (), lambda: None)
+        run = CheckedRun(subject.path)
+        found = _run(options, run, (), lambda: None)
+        scene = ("run",) if run.form == "external run" else ()
     else:
         dataset = Dataset(subject.path, options.urdf)
         found = _run(options, dataset, ("dataset_readable",), lambda: dataset.rows)
@@ -229,7 +227,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     return SubjectReport(**vars(subject), results=results, needs_allow=modules)
 
 
-Checked = CheckedEpisode | Dataset | CheckedRun | ExternalRun
+Checked = CheckedEpisode | Dataset | CheckedRun
 
 
 def _within(path: Path, detail: str) -> str:

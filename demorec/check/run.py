@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from demorec.check.base import SCENE, Form, Found, Lacking, Measurement, NotMeasured, run_check, worst
 from demorec.check.coverage import MIN_EPISODES, motion_vector, start_vector, twins, worst_gap
@@ -20,8 +20,8 @@ from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.episode import Outcome
 from demorec.episode.features import STATE
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import Recording, open_recording
-from demorec.runs.external import load_external_run
+from demorec.mcap import open_recording
+from demorec.runs.external import is_external_run, load_external_run
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 
 _MAX_JSON_BYTES = 2 << 30
@@ -54,10 +54,13 @@ class CheckedRun:
         path: The folder with run.json.
     """
 
-    form: ClassVar[Form] = "run"
-
     def __init__(self, path: Path) -> None:
         self.path = path
+
+    @cached_property
+    def form(self) -> Form:
+        """Whether demorec simulated its episodes or others recorded them."""
+        return "external run" if is_external_run(self.path) else "run"
 
     @cached_property
     def run(self) -> dict[str, Any]:
@@ -109,17 +112,38 @@ class CheckedRun:
     @property
     def listed(self) -> dict[str, str]:
         """File -> SHA-256 (hex), as run.json has them."""
+        if self.form == "external run":
+            return {line.file: line.sha256 for line in load_external_run(self.path).episodes}
         return {line["file"]: line["sha256"] for line in self.lines}
 
     @property
     def hint(self) -> str:
         """What becomes of a recording that run.json does not list."""
-        return "" if self.run.get("complete", True) else " yet; the command that began the run takes it in and goes on"
+        is_complete = self.form == "external run" or self.run.get("complete", True)
+        return "" if is_complete else " yet; the command that began the run takes it in and goes on"
+
+    @property
+    def has_equal_starts(self) -> bool:
+        """Whether every episode starts alike because that was asked for."""
+        return self.form == "run" and bool(self.run.get("config", {}).get("fixed"))
 
     def courses(self) -> tuple[list[str], list[Array], list[Array]]:
-        """Files of the successes, their motions and their starts."""
+        """Files of the successes, their motions and their starts, as far as these are known."""
+        if self.form == "external run":
+            motions = dict(self._external_motions())
+            return list(motions), list(motions.values()), []
         told = {file: told for file, told in self.told.items() if file.startswith("episodes/")}
         return list(told), [t.motion for t in told.values()], [start_vector(t.info.scene) for t in told.values()]
+
+    def _external_motions(self) -> Iterator[tuple[str, Array]]:
+        """Of the recordings that can be read and have a state."""
+        for path in self.recordings:
+            try:
+                with open_recording(path) as recording:
+                    if STATE in (features := recording.columns().features):
+                        yield path.name, motion_vector(features[STATE])
+            except (RecordingError, OSError):
+                continue  # check `opens` or `readable` of that recording says so
 
     @property
     def successes(self) -> list[EpisodeInfo]:
@@ -129,48 +153,12 @@ class CheckedRun:
         return [info for info in infos if info.episode_index < asked]
 
 
-class ExternalRun:
-    """A run of recordings that demorec did not simulate.
-
-    Args:
-        path: The folder with run.json.
-    """
-
-    form: ClassVar[Form] = "external run"
-    hint = ""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    @cached_property
-    def listed(self) -> dict[str, str]:
-        """File -> SHA-256 (hex), as run.json has them."""
-        return {line.file: line.sha256 for line in load_external_run(self.path).episodes}
-
-    @property
-    def recordings(self) -> list[Path]:
-        """Every recording there is."""
-        return sorted((self.path / EPISODES).glob("*.mcap"))
-
-    def courses(self) -> tuple[list[str], list[Array], list[Array]]:
-        """Files that can be read and have a state, and their motions; nothing is known of starts."""
-        found: dict[str, Array] = {}
-        for path in self.recordings:
-            try:
-                with Recording(path) as recording:
-                    if STATE in (features := recording.columns().features):
-                        found[path.name] = motion_vector(features[STATE])
-            except (RecordingError, OSError):
-                continue  # check `opens` or `readable` of that recording says so
-        return list(found), list(found.values()), []
-
-
 @run_check(
     measures="files missing, changed since they were made, or not in run.json",
     on=("run", "external run"),
     needs="a run",
 )
-def run_files(run: CheckedRun | ExternalRun) -> Measurement:
+def run_files(run: CheckedRun) -> Measurement:
     """The recordings are exactly those that run.json lists, with the same SHA-256."""
     listed = run.listed
     there = {str(path.relative_to(run.path)) for path in run.recordings}
@@ -238,12 +226,12 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
     on=("run", "external run", "dataset"),
     needs="two episodes",
 )  # fmt: skip
-def duplicates(subject: CheckedRun | ExternalRun | Dataset) -> Found:
+def duplicates(subject: CheckedRun | Dataset) -> Found:
     """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
     names, motions, starts = subject.courses()
     if len(names) < 2:
         return Lacking(need="two episodes")
-    if isinstance(subject, CheckedRun) and subject.run.get("config", {}).get("fixed"):
+    if subject.has_equal_starts:
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
     return worst(*([twins(starts, names, "starts")] if starts else []), twins(motions, names, "motions"))
 

@@ -20,7 +20,7 @@ from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 
-from demorec.check.run import ExternalRun
+from demorec.check.run import CheckedRun
 from demorec.cli import main
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.tables import CHECKS
@@ -157,7 +157,7 @@ def test_bad_bags_are_skipped_and_listed(
         assert left_out[number]["bag"] == f"run_{2 * number + 1}.mcap"
         assert reason in left_out[number]["reason"]
         assert left_out[number]["reason"] in shown
-    judged = CHECKS.load("import_dropped").run(ExternalRun(run))
+    judged = CHECKS.load("import_dropped").run(CheckedRun(run))
     assert judged.value == len(BAD)
     assert "run_1.mcap: The bag is empty" in judged.detail
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from support import bag_mappings, bags
 
-from demorec.check.run import ExternalRun
+from demorec.check.run import CheckedRun
 from demorec.cli import main
 from demorec.core.tables import CHECKS
 from demorec.mcap import Recording
@@ -179,7 +179,7 @@ def test_what_is_wrong_is_found(name: str, tmp_path: Path, capsys: pytest.Captur
     assert f"  {kind}: " in told
     assert "Nothing odd" not in told
     assert f"({kind}" in told.splitlines()[-1] or f", {kind}" in told.splitlines()[-1]
-    assert CHECKS.load("import_times").run(ExternalRun(tmp_path / "run")).level == "warn"
+    assert CHECKS.load("import_times").run(CheckedRun(tmp_path / "run")).level == "warn"
     if name == "images dropped":  # of the whole camera none is lost, and rows stay a thirtieth of a second apart
         times = [note.header_ns for note in bags.of_topic(notes, SIDE)]
         assert set(times[1:-1]) <= set(shown["side"])
@@ -202,7 +202,7 @@ def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys:
     (share,) = re.findall(r"([\d.]+) % of (?:the rows show the image before|its images are in no row)", note)
     assert float(share) == pytest.approx({30: 50, 15: 50, 25: 100 / 6}[fps], abs=1)
     assert ("in no row" in note) == (fps < 30)
-    assert CHECKS.load("import_times").run(ExternalRun(tmp_path / "run")).level == "pass"
+    assert CHECKS.load("import_times").run(CheckedRun(tmp_path / "run")).level == "pass"
 
 
 @pytest.mark.parametrize(("fps", "kind"), [(20, "skips"), (15, "note"), (25, "skips"), (60, "slow")])
@@ -217,5 +217,5 @@ def test_a_rate_that_no_camera_has(fps: int, kind: str, tmp_path: Path, capsys: 
     if fps < 30:
         (share,) = re.findall(r"([\d.]+) % of its images are in no row", lines[0])
         assert float(share) == pytest.approx(100 * left_out / 90, abs=1)
-    level = CHECKS.load("import_times").run(ExternalRun(tmp_path / "run")).level
+    level = CHECKS.load("import_times").run(CheckedRun(tmp_path / "run")).level
     assert level == ("pass" if kind == "note" else "warn")

@@ -10,7 +10,7 @@ import pytest
 from support import bag_mappings, bags
 from support.bag_faults import ACTION, FAULTS, FRONT, hurt
 
-from demorec.check.run import ExternalRun
+from demorec.check.run import CheckedRun
 from demorec.core.tables import CHECKS
 from demorec.sources.bag import open_bag
 from demorec.sources.bag_files import BagError
@@ -131,7 +131,7 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
     import_bags([bag], mapping, tmp_path / "run")
     bag.unlink()
     found = {
-        check: CHECKS.load(check).run(ExternalRun(tmp_path / "run"))
+        check: CHECKS.load(check).run(CheckedRun(tmp_path / "run"))
         for check in CHECKS.names()
         if check.startswith("import_")
     }
@@ -147,6 +147,6 @@ def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:
     text = MAPPING.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
     text = text.replace("[cameras.front]", cut + "[cameras.front]")
     import_bags([bag], bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run")
-    result = CHECKS.load("import_dropped").run(ExternalRun(tmp_path / "run"))
+    result = CHECKS.load("import_dropped").run(CheckedRun(tmp_path / "run"))
     assert (result.level, result.value) == ("warn", 1)
     assert "camera front" in result.detail

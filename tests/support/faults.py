@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -115,7 +116,8 @@ class Changed:
 
     def with_info(self, **fields: Any) -> Changed:
         """With another description, which must differ."""
-        info = replace(self.info, **fields)
+        of_episode = {known.name for known in dataclasses.fields(EpisodeInfo)} & fields.keys()
+        info = replace(self.info, **{name: fields.pop(name) for name in of_episode}).with_simulation(**fields)
         assert info != self.info
         return replace(self, info=info)
 

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.docs import run_examples
+from support.external import make_external, write_external
 from support.present import present
 from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
+from demorec.core.errors import NotSimulatedError
 from demorec.episode.episode import Frame
-from demorec.mcap import Recording
+from demorec.mcap import Recording, open_recording
 
 NUM_FRAMES = 47
 
@@ -137,3 +139,29 @@ def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> Non
     recording = {"recordings/demo/episodes/episode_000000.mcap": sample}
     assert run_examples("docs/recording.md", "from demorec.mcap import open_recording", recording) == 2
     assert capsys.readouterr().out
+
+
+def test_an_external_recording_is_at_home_in_notebooks(tmp_path: Path) -> None:
+    given = make_external(num_frames=20)
+    with open_recording(write_external(tmp_path / "episode.mcap", given)) as recording:
+        table = recording.to_pandas()
+        assert list(table.columns[:3]) == ["time_ns", "observation.state.shoulder.pos", "observation.state.elbow.pos"]
+        assert table["time_ns"].tolist() == [frame.time_ns for frame in given.frames]
+        forces = [frame.samples["observation.force"].vector for frame in given.frames]
+        assert np.array_equal(table[[f"observation.force.{axis}" for axis in "xyz"]].to_numpy(), np.array(forces))
+        assert "stack the cups with two_joints" in repr(recording)
+        assert recording._repr_html_().count("<img") == 2 * 5
+        with pytest.raises(NotSimulatedError, match="needs the robot of an episode that demorec simulated"):
+            next(iter(recording))
+    with pytest.raises(NotSimulatedError, match=f"needs the scene .* has none: {tmp_path}"):
+        open_recording(tmp_path / "episode.mcap", simulated=True)
+
+
+def test_a_simulated_recording_says_which_image_each_frame_holds(path: Path) -> None:
+    with open_recording(path, simulated=True) as recording:
+        columns, info = recording.columns(), recording.info
+        for camera in info.cameras:
+            assert columns.pictures[camera.name].tolist() == list(range(NUM_FRAMES))
+            assert not columns.picture_age_ns(camera.name).any()
+        assert [camera.name for camera in info.cameras] == list(recording.cameras)
+        assert np.array_equal(np.reshape(present(info.cameras[0].intrinsics), (3, 3)), info.scene.cameras[0].intrinsics)
