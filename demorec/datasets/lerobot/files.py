@@ -73,7 +73,7 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
     with _table_errors(path):
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
-        table = pq.ParquetFile(path)
+        table = pq.ParquetFile(path, pre_buffer=False)  # which would hold the whole file in memory
         parts = [part for _, part in _parts(table.metadata)]
         said = sum(part.num_values for part in parts if part.path_in_schema.startswith(_REPEATED))
         values = sum(part.num_values for part in parts) - said
