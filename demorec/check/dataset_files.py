@@ -10,12 +10,15 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 
 import numpy as np
 
 from demorec.check.base import Measurement, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
+from demorec.datasets.episode import DONE, REWARD, SUCCESS
+from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
@@ -61,7 +64,47 @@ def dataset_counts(dataset: Dataset) -> Measurement:
         if names != set(place.tasks):
             wrong.append(f"the task of episode {number}")
         start += place.length
+    wrong += [*_wrong_ends(dataset), *(() if info.is_old else (*_wrong_ranges(dataset), *_stray_rows(dataset)))]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{start} frames at {info.fps} fps")
+
+
+def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
+    """Ends of the ranges in the episodes' table, where it has them: rows of the dataset, and seconds of each video."""
+    ends = [f"videos/{key}/to_timestamp" for key in dataset.info.video_keys]
+    for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
+        columns = open_table(path).schema_arrow.names
+        names = [name for name in ("dataset_to_index", *ends) if name in columns]
+        begins = [name.replace("to_", "from_") for name in names]
+        for row in read_table(path, ["episode_index", "length", *names, *begins]).to_pylist():
+            for begin, end in zip(begins, names, strict=True):
+                unit = 1 if end == "dataset_to_index" else dataset.info.fps
+                if not abs((row[end] - row[begin]) * unit - row["length"]) < 0.5:
+                    yield f"{end} of episode {row['episode_index']}"
+
+
+def _stray_rows(dataset: Dataset) -> Iterator[str]:
+    """Rows of the data files that belong to no episode."""
+    used: dict[str, int] = {}
+    for place in dataset.places:
+        path = place.data.path(dataset.info.data_path)
+        used[path] = used.get(path, 0) + place.length
+    for file in sorted((dataset.path / "data").glob("*/*.parquet")):
+        found = open_table(file).metadata.num_rows
+        if (count := used.get(file.relative_to(dataset.path).as_posix(), 0)) != found:
+            yield f"{file.name} has {found} rows, {count} of them of episodes"
+
+
+def _wrong_ends(dataset: Dataset) -> Iterator[str]:
+    """Where an episode is said to be done, if most are at their last row; a reward where there is no success."""
+    if DONE in dataset.info.features:
+        done = [rows[DONE].reshape(-1) for rows in dataset.rows]
+        last = [bool(flags[-1]) and int(flags.sum()) == 1 for flags in done]
+        if sum(last) > len(last) / 2:
+            yield from (f"{DONE} of episode {number}" for number, is_last in enumerate(last) if not is_last)
+    if dataset.sidecar and {REWARD, SUCCESS} <= dataset.info.features.keys():
+        for number, rows in enumerate(dataset.rows):
+            if not np.array_equal(rows[REWARD].reshape(-1) > 0, rows[SUCCESS].reshape(-1)):
+                yield f"{REWARD} of episode {number}"
 
 
 @dataset_check(

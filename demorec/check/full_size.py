@@ -30,6 +30,8 @@ _LEAST_PIXELS, _MANY_PIXELS = 64, 512
 """Of a colour in an image: one of fewer is not judged, one of many fully."""
 _LEVELS = 2.0
 """By which a block may be off beside its encoder's error: what rounding does."""
+_WORST_SHARE = 0.3
+"""Of its worst block's error an encoder may leave in any: at low quality a small thing's colour is lost, or is not."""
 _DEPTH_METRES = 0.004
 """Depth is stored in millimetres; another machine draws edges a little elsewhere."""
 
@@ -167,7 +169,8 @@ def _error(off: Array, own: Array) -> float:
     wide = around.copy()
     wide[:, 1:] = np.maximum(wide[:, 1:], around[:, :-1])
     wide[:, :-1] = np.maximum(wide[:, :-1], around[:, 1:])
-    worst = float(((off - _LEVELS) / np.maximum(wide, 0.5)).max(initial=0.0))
+    least = max(_WORST_SHARE * float(own.max(initial=0.0)), 0.5)
+    worst = float(((off - _LEVELS) / np.maximum(wide, least)).max(initial=0.0))
     usual = float(np.quantile(off / np.maximum(own, 1.0), 0.9)) if off.size else 0.0
     return max(worst, usual)
 

@@ -128,6 +128,7 @@ CHECKS: Registry[Check] = Registry(
         ("alignment", "dataset_action_lag"),
         ("dataset_files", "dataset_sidecar"),
         ("dataset_facts", "dataset_robots", "dataset_facts", "dataset_progress"),
+        ("dataset_details", "dataset_details"),
         ("dataset_language", "dataset_language", "dataset_language_truth"),
         ("dataset_files", "dataset_opens"),
     ),

@@ -155,6 +155,12 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "no timestamps": (of_info(lambda data: data["features"].pop("timestamp")), "dataset_readable"),
     "an episode without frames": (value_of("length", 1, 0, "meta/episodes"), "dataset_readable"),
     "an episode that ends late": (value_of("length", 2, 10_000, "meta/episodes"), "dataset_readable"),
+    "a row's range that ends late": (value_of("dataset_to_index", 1, 10_000, "meta/episodes"), "dataset_counts"),
+    "a video's range that ends early": (
+        value_of(f"videos/{CAMERA}/to_timestamp", 1, 1.0, "meta/episodes"), "dataset_counts"
+    ),
+    "rows of no episode": (of_table("data", lambda t: pa.concat_tables([t, t.slice(0, 5)])), "dataset_counts"),
+    "an episode that is done early": (value_of("next.done", 10, True), "dataset_counts"),
     "statistics that are gone": (lambda dataset: (dataset / "meta/stats.json").unlink(), "dataset_statistics"),
 }  # fmt: skip
 """Name -> what is done to the files of a dataset without sidecar, and the check that fails."""
@@ -192,6 +198,69 @@ def test_pictures_coded_anew_are_no_fault(dataset: Path) -> None:
     rewrite_video(dataset, CAMERA, lambda pictures: [*pictures[:-1], pictures[-2]])
     assert level_of(dataset, "dataset_pictures", "dataset") == "pass"
     assert level_of(dataset, "dataset_picture_statistics", "dataset") == "pass"
+
+
+def of_pose(camera: str, change: Callable[[Any], Any]) -> Fault:
+    def spoil(table: pa.Table) -> pa.Table:
+        poses = np.array(table.column(camera).to_pylist())
+        return replaced(table, camera, change(poses).tolist())
+
+    return of_table("demorec/camera_poses", spoil)
+
+
+def nested(column: str, change: Callable[[Any], Any]) -> Fault:
+    """A change of what the sidecar has of the second episode."""
+
+    def spoil(table: pa.Table) -> pa.Table:
+        values = table.column(column).to_pylist()
+        change(values[1])
+        return replaced(table, column, values)
+
+    return of_table("demorec/episodes", spoil)
+
+
+def farther(row: Any) -> None:
+    row["mount_from_camera"][0] += 0.05
+
+
+DETAILS: dict[str, Fault] = {
+    "a camera's path late by a frame": of_pose("wrist", lambda poses: np.roll(poses, 1, axis=0)),
+    "a camera's path in another place": of_pose("wrist", lambda poses: poses + 0.01),
+    "a camera elsewhere": nested("cameras", lambda rows: farther(rows[0])),
+    "another focal length": nested("cameras", lambda rows: rows[0]["intrinsics"].__setitem__(0, 100.0)),
+    "a goal of another object": nested("goals", lambda rows: rows[0].update(object="table")),
+    "an object that starts elsewhere": nested(
+        "objects", lambda rows: rows[0]["world_from_object_start"].__setitem__(0, 0.9)
+    ),
+    "a phase that is missing": nested("phases", lambda rows: rows.pop(1)),
+    "a condition that failed": nested("checks", lambda rows: rows[0].update(passed=False)),
+    "another seed": value_of("root_seed", 1, 77, "demorec/episodes"),
+    "another attempt": value_of("attempt", 1, 3, "demorec/episodes"),
+    "another task": value_of("task", 1, "stack", "demorec/episodes"),
+    "a config of another run": lambda dataset: edit_json(
+        dataset / "demorec/configs.json", lambda data: next(iter(data.values())).update(seed=77)
+    ),
+}
+"""Name -> what is done to the sidecar of a dataset with a camera on the hand."""
+
+
+@pytest.fixture(scope="module")
+def with_wrist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wrist")
+    simulate_run(folder / "run", 2, seed=3, fps=10, cameras=("wrist",), width=64, height=64)
+    export_lerobot([folder / "run"], folder / "dataset", ExportOptions(verify=False))
+    return folder / "dataset"
+
+
+def test_details_of_a_good_one(with_wrist: Path) -> None:
+    assert level_of(with_wrist, "dataset_details", "dataset") == "pass"
+
+
+@pytest.mark.parametrize("name", DETAILS)
+def test_a_detail_of_the_sidecar(name: str, with_wrist: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(with_wrist, tmp_path / "dataset"))
+    DETAILS[name](dataset)
+    assert level_of(dataset, "dataset_details", "dataset") == "fail"
 
 
 def swap_names(data: Any) -> None:
