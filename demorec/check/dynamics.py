@@ -2,7 +2,7 @@
 
 The model's masses, each at its link's centre of mass, accelerated as the recorded joints say, give the torque of every
 arm joint and the force on the hand (Newton and d'Alembert, without the links' own rotational inertia). What is carried
-adds its weight. That is exact enough where nothing is hit and the motion is smooth: the medians are told.
+adds its weight. That is exact enough where nothing is hit and the motion is smooth: medians, and the gain, are told.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from demorec.robots.assets import asset_path
 from demorec.robots.inertials import link_masses
 from demorec.robots.urdf import Urdf, UrdfJoint
 
-MIN_LOAD = 3.0
-"""N m: joints that bear less, root mean square, say nothing about efforts."""
+MIN_LOAD, LEAST_LOAD = 3.0, 1.0
+"""N m, root mean square: joints that bear less say nothing of a gain; of an offset they do, as if they bore so much."""
 MIN_FRAMES = 20
 LIFTED_HEIGHT = 0.01
 """Metres above its start from which on the arm bears an object in the hand."""
@@ -100,12 +100,14 @@ class Dynamics:
         for name, values in zip(joints, effort.T, strict=True):
             if name not in known or not np.isfinite(values).all():
                 continue
-            torque = self.torque(known[name])[self.is_judged]
+            torque, values = self.torque(known[name])[self.is_judged], values[self.is_judged]
             size = float(np.sqrt(np.median(torque**2)))
+            off = float(np.median(values - torque))
+            found.append(Measurement(value=abs(off) / max(size, LEAST_LOAD), detail=f"{name} is {off:+.2g} N m off"))
             if size >= MIN_LOAD:
-                off = float(np.median(np.abs(values[self.is_judged] - torque))) / size
-                found.append(Measurement(value=off, detail=f"{name}, which bears {size:.0f} N m"))
-        return worst(*found) or NotMeasured(why="no joint of the arm bears a load")
+                gain = float((values * torque).sum() / (torque**2).sum())
+                found.append(Measurement(value=abs(gain - 1), detail=f"{name} gives {gain:.3g} of {size:.0f} N m"))
+        return worst(*found) or NotMeasured(why="no joint of the arm is known")
 
 
 def masses_of(model: str) -> dict[str, tuple[float, Array]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.rows import displacement, inverse, matrices
+from demorec.check.rows import angle_between, displacement, inverse, matrices
 from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Shape
 
@@ -78,9 +78,13 @@ def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     unit="m/s",
 )
 def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
-    """An object moves only when touched, or for a moment after it (falling, rolling, tipping)."""
+    """An object moves or turns only when touched, or for a moment after it (falling, rolling, tipping).
+
+    0.1 m/s are counted for each rad/s.
+    """
     for name, touched in _touched(episode).items():
-        speed = np.linalg.norm(_speeds(episode, name), axis=1)
+        pose = episode.world_from_object(name)
+        speed = displacement(pose[1:], pose[:-1]) * episode.info.fps
         yield worst_frame(np.where(touched, 0.0, speed), name, first=1)
 
 
@@ -97,6 +101,23 @@ def teleports(episode: CheckedEpisode) -> Iterator[Found]:
         beyond = np.linalg.norm(velocity, axis=1) - hand - falling
         if (fastest := worst_frame(beyond, name, first=1)) is not None:
             yield replace(fastest, value=max(fastest.value, 0.0))
+
+
+@physics_check(
+    measures="object rotation beyond that of the hand and of rolling",
+    unit="rad/s",
+)
+def spins(episode: CheckedEpisode) -> Iterator[Found]:
+    """No object's rotation jumps: it turns with the hand that has it, or rolls as fast as it moves past the hand."""
+    fps, hand = episode.info.fps, episode.world_from_tcp
+    with_hand = angle_between(hand[1:], hand[:-1]) * fps
+    of_hand = np.diff(hand[:, :3, 3], axis=0) * fps
+    for name in episode.columns.object_poses:
+        pose, velocity = episode.world_from_object(name), _speeds(episode, name)
+        passing = np.minimum(np.linalg.norm(velocity, axis=1), np.linalg.norm(velocity - of_hand, axis=1))
+        rolling = passing / (min(episode.info.scene.body(name).shape.extents) / 2)
+        beyond = angle_between(pose[1:], pose[:-1]) * fps - with_hand - rolling
+        yield worst_frame(np.maximum(beyond, 0.0), name, first=1)
 
 
 @physics_check(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,7 +12,11 @@ from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Found, Measurement, NotMeasured, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import matrices
+from demorec.core.geometry import Array
+from demorec.core.tables import TASKS
+from demorec.episode.conditions import DISTURBED, LIMITS, OPEN, PLACED
 from demorec.episode.episode import gave_up
+from demorec.episode.scene import Body, Scene
 
 
 @outcome_check(
@@ -63,28 +67,83 @@ def instruction_fits_scene(episode: CheckedEpisode) -> Found:
 
 
 @outcome_check(
-    measures="goal distance in the last frame against the outcome's",
-    unit="m",
+    measures="conditions that are missing, have another limit, or passed though they do not hold",
+)
+def conditions_as_known(episode: CheckedEpisode) -> Found:
+    """The conditions are those of demorec's tasks, with their limits, and those passed that hold."""
+    outcome, scene = episode.outcome, episode.info.scene
+    if outcome is None:
+        return None
+    if episode.info.task not in TASKS.rows:
+        return NotMeasured(why="the task is none of demorec's, so its conditions are not known")
+    names = [condition.name for condition in outcome.checks]
+    wrong = [f"{name} is missing" for name in _expected(scene, names) if name not in names]
+    for condition in outcome.checks:
+        side, limit = LIMITS.get(condition.name.partition(":")[0], ("", math.nan))
+        if condition.name == OPEN:
+            limit *= episode.info.robot.gripper.max_width
+        if side and not math.isclose(condition.limit, limit, rel_tol=1e-9):
+            wrong.append(f"{condition.name} has the limit {condition.limit:g}, not {limit:g}")
+        holds = condition.value <= condition.limit if side == "at most" else condition.value >= condition.limit
+        if side and condition.passed != holds:
+            words = "passed" if condition.passed else "did not pass"
+            wrong.append(f"{condition.name} {words} with {condition.value:g}, limit {condition.limit:g}")
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(names)} conditions")
+
+
+def _expected(scene: Scene, names: Sequence[str]) -> Iterator[str]:
+    """What a task asks for that places things at goals, and the open hand of every task."""
+    yield OPEN
+    if not any(name.partition(":")[0] == PLACED[0] for name in names):
+        return
+    for goal in scene.goals:
+        yield from (f"{part}:{goal.object}" if len(scene.goals) > 1 else part for part in PLACED)
+    placed = {goal.object for goal in scene.goals}
+    yield from (f"{DISTURBED}:{body.name}" for body in scene.movable if body.name not in placed)
+
+
+@outcome_check(
+    measures="what the last frame shows of a condition, against the outcome's value",
+    unit="m, rad",
 )
 def final_state(episode: CheckedEpisode) -> Iterator[Found]:
-    """An object that is said to lie at its goal lies there in the last recorded frame."""
-    outcome, scene, c = episode.outcome, episode.info.scene, episode.columns
-    if outcome is None or not outcome.success or not scene.goals or not c.num_frames:
+    """After a success objects and fingers are in the last recorded frame where the outcome says: distances to goals,
+    heights, tilts, what was not to be moved, the opening."""
+    outcome, c = episode.outcome, episode.columns
+    if outcome is None or not outcome.success or not c.num_frames:
         return
-    said = {condition.name: condition for condition in outcome.checks}
+    shown = dict(_shown(episode))
+    for condition in outcome.checks:
+        if condition.name in shown:
+            value = shown[condition.name]
+            yield Measurement(
+                value=abs(value - condition.value),
+                frame=c.num_frames - 1,
+                detail=f"{condition.name}: {value:.4f}, outcome says {condition.value:.4f}",
+            )
+
+
+def _shown(episode: CheckedEpisode) -> Iterator[tuple[str, float]]:
+    """Conditions as the last frame has them."""
+    c, scene = episode.columns, episode.info.scene
+    last = {name: matrices(poses[-1:])[0] for name, poses in c.object_poses.items()}
+    yield OPEN, float(c.gripper_width[-1])
     for goal in scene.goals:
-        name = "distance_to_goal" if len(scene.goals) == 1 else f"distance_to_goal:{goal.object}"
-        if (condition := said.get(name)) is None:
-            continue
-        wanted = goal.onto_from_goal.matrix()
+        suffix = f":{goal.object}" if len(scene.goals) > 1 else ""
+        wanted, pose, body = goal.onto_from_goal.matrix(), last[goal.object], scene.body(goal.object)
         if goal.onto:
-            poses = c.object_poses.get(goal.onto)
-            onto = scene.body(goal.onto).world_from_body.matrix() if poses is None else matrices(poses[-1:])[0]
-            wanted = onto @ wanted
-        distance = math.dist(c.object_poses[goal.object][-1, :2], wanted[:2, 3])
-        value = abs(distance - condition.value)
-        detail = f"{goal.object}: {distance * 1e3:.1f} mm, outcome says {condition.value * 1e3:.1f} mm"
-        yield Measurement(value=value, frame=c.num_frames - 1, detail=detail)
+            wanted = (last[goal.onto] if goal.onto in last else scene.body(goal.onto).world_from_body.matrix()) @ wanted
+        height = wanted[2, 3] + _half_height(body, pose) - _half_height(body, wanted)
+        yield f"distance_to_goal{suffix}", math.dist(pose[:2, 3], wanted[:2, 3])
+        yield f"height_error{suffix}", abs(float(pose[2, 3] - height))
+        yield f"tilt{suffix}", math.acos(min(1.0, float(np.abs(pose[2, :3]).max())))
+    for body in scene.movable:
+        yield f"{DISTURBED}:{body.name}", math.dist(last[body.name][:2, 3], body.world_from_body.position[:2])
+
+
+def _half_height(body: Body, pose: Array) -> float:
+    """Half the extent of the axis that is nearest to the vertical."""
+    return body.shape.extents[int(np.argmax(np.abs(pose[2, :3])))] / 2
 
 
 @outcome_check(

@@ -13,6 +13,7 @@ from demorec.check.base import (
     Measurement,
     NotMeasured,
     physics_check,
+    worst,
     worst_entry,
     worst_frame,
 )
@@ -20,6 +21,8 @@ from demorec.check.dynamics import MIN_FRAMES
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.core.geometry import Array
+from demorec.episode.episode import POLICY_PHASE
+from demorec.episode.scene import POSITION_GAIN
 
 
 @physics_check(
@@ -71,6 +74,13 @@ def joint_acceleration(episode: CheckedEpisode) -> Measurement | None:
     velocity, robot = episode.columns.joint_velocity[:, : episode.num_arm], episode.info.robot
     acceleration = np.abs(np.diff(velocity, axis=0)) * episode.info.fps
     return worst_entry(acceleration / np.array(robot.acceleration_limit), robot.arm_joints, first=1)
+
+
+_SLOW = 0.02
+"""rad/s below which a joint's velocities say nothing."""
+
+_AT_LIMIT = 0.99
+"""Share of its torque from which on a motor does what it can, not what it is told."""
 
 
 class Handed(Protocol):
@@ -173,22 +183,49 @@ def idle_frames(episode: CheckedEpisode) -> Measurement | None:
 
 
 @physics_check(
-    measures="force on the hand against the weight and motion of what it bears, median difference of it",
+    measures="largest speed of a joint in the first frame in units of its limit",
 )
-def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
-    """The arm holds the hand, and what it carries, with the force that their masses need: catches other units."""
-    wrench = episode.columns.sensed.get("wrench")
-    if wrench is None:
+def starts_at_rest(episode: CheckedEpisode) -> Measurement | None:
+    """The first frame is the scene's start, before any command: catches frames cut off at the head."""
+    robot, n = episode.info.robot, episode.num_arm
+    return worst_entry(
+        np.abs(episode.columns.joint_velocity[:1, :n]) / np.array(robot.velocity_limit), robot.arm_joints
+    )
+
+
+@physics_check(
+    measures="speed of the last wanted motion at 30 frames a second",
+    unit="rad/s",
+)
+def ends_at_rest(episode: CheckedEpisode) -> Found:
+    """The script of a success ends where its last motion does: catches frames cut off at the tail.
+
+    The last step of a motion that is slowed down to rest is the smaller by the square of the rate.
+    """
+    c, fps = episode.columns, episode.info.fps
+    if episode.outcome is None or not episode.outcome.success or c.num_frames < 2:
         return None
-    dynamics = episode.dynamics
-    if isinstance(dynamics, NotMeasured):
-        return dynamics
-    link = episode.info.robot.hand_link
-    mount = episode.urdf.path_to(link)[-1].name
-    force = np.sum([load.force for load in dynamics.below(mount)], axis=0)
-    turned = np.einsum("tji,tj->ti", episode.world_from_link(link)[:, :3, :3], force)
-    off = np.linalg.norm(wrench[:, :3] - turned, axis=1) / np.maximum(np.linalg.norm(turned, axis=1), 1e-6)
-    judged = off[dynamics.is_judged]
-    if len(judged) < MIN_FRAMES:
-        return NotMeasured(why=f"the hand is free and moves smoothly in {len(judged)} frames, fewer than {MIN_FRAMES}")
-    return Measurement(value=float(np.median(judged)), detail=f"{len(judged)} frames")
+    if POLICY_PHASE in c.phase:
+        return NotMeasured(why="a policy may succeed in mid-motion")
+    step = np.abs(c.action_joint_target[-1:] - c.action_joint_target[-2:-1]) * fps * (fps / 30) ** 2
+    return worst_entry(step, episode.info.robot.arm_joints, first=c.num_frames - 1)
+
+
+@physics_check(
+    measures="velocity of a joint against that which the servo's distance from its target gives, median ratio off 1",
+)
+def velocity_follows_servo(episode: CheckedEpisode) -> Found:
+    """The servo takes a joint by a fixed share of what is left to its target in each physics step, so that what is left
+    in a frame gives the velocity in it, unless the motor is at its limit: catches velocities a few per cent off, of
+    another joint, or late."""
+    c, info, n = episode.columns, episode.info, episode.num_arm
+    is_free = np.abs(c.joint_effort[1:, :n]) < _AT_LIMIT * np.array(info.robot.torque_limit)
+    left = c.command_joint_target[:-1] - c.joint_position[1:, :n]
+    expected = left * (info.physics_hz * POSITION_GAIN / (1 - POSITION_GAIN))
+    found: list[Found] = []
+    for joint, name in enumerate(info.robot.arm_joints):
+        rows = is_free[:, joint] & (np.abs(expected[:, joint]) > _SLOW)
+        if rows.sum() >= MIN_FRAMES:
+            off = np.median(np.abs(c.joint_velocity[1:, joint][rows] / expected[rows, joint] - 1))
+            found.append(Measurement(value=float(off), detail=f"{name}, {int(rows.sum())} frames"))
+    return worst(*found) or NotMeasured(why="no joint moves for long")

@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.core.geometry import Pose
+from demorec.episode.conditions import DISTURBED, MAX_DISTURBANCE
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal, Scene
 from demorec.robots.robot import RobotSpec
@@ -24,8 +25,6 @@ from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import at_most, gripper_open_check, placement_checks
 
-MAX_DISTURBANCE = 0.02
-"""How far an object that is not to be moved may end from where it was, metres."""
 TALLEST = 0.07
 """Height, metres, above which no thing on the table reaches."""
 HAND_AND_THING = 0.07
@@ -141,7 +140,7 @@ def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
     moved = {goal.object for goal in world.scene.goals}
     return tuple(
         at_most(
-            f"disturbed:{body.name}",
+            f"{DISTURBED}:{body.name}",
             math.dist(world.pose(body.name).position[:2], body.world_from_body.position[:2]),
             MAX_DISTURBANCE,
             "m",

@@ -7,17 +7,17 @@ import math
 import numpy as np
 
 from demorec.core.geometry import Pose
+from demorec.episode.conditions import (
+    MAX_DISTANCE,
+    MAX_HEIGHT_ERROR,
+    MAX_SPEED,
+    MAX_SPIN,
+    MAX_TILT,
+    MIN_OPENING,
+)
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal
 from demorec.sim.world import World
-
-MAX_DISTANCE = 0.02
-MAX_HEIGHT_ERROR = 0.004
-MAX_TILT = math.radians(5.0)
-MAX_SPEED = 0.01
-MAX_SPIN = 0.1
-MIN_OPENING = 0.875
-"""Share of the gripper's full opening that counts as open."""
 
 
 def goal_pose(world: World, goal: Goal) -> Pose:
@@ -62,7 +62,7 @@ def on_support(world: World, name: str, onto: str) -> bool:
     )
 
 
-def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DISTANCE) -> tuple[SuccessCheck, ...]:
+def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
     """That one object lies at its goal: near, on its support, upright, at rest and let go.
 
     The names end in the object's name when the scene has more than one goal.
@@ -74,7 +74,7 @@ def placement_checks(world: World, goal: Goal, *, max_distance: float = MAX_DIST
     # The wanted height is that of the resting face that was meant; a cube may rest on any face.
     height = wanted.position[2] + resting_half_height(body, pose) - resting_half_height(body, wanted)
     return (
-        at_most(f"distance_to_goal{suffix}", math.dist(pose.position[:2], wanted.position[:2]), max_distance, "m"),
+        at_most(f"distance_to_goal{suffix}", math.dist(pose.position[:2], wanted.position[:2]), MAX_DISTANCE, "m"),
         at_most(f"height_error{suffix}", abs(pose.position[2] - height), MAX_HEIGHT_ERROR, "m"),
         at_least(f"on_support{suffix}", on_support(world, goal.object, goal.onto), 1.0, ""),
         # A box may rest on any face, a bottle may not.

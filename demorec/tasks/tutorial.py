@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.core.geometry import Pose
+from demorec.episode.conditions import MAX_SPEED, MAX_SPIN, MAX_TILT
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.render.cameras import FRONT, TOP, WORKSPACE, CameraPreset
@@ -22,9 +23,6 @@ from demorec.tasks.sampling import Sampler, wording
 from demorec.tasks.script import Step, lasting, steady_width
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import (
-    MAX_SPEED,
-    MAX_SPIN,
-    MAX_TILT,
     at_least,
     at_most,
     gripper_open_check,

@@ -117,6 +117,40 @@ def fingers_in_the_cube(c: Changed) -> Changed:
     return with_fingers(c, plus(np.s_[held(c), -2:], -0.0025)(c.columns.joint_position))
 
 
+def low_pass(rows: Rows) -> Rows:
+    out = rows.copy()
+    for t in range(1, len(out)):
+        out[t] = 0.8 * out[t - 1] + 0.2 * rows[t]
+    return out
+
+
+def force_late(rows: Rows) -> Rows:
+    """The torque stays where it was."""
+    return np.column_stack([late(late(rows[:, :3])), rows[:, 3:]])
+
+
+def rotation_jumps(rows: Rows) -> Rows:
+    """For a frame, by 0.35 rad about the vertical, long before anything touches the cube."""
+    out = rows.copy()
+    half = 0.175
+    x, y, z, w = rows[3, 3:]
+    s, k = math.sin(half), math.cos(half)
+    out[3, 3:] = k * x - s * y, k * y + s * x, k * z + s * w, k * w - s * z
+    return out
+
+
+def cut(kept: slice) -> Fault:
+    """Only some of the frames, as if no others had been recorded."""
+
+    def fault(c: Changed) -> Changed:
+        taken: dict[str, Any] = {}
+        for name, value in vars(c.columns).items():
+            taken[name] = {key: table[kept] for key, table in value.items()} if isinstance(value, dict) else value[kept]
+        return replace(c, columns=replace(c.columns, **taken))
+
+    return fault
+
+
 def beside_the_middle_of_the_fingers(c: Changed) -> Changed:
     rows = held(c)
     hands = matrices(c.columns.base_from_tcp[rows])  # the robot's base is the origin of the world
@@ -224,6 +258,33 @@ CASES: list[tuple[str, Fault, str]] = [
     ("wrench of the load", wrench(inverted), "wrench_bears_the_hand"),
     ("torque before force", wrench(lambda r: r[:, [3, 4, 5, 0, 1, 2]]), "wrench_bears_the_hand"),
     ("wrench along other axes", wrench(lambda r: r[:, [2, 0, 1, 5, 3, 4]]), "wrench_bears_the_hand"),
+    ("torque of the wrench zero", wrench(lambda r: r * [1, 1, 1, 0, 0, 0]), "wrench_turns_the_wrist"),
+    ("torque of the wrench inverted", wrench(lambda r: r * [1, 1, 1, -1, -1, -1]), "wrench_turns_the_wrist"),
+    ("torque of the wrench in N mm", wrench(lambda r: r * [1, 1, 1, *[1000] * 3]), "wrench_turns_the_wrist"),
+    ("wrench two frames late", wrench(lambda r: late(late(r))), "wrench_turns_the_wrist"),
+    ("wrench filtered", wrench(low_pass), "wrench_turns_the_wrist"),
+    ("force of the wrench two frames late", wrench(force_late), "wrench_lag"),
+    ("wrench not tared", wrench(plus(np.s_[:, 2], 3.0)), "wrench_bears_the_hand"),
+    ("torque of the wrench not tared", wrench(plus(np.s_[:, 4], 0.5)), "wrench_bears_the_hand"),
+    ("efforts 30 % too small", column("joint_effort", lambda r: 0.7 * r), "effort_matches_dynamics"),
+    ("efforts of light joints exchanged", column("joint_effort", lambda r: r[:, [0, 1, 2, 3, 6, 5, 4, 7, 8]]),
+     "effort_matches_dynamics"),
+    ("efforts three frames late", column("joint_effort", lambda r: late(late(late(r)))), "wrench_turns_the_wrist"),
+    ("velocities 8 % too small", column("joint_velocity", lambda r: 0.92 * r), "velocity_follows_servo"),
+    ("velocity of a joint too small", column("joint_velocity", lambda r: r * [1, 0.92, *[1] * 7]),
+     "velocity_follows_servo"),
+    ("three frames cut off at the head", cut(np.s_[3:]), "starts_at_rest"),
+    ("five frames cut off at the tail", cut(np.s_[:-5]), "ends_at_rest"),
+    ("a rotation that jumps", cube(rotation_jumps), "spins"),
+    ("a rotation that jumps while untouched", cube(rotation_jumps), "object_motion"),
+    ("a limit of the tilt that is another", condition("tilt", limit=0.2), "conditions_as_known"),
+    ("passed beyond the limit", condition("speed", value=0.2), "conditions_as_known"),
+    ("touched, and passed", condition("touched_by_robot", value=1.0), "conditions_as_known"),
+    ("no condition of the tilt", lambda c: c.with_outcome(
+        checks=tuple(check for check in c.outcome.checks if check.name != "tilt")), "conditions_as_known"),
+    ("a tilt that is not seen", condition("tilt", value=0.06), "final_state"),
+    ("a height that is not seen", condition("height_error", value=0.0035), "final_state"),
+    ("an opening that is not seen", condition("gripper_width", value=0.0735), "final_state"),
     ("a jump while untouched", cube(plus(np.s_[10:, 1], 0.02)), "object_motion"),
     ("a drift while untouched", cube(plus(np.s_[:30, 0], np.linspace(-0.15, 0, 30))), "object_motion"),
     ("a jump in the hand", cube(jump_in_the_hand), "teleports"),

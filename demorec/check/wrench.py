@@ -1,0 +1,148 @@
+"""Does the wrench at the hand's joint tell of the same load as the masses below it and the motors above it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.base import Found, Lacking, Measurement, NotMeasured, alignment_check, physics_check, worst
+from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, Dynamics
+from demorec.check.episode import CheckedEpisode
+from demorec.core.geometry import Array
+
+_LEVER = 0.2
+"""Metres at which a torque counts as much as a force."""
+_LEAST_TORQUE = 1e-4
+"""N m below which nothing is said."""
+_MOST_LAG = 3
+"""Frames up to which wrench and motors are shifted against each other."""
+
+
+class _Hand(NamedTuple):
+    """The recorded wrench and what there is to compare it with.
+
+    Attributes:
+        force, torque: (T, 3) N and N m about the hand's joint, as recorded, along the axes of the world.
+        loads_force, loads_torque: (T, 3) what the masses below need, in the same way.
+        origin: (T, 3) metres, the hand's joint.
+        rotation: (T, 3, 3) of the hand.
+        dynamics: Of the arm.
+    """
+
+    force: Array
+    torque: Array
+    loads_force: Array
+    loads_torque: Array
+    origin: Array
+    rotation: Array
+    dynamics: Dynamics
+
+
+def _mount(episode: CheckedEpisode) -> str:
+    return episode.urdf.path_to(episode.info.robot.hand_link)[-1].name
+
+
+def _hand(episode: CheckedEpisode) -> _Hand | NotMeasured | Lacking:
+    wrench, dynamics = episode.columns.sensed.get("wrench"), episode.dynamics
+    if wrench is None:
+        return Lacking(need="a wrench on the hand")
+    if isinstance(dynamics, NotMeasured):
+        return dynamics
+    pose = episode.world_from_link(episode.info.robot.hand_link)
+    rotation, origin = pose[:, :3, :3], pose[:, :3, 3]
+    loads = dynamics.below(_mount(episode))
+    return _Hand(
+        dynamics=dynamics,
+        force=np.einsum("tij,tj->ti", rotation, wrench[:, :3]),
+        torque=np.einsum("tij,tj->ti", rotation, wrench[:, 3:]),
+        loads_force=np.sum([load.force for load in loads], axis=0),
+        loads_torque=np.sum([np.cross(load.point - origin, load.force) for load in loads], axis=0),
+        origin=origin,
+        rotation=rotation,
+    )
+
+
+@physics_check(
+    measures="force and torque on the hand against the weight and motion of what it bears, median difference of it",
+)
+def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
+    """The arm holds the hand, and what it carries, with the force that their masses need: catches other units, axes,
+    gains and an offset. The difference is a median along each axis of the hand, in which what shakes the arm cancels.
+    """
+    hand = episode.shared(_hand)
+    if not isinstance(hand, _Hand):
+        return hand
+    free, c = hand.dynamics.is_judged, episode.columns
+    if episode.info.scene.hold != "friction":
+        free = free & (c.contact_force == 0)  # a constraint that holds an object is no load of the hand's joint
+    lifted = {name: free & episode.is_carried(name, LIFTED_HEIGHT) for name in c.object_poses}
+    empty = free & ~np.any([*lifted.values(), np.zeros_like(free)], axis=0)
+    found = [
+        _unborne(hand, rows, what) for what, rows in (("nothing", empty), *lifted.items()) if rows.sum() >= MIN_FRAMES
+    ]
+    return worst(*found) or NotMeasured(why=f"the hand is free and moves smoothly in fewer than {MIN_FRAMES} frames")
+
+
+def _unborne(hand: _Hand, rows: NDArray[np.bool_], what: str) -> Measurement:
+    """What force and torque differ by in some frames, in units of the weight that is borne."""
+    weight = float(np.median(np.linalg.norm(hand.loads_force[rows], axis=1)))
+    off = np.hstack([hand.force - hand.loads_force, (hand.torque - hand.loads_torque) / _LEVER])[rows]
+    along = np.einsum("tji,tkj->tki", hand.rotation[rows], off.reshape(-1, 2, 3))
+    force, torque = np.linalg.norm(np.median(along, axis=0), axis=1) / weight
+    is_force = force >= torque
+    return Measurement(
+        value=float(max(force, torque)),
+        detail=f"{'force' if is_force else 'torque'} while {what} is held, {int(rows.sum())} frames",
+    )
+
+
+@physics_check(
+    measures="torque of the last motor against that of the wrench about its axis, root mean square difference of it",
+)
+def wrench_turns_the_wrist(episode: CheckedEpisode) -> Found:
+    """The last motor of the arm gives what the wrench asks for about its axis, in every frame, contacts included:
+    catches torques of the wrench that are zero, inverted, late, filtered or in another unit, and such efforts."""
+    hand = episode.shared(_hand)
+    if not isinstance(hand, _Hand):
+        return hand
+    needed, effort = _of_joint(episode, hand, -1)
+    if len(needed) < MIN_FRAMES or max(np.abs(needed).max(), np.abs(effort).max()) < _LEAST_TORQUE:
+        return NotMeasured(why="the last motor has nothing to turn")
+    size = max(float((effort**2).mean()), _LEAST_TORQUE**2)
+    return Measurement(value=math.sqrt(float(((effort - needed) ** 2).mean()) / size), detail=f"{len(needed)} frames")
+
+
+@alignment_check(
+    measures="frames by which the wrench is off the torque of the wrist's motors",
+)
+def wrench_lag(episode: CheckedEpisode) -> Found:
+    """Wrench and efforts are of one instant: of all shifts against each other none fits the last motor but one best."""
+    hand = episode.shared(_hand)
+    if not isinstance(hand, _Hand):
+        return hand
+    if episode.info.scene.hold != "friction":
+        return NotMeasured(why="what is carried is held by a constraint")
+    if episode.num_arm < 2 or episode.num_frames < MIN_FRAMES + 2 * _MOST_LAG:
+        return NotMeasured(why="there are too few joints or frames")
+    needed, effort = _of_joint(episode, hand, -2)
+    lags = range(-_MOST_LAG, _MOST_LAG + 1)
+    core = slice(_MOST_LAG, -_MOST_LAG)
+    off = [float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags]
+    return Measurement(value=abs(lags[int(np.argmin(off))]), detail=f"{lags[int(np.argmin(off))]:+d} frames")
+
+
+def _of_joint(episode: CheckedEpisode, hand: _Hand, number: int) -> tuple[Array, Array]:
+    """(T - 4,) N m each: what a joint's motor needs to give by the wrench and the links above it, and what it gave."""
+    name = episode.info.robot.arm_joints[number]
+    joint = next(joint for joint in episode.urdf.joints if joint.name == name)
+    pose = episode.world_from_link(joint.child)
+    below = hand.dynamics.below(_mount(episode))
+    total = hand.torque + np.cross(hand.origin - pose[:, :3, 3], hand.force)
+    for load in hand.dynamics.below(name):
+        if not any(load is other for other in below):
+            total = total + np.cross(load.point - pose[:, :3, 3], load.force)
+    needed = ((pose[:, :3, :3] @ np.array(joint.axis)) * total).sum(axis=1)
+    return needed[2:-2], episode.columns.joint_effort[2:-2, episode.num_arm + number]
