@@ -75,7 +75,8 @@ def load_task(config: GenerateConfig) -> type[Task]:
     """The task that a config names.
 
     Raises:
-        ConfigError: There is none of that name, it cannot be imported, or the config asks for what it does not have.
+        ConfigError: There is none of that name, it cannot be imported, the config asks for what it does not have, or
+            the robot cannot do it.
     """
     task: type[Task] = TASKS.load(config.task, config.modules)
     if config.fixed and not task.has_fixed_layout:
@@ -83,6 +84,8 @@ def load_task(config: GenerateConfig) -> type[Task]:
     if (config.objects or config.object_split != "all") and not task.shelves:
         flag = "--objects" if config.objects else "--object-split"
         raise ConfigError(f"{flag} was given, but the task {config.task!r} has things of its own: leave it out.")
+    if why := task.refusal(load_robot(config.robot, config.modules)):
+        raise ConfigError(f"The robot {config.robot!r} cannot do the task {config.task!r}: {why}; choose another.")
     return task
 
 

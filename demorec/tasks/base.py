@@ -35,6 +35,12 @@ class Task(ABC):
     camera_presets: ClassVar[Mapping[str, CameraPreset]] = {}
     """Camera name -> preset in place of the table's, for a scene that the usual view misses."""
 
+    @classmethod
+    def refusal(cls, robot: RobotSpec) -> str:
+        """Why no arm like this one can do it, in words; "": it may."""
+        del robot
+        return ""
+
     @abstractmethod
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         """Draw a layout; no cameras. SceneError when none is found."""

@@ -73,6 +73,11 @@ class Tutorial(Task):
         ),
     }
 
+    @classmethod
+    def refusal(cls, robot: RobotSpec) -> str:
+        """Its lengths are the listing's."""
+        return "" if robot.task_scale == 1.0 else "its table and cube have fixed sizes, which a small arm cannot reach"
+
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         """Draw a layout, or give the tutorial's own."""
         angle, radius, yaw = math.pi / 2, 1.0, 0.0

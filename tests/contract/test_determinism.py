@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
 from support.sim import episode, run
+from support.tasks import PAIRS
 
 from demorec.core.plain import from_json, to_json
-from demorec.core.tables import ROBOTS, TASKS
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.variation import PRESET_NAMES
 from demorec.loop import make_world
 
-CASES = list(itertools.product(TASKS.names(), ROBOTS.names(), PRESET_NAMES))
+CASES = [(*pair, preset) for pair in PAIRS for preset in PRESET_NAMES]
 FAST = [case for case in CASES if case[0] == "pick_place" and case[2] == "full"]
 
 

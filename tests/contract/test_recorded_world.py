@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.sim import episode
+from support.tasks import PAIRS
 
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
-from demorec.core.tables import ROBOTS, TASKS
+from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Action
 from demorec.episode.scene import Body, Scene, Shape, Texture
 from demorec.loop import make_world
@@ -69,8 +70,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("robot", ROBOTS.names())
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize(("task", "robot"), PAIRS)
 def test_every_task_is_drawn_as_it_was_simulated(robot: str, task: str) -> None:
     info = episode(3, task=task, robot=robot, variation="full", cameras=("front",)).info
     with make_world(info) as world:
@@ -93,7 +93,8 @@ def test_every_link_is_where_pybullet_has_it(name: str) -> None:
         )
         robot = spec.scaled(placement.scale)
         positions = rng.uniform(-3.0, 3.0, (30, len(robot.joint_names)))
-        positions[:, -2:] = rng.uniform(0, robot.gripper.max_width / 2, (30, 2))
+        fingers = len(robot.gripper.joints)
+        positions[:, -fingers:] = rng.uniform(0, robot.gripper.max_width / 2, (30, fingers))
         scene = Scene(robot=placement, bodies=())
         other = RecordedWorld(robot, scene, joint_position=positions, object_poses={})
         with World(robot) as world:

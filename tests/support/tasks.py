@@ -6,11 +6,19 @@ from typing import Any
 
 import pytest
 
-from demorec.core.tables import TASKS
+from demorec.core.tables import ROBOTS, TASKS
 
 QUICK_TASKS = ("pick_from_clutter", "tutorial")
 """Many bodies, an own script. Most other tests take one cube (`pick_place`); `tests/contract/test_tasks.py` runs every
 task always."""
+
+PAIRS = [
+    (task, robot)
+    for task in TASKS.names()
+    for robot in ROBOTS.names()
+    if not TASKS.load(task).refusal(ROBOTS.load(robot))
+]
+"""Every task with every robot that does it."""
 
 
 def tasks_with_slow_ones() -> list[Any]:
