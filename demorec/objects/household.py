@@ -90,7 +90,7 @@ def _pear(rng: Rng) -> SolidMesh:
 
 def _lemon(rng: Rng) -> SolidMesh:
     radius, length = rng.uniform(0.018, 0.024), rng.uniform(0.05, 0.065)
-    steps = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0)
+    steps = (0.0, 0.1, 0.2, 0.33, 0.67, 0.8, 0.9, 1.0)
     path = [(length * (step - 0.5), 0.0, 0.0) for step in steps]
     return rod(path, [radius * max(0.2, math.sin(math.pi * step)) ** 0.7 for step in steps], (0.0, 0.0, 1.0))
 

@@ -41,7 +41,7 @@ class PickAnything(TableTask):
         5 degrees, at rest, not touched; everything else within 2 cm of where it was; the gripper open.
     """
 
-    summary = "a named thing out of one to six, of 530 shapes, onto a mark or into a tray"
+    summary = "the named thing out of one to six, to a mark or into a tray"
     shelves = ("household", "blocks")
     wordings = (
         "pick up the {thing} and put it {place}",

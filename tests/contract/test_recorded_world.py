@@ -13,8 +13,10 @@ from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
 from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Action
+from demorec.episode.mesh import encode_mesh
 from demorec.episode.scene import Body, Scene, Shape, Texture
 from demorec.loop import make_world
+from demorec.objects.solids import lathe
 from demorec.render.recorded import RecordedWorld
 from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
@@ -54,6 +56,7 @@ SHAPES = {
     "cylinder": Shape(kind="cylinder", size=(0.1, 0.3)),
     "capsule": Shape(kind="capsule", size=(0.1, 0.3)),
     "mesh": Shape(kind="mesh", size=(0.1, 0.1, 0.1), file="duck.obj", scale=0.07, origin=(0.1, 0.7, 0.2), y_up=True),
+    "held": Shape(kind="mesh", size=(0.1, 0.1, 0.1), mesh=encode_mesh(lathe([(0.02, 0.0), (0.03, 0.05)])), scale=0.8),
 } | {
     file: Shape(kind="urdf", size=(0.1, 0.1, 0.1), file=file, scale=0.9)
     for file in (
