@@ -30,9 +30,11 @@ class Source:
     Attributes:
         root, info: Its folder and what info.json says.
         dataset: It, opened.
+        scores: episode_index -> score, where somebody asked for it.
     """
 
     def __init__(self, root: Path) -> None:
+        self.scores: Mapping[int, float] = {}
         self.root = root
         self.dataset = LeRobotDataset(root)
         self.info: DatasetInfo = self.dataset.info
@@ -97,6 +99,8 @@ class Source:
         for place, row, facts in zip(self.dataset.places, found, self.facts, strict=True):
             known = {**beside.get(place.episode_index, {}), **facts}
             row |= {name: value for name, value in known.items() if name not in row}
+            if place.episode_index in self.scores:
+                row.setdefault("score", self.scores[place.episode_index])
         return found
 
 
