@@ -69,7 +69,7 @@ class Dataset:
       demorec dataset reorder cups --by num_frames --out sorted
       demorec dataset diff cups sorted
       demorec dataset score cups --out scores.json
-      demorec dataset select cups --where 'score > 0.8' --scores scores.json --out good
+      demorec dataset select cups --where 'score > 0.8' --out good
     """
 
     command: Annotated[Positional[str], arg(metavar="COMMAND")]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -20,8 +22,8 @@ _ROWS_EACH = 3
 _RIDGE, _PREDICTED, _LEAST_ERROR = 0.3, 0.75, 0.25
 """Of the model of words: its damping, the share of the episodes with and without a word that it must tell right, and
 its error at least."""
-_FEWEST_WORDS = 5
-"""Episodes that have a word, and that lack it, for it to be learned."""
+_FEWEST_WORDS, _MOST_WORDS = 5, 60
+"""Episodes that have a word, and that lack it, for it to be learned; and how many words are, the most frequent ones."""
 
 
 def groups(tasks: Sequence[str]) -> list[list[int]]:
@@ -53,8 +55,9 @@ def left_out_residuals(inputs: Array, outputs: Array) -> Array:
     """
     gram = inputs.T @ inputs
     gram += _DAMPING * np.trace(gram) / len(gram) * np.eye(len(gram))
-    hat = inputs @ np.linalg.solve(gram, inputs.T)
-    return np.asarray((outputs - hat @ outputs) / (1 - np.minimum(np.diag(hat), 0.9))[:, None])
+    influence = np.linalg.solve(gram, inputs.T)
+    leverage = np.einsum("np,pn->n", inputs, influence)
+    return np.asarray((outputs - inputs @ (influence @ outputs)) / (1 - np.minimum(leverage, 0.9))[:, None])
 
 
 def course_residuals(ends: Array, courses: Array) -> Array:
@@ -101,15 +104,27 @@ def nearest_distance(points: Array, neighbours: int = 5) -> Array:
 
 
 def words_of(tasks: Sequence[str]) -> Iterator[tuple[str, Flags]]:
-    """(word, (N,) which instructions have it) of those that some have and some have not; "red, cube" for words that go
-    together."""
-    sets = [set(re.findall(r"\w+", task.lower())) for task in tasks]
-    together: dict[tuple[bool, ...], list[str]] = {}
-    for word in sorted({word for words in sets for word in words}):
-        together.setdefault(tuple(word in words for words in sets), []).append(word)
-    for has, words in together.items():
-        if _FEWEST_WORDS <= sum(has) <= len(tasks) - _FEWEST_WORDS:
-            yield ", ".join(words), np.array(has)
+    """(words, (N,) which instructions have them) of those that some have and some have not.
+
+    Single words, and two words in an order that is the other one elsewhere: "red ... blue". Of those that the same
+    instructions have the first ones stand for all.
+    """
+    texts = list(dict.fromkeys(tasks))
+    lists = [list(dict.fromkeys(re.findall(r"\w+", text.lower()))) for text in texts]
+    counts = Counter(word for words in lists for word in words)
+    common = {word for word, _ in counts.most_common(_MOST_WORDS)}
+    kept = [[word for word in words if word in common] for words in lists]
+    single = [set(words) for words in kept]
+    orders = {pair for words in kept for pair in combinations(words, 2)}
+    pairs = [{f"{a} ... {b}" for a, b in combinations(words, 2) if (b, a) in orders} for words in kept]
+    places = np.array([texts.index(task) for task in tasks])
+    seen: set[bytes] = set()
+    for terms in (single, pairs):
+        for term in sorted(set().union(*terms)):
+            has = np.array([term in of_text for of_text in terms])[places]
+            if _FEWEST_WORDS <= has.sum() <= len(tasks) - _FEWEST_WORDS and has.tobytes() not in seen:
+                seen |= {has.tobytes(), (~has).tobytes()}
+                yield term, has
 
 
 def told_otherwise(tasks: Sequence[str], looks: Array) -> tuple[Array, list[str]]:
@@ -127,14 +142,14 @@ def told_otherwise(tasks: Sequence[str], looks: Array) -> tuple[Array, list[str]
     """
     worst, which = np.zeros(len(tasks)), [""] * len(tasks)
     centred = np.sqrt(looks) - np.sqrt(looks).mean(axis=0)
-    alike = centred @ centred.T
-    alike *= len(tasks) / max(float(np.trace(alike)), 1e-12)
-    hat = alike @ np.linalg.inv(alike + _RIDGE * np.eye(len(tasks)))
-    leverage = np.minimum(np.diag(hat) + 1 / len(tasks), 0.95)
+    gram = centred.T @ centred
+    gram += (_RIDGE * np.trace(gram) / len(tasks) + 1e-12) * np.eye(len(gram))
+    influence = np.linalg.solve(gram, centred.T)
+    leverage = np.minimum(np.einsum("np,pn->n", centred, influence) + 1 / len(tasks), 0.95)
     for word, has in words_of(tasks):
         told = np.where(has, 1.0, -1.0)
         mean = told.mean()
-        seen = told - (told - mean - hat @ (told - mean)) / (1 - leverage)
+        seen = told - (told - mean - centred @ (influence @ (told - mean))) / (1 - leverage)
         agrees = told * seen
         if min((agrees[has] > 0).mean(), (agrees[~has] > 0).mean()) < _PREDICTED:
             continue
