@@ -501,11 +501,11 @@ def test_scores_replace_scores_only(place: Path, capsys: pytest.CaptureFixture[s
     before = files_of(place)
     (place / "other.json").write_text('{"episodes": []}')
     score = ("dataset", "score", place / "dataset", "--no-images", "--workers", "1", "--out")
-    for target in ("other.json", "thesis.tex", "thesis", "dataset/meta/info.json", "dataset/scores.json"):
-        assert exit_code(*score, place / target, "--overwrite") == 2, target
+    for name in ("other.json", "thesis.tex", "thesis", "dataset/meta/info.json", "dataset/scores.json"):
+        assert exit_code(*score, place / name, "--overwrite") == 2, name
         assert len(capsys.readouterr().err.splitlines()) == 1
     target = place / "scores.json"
-    for flags, code in ((), 0), ((), 2), (("--overwrite",), 0):
+    for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
         assert exit_code(*score, target, *flags) == code
     target.unlink()
     (place / "other.json").unlink()
