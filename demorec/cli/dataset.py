@@ -12,14 +12,16 @@ from tyro.conf import Positional, arg
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.core.errors import ConfigError, ExportError
+from demorec.core.errors import ConfigError, ExportError, check_option
 from demorec.core.registry import check_choice
 
 if TYPE_CHECKING:
+    from demorec.check.scoring.score import EpisodeScore
     from demorec.datasets.editing.plan import Plan, Source
 
 _COMMANDS = (
-    "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle", "diff",
+    "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle",
+    "diff", "score",
 )  # fmt: skip
 _FLAGS = {
     "where": ("select", "drop", "set-task"),
@@ -32,8 +34,12 @@ _FLAGS = {
     "seed": ("split", "shuffle"),
     "task": ("set-task",),
     "mapping": ("merge",),
-    "json": ("diff",),
-    **dict.fromkeys(("out", "decode", "overwrite", "dry_run"), _COMMANDS[:-1]),
+    "json": ("diff", "score"),
+    "images": ("score",),
+    "workers": ("score",),
+    "scores": ("select", "drop", "set-task", "split", "reorder"),
+    **dict.fromkeys(("out", "overwrite"), tuple(name for name in _COMMANDS if name != "diff")),
+    **dict.fromkeys(("decode", "dry_run"), _COMMANDS[:-2]),
 }
 """The commands that each flag is for."""
 _SHOWN = 20
@@ -47,9 +53,10 @@ class Dataset:
     Commands: select and drop episodes (--where, --episodes); trim them (--head, --tail, --idle); split (--shares);
     merge datasets (--mapping); rename OLD=NEW...; drop-features NAME...; set-task; reorder (--by, --order); shuffle.
     diff A B says in what two datasets differ, wherever their episodes lie (exit code 0: nothing, 1: something).
+    score gives every episode a number from 0 to 1 by what most of its task do, with reasons (--json, --out FILE).
 
     A condition compares columns of the table of episodes or of demorec's sidecar, and episode_index, num_frames,
-    duration_s, task: success and num_frames < 300; "cube" in task.
+    duration_s, task, score: success and num_frames < 300; "cube" in task; score > 0.8.
 
     Examples:
       demorec dataset select cups --where 'success and num_frames < 300' --out good
@@ -61,6 +68,8 @@ class Dataset:
       demorec dataset set-task cups --task 'pick up the cup' --out told
       demorec dataset reorder cups --by num_frames --out sorted
       demorec dataset diff cups sorted
+      demorec dataset score cups --out scores.json
+      demorec dataset select cups --where 'score > 0.8' --out good
     """
 
     command: Annotated[Positional[str], arg(metavar="COMMAND")]
@@ -68,7 +77,7 @@ class Dataset:
     words: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET")]
     """The dataset, of merge two or more, of diff two; behind it the features of rename (OLD=NEW) and drop-features."""
     out: Path | None = None
-    """Folder of the new dataset; of split the folder in which each part gets one. Of all but diff."""
+    """Folder of the new dataset; of split the folder in which each part gets one; of score a JSON file."""
     where: str = ""
     """Episodes for which this holds (select, drop, set-task)."""
     episodes: str = ""
@@ -101,12 +110,18 @@ class Dataset:
     """What becomes what where datasets differ (merge)."""
     decode: bool = False
     """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""
+    scores: Path | None = None
+    """What score --out kept, for conditions and orders by score; else the dataset is scored."""
+    images: bool = True
+    """Look at some images of each episode (score)."""
+    workers: int | None = None
+    """Processes (score; auto: one for each core)."""
     overwrite: bool = False
-    """Replace a dataset that is there."""
+    """Replace a dataset, or a file of scores, that is there."""
     dry_run: bool = False
     """Say what would come out, and write nothing."""
     json: bool = False
-    """Print JSON (diff)."""
+    """Print JSON (diff, score)."""
 
     def run(self) -> int:
         """Plan, write, and say what came out."""
@@ -117,6 +132,8 @@ class Dataset:
                 raise ConfigError(f"--{name} means nothing to {self.command}: it is for {', '.join(commands)}.")
         if self.command == "diff":
             return self._diff()
+        if self.command == "score":
+            return self._score()
         if not self.words or self.out is None:
             raise ConfigError(
                 f"Give a dataset and where the new one goes: demorec dataset {self.command} DATASET --out NEW."
@@ -131,6 +148,7 @@ class Dataset:
         if len(self.words) > num_sources and not takes_words:
             raise ConfigError(f"demorec dataset {self.command} takes one dataset; demorec dataset merge joins several.")
         sources = [Source(Path(word)) for word in self.words[:num_sources]]
+        self._add_scores(sources[0])
         plans = self._split(sources[0]) if self.command == "split" else {"": self._plan(sources)}
         for name, plan in plans.items():
             out = self.out / name
@@ -175,6 +193,42 @@ class Dataset:
         episodes = f"{found.num_same} of {found.num_episodes[0]} and {found.num_episodes[1]} episodes are the same"
         say(f"{'No difference' if found.is_same else counted(len(found.differences), 'difference')}: {episodes}.")
         return 0 if found.is_same else 1
+
+    def _score(self) -> int:
+        from demorec.check.scoring.file import check_target, to_json, write_scores
+
+        if len(self.words) != 1:
+            raise ConfigError(f"One dataset is scored, given are {len(self.words)}: demorec dataset score DATASET.")
+        root = Path(self.words[0])
+        if self.out is not None:
+            refuse_inside([self.out])
+            check_target(self.out, source=root, overwrite=self.overwrite)
+        found = scored(root, images=self.images, workers=self.workers)
+        if self.out is not None:
+            write_scores(self.out, found)
+        if self.json:
+            say_json(to_json(found))
+            return 0
+        for episode in sorted(found, key=lambda episode: episode.score):
+            reasons = [f"{reason.text} (frames {reason.first} to {reason.last})" for reason in episode.reasons]
+            say(
+                f"{episode.score:.2f}  episode {episode.episode_index}" + (f": {'; '.join(reasons)}" if reasons else "")
+            )
+        return 0
+
+    def _add_scores(self, source: Source) -> None:
+        """Where a condition or an order is by score, and the dataset has no column of that name."""
+        from demorec.datasets.editing.where import names_in
+
+        if "score" not in names_in(self.where) | {self.by} or "score" in source.columns()[0]:
+            return
+        if self.scores is not None:
+            from demorec.check.scoring.file import read_scores
+
+            lengths = {place.episode_index: place.length for place in source.places}
+            source.scores = read_scores(self.scores, lengths)
+        else:
+            source.scores = {episode.episode_index: episode.score for episode in scored(source.root)}
 
     def _plan(self, sources: Sequence[Source]) -> Plan:
         from demorec.datasets.editing import operations
@@ -227,6 +281,16 @@ class Dataset:
             length = plan.sources[cut.source].places[cut.episode].length
             if (cut.first, cut.last) != (0, length):
                 say(f"episode {cut.episode}: {cut.first} frames cut at the beginning, {length - cut.last} at the end")
+
+
+def scored(root: Path, *, images: bool = True, workers: int | None = None) -> list[EpisodeScore]:
+    """The scores of a dataset, with a bar; a few episodes are measured by this process alone."""
+    from demorec.check.scoring.score import score_dataset
+    from demorec.core.processes import available_cores
+
+    check_option("workers", workers, 1, 1024)
+    with ProgressBar("scoring") as bar:
+        return score_dataset(root, images=images, workers=workers or available_cores(), progress=bar.set)
 
 
 def _numbers(text: str) -> list[int]:

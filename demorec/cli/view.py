@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
@@ -21,8 +21,8 @@ from demorec.runs.find import expect
 if TYPE_CHECKING:
     from demorec.view.sources import PlaybackSource
 
-_MOST = 50
-"""How many episodes are shown unless --episodes asks for more."""
+_MOST, _TOLD = 50, 10
+"""How many episodes are shown unless --episodes asks for more, and of how many of --rank the reasons are told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +36,7 @@ class View:
       demorec view recordings/cubes
       demorec view episode_000003.mcap --screenshot cube.png --at 2.5
       demorec view datasets/cubes --episodes 0:10 --web
+      demorec view datasets/cubes --rank score
       demorec view recordings/cubes --save cubes.rrd
       demorec view cubes-0000.rrd
       demorec view original.mcap replayed.mcap --compare
@@ -50,6 +51,8 @@ class View:
     """Overlay two episodes: the same streams in the same views, and the distance between them."""
     episodes: str = ""
     """Which episodes, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
+    rank: Literal["score"] | None = None
+    """Show the episodes of LeRobot datasets in this order, by demorec dataset score, the worst first."""
     include_failures: bool = False
     """Also show the failed attempts of a run."""
     save: Path | None = None
@@ -86,6 +89,8 @@ class View:
 
         sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
         tell_unfinished(self.paths)
+        if self.rank is not None:
+            sources = self._ranked(sources)
         if self.save is None and self.screenshot is None and not self.web:
             need_screen()  # before minutes of converting
         if self.compare:
@@ -123,6 +128,20 @@ class View:
                 f"font ({''.join(sorted(missing)[:20])}); the window, --web and --save keep them."
             )
         return code
+
+    def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
+        """The worst first; what is wrong with them is told."""
+        from demorec.cli.dataset import scored
+        from demorec.runs.find import find
+
+        if others := [path for path in self.paths if find(path).kind != "dataset"]:
+            raise ConfigError(f"--rank score is for LeRobot datasets, which this is not: {others[0]}")
+        found = {f"{path}: episode {episode.episode_index}": episode for path in self.paths for episode in scored(path)}
+        ranked = sorted(sources, key=lambda source: found[source.name].score)
+        for episode in [found[source.name] for source in ranked[:_TOLD]]:
+            reasons = "; ".join(reason.text for reason in episode.reasons)
+            tell(f"{episode.score:.2f}  episode {episode.episode_index}{': ' * bool(reasons)}{reasons}")
+        return ranked
 
     def _validate(self) -> None:
         if self.web and (self.save is not None or self.screenshot is not None):

@@ -11,7 +11,7 @@ from support.commands import exit_code
     [
         (("select", "a", "--head", "3", "--out", "b"), "--head means nothing to select: it is for trim."),
         (("diff", "a", "b", "--out", "c"), "--out means nothing to diff"),
-        (("merge", "a", "b", "--json", "--out", "c"), "--json means nothing to merge: it is for diff."),
+        (("merge", "a", "b", "--json", "--out", "c"), "--json means nothing to merge: it is for diff, score."),
         (("trim", "a", "--idle", "--where", "success", "--out", "b"), "--where means nothing to trim"),
     ],
 )

@@ -497,6 +497,21 @@ def test_an_empty_file_is_not_replaced(place: Path, capsys: pytest.CaptureFixtur
         assert files_of(place) == before
 
 
+def test_scores_replace_scores_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files_of(place)
+    (place / "other.json").write_text('{"episodes": []}')
+    score = ("dataset", "score", place / "dataset", "--no-images", "--workers", "1", "--out")
+    for name in ("other.json", "thesis.tex", "thesis", "dataset/meta/info.json", "dataset/scores.json"):
+        assert exit_code(*score, place / name, "--overwrite") == 2, name
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    target = place / "scores.json"
+    for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
+        assert exit_code(*score, target, *flags) == code
+    target.unlink()
+    (place / "other.json").unlink()
+    assert files_of(place) == before
+
+
 def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "thesis.html").write_text("<!doctype html>\n<p>years of work")
     (place / "link.html").symlink_to(place / "alone.mcap")

@@ -32,12 +32,14 @@ class Source:
     Attributes:
         root, info: Its folder and what info.json says.
         places: Where its episodes lie, in order.
+        scores: episode_index -> score, where somebody asked for it.
 
     Raises:
         ExportError: There is none, or it is damaged.
     """
 
     def __init__(self, root: Path) -> None:
+        self.scores: Mapping[int, float] = {}
         self.root = root
         self.info = DatasetInfo.load(root)
         self.places = tuple(episode_places(root, self.info))
@@ -114,6 +116,8 @@ class Source:
         for place, row, facts in zip(self.places, found, self.facts(), strict=True):
             known = {**beside.get(place.episode_index, {}), **facts}
             row |= {name: value for name, value in known.items() if name not in row}
+            if place.episode_index in self.scores:
+                row.setdefault("score", self.scores[place.episode_index])
         return found
 
 

@@ -97,6 +97,14 @@ class Condition:
         raise ConfigError(f"There is no column {name!r}.{nearest_match(name, self._columns)} Condition: {self._text}")
 
 
+def names_in(text: str) -> set[str]:
+    """Words of a condition that may be columns; none of what is no condition."""
+    try:
+        return {node.id for node in ast.walk(ast.parse(text.strip(), mode="eval")) if isinstance(node, ast.Name)}
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return set()
+
+
 def _name(node: ast.expr) -> str | None:
     """A column's name, which may have slashes and dots in it."""
     match node:

@@ -1,0 +1,140 @@
+"""Episodes of a LeRobot dataset, measured one by one: what their comparison needs, a few kB each."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.evidence import Motion, motions_of_dataset
+from demorec.check.scoring.movement import Movement, Scale, movement
+from demorec.check.scoring.sight import Sight, sight
+from demorec.core.errors import ExportError, without_path
+from demorec.datasets.editing.content import row_hashes
+from demorec.datasets.lerobot.episodes import LeRobotDataset
+from demorec.episode.features import ACTION, STATE
+
+_FEWEST_FRAMES = 8
+_GAP = 1.5
+"""Times the usual step from one frame to the next: more is a gap."""
+_SKETCH = 64
+"""Rows whose hashes stand for an episode: those of the smallest hashes, the same ones wherever these rows are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flaw:
+    """What is wrong whatever others do: what, in words, and its first and last frame."""
+
+    kind: str
+    text: str
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measured:
+    """One episode.
+
+    Attributes:
+        number: Its place in the dataset.
+        episode_index, length, task: As the dataset has them.
+        flaws: What is wrong in itself.
+        movement: None without a state, and where numbers are missing.
+        sights: Camera -> what is seen.
+        sketch: (N,) hashes of some rows of state and action.
+    """
+
+    number: int
+    episode_index: int
+    length: int
+    task: str
+    flaws: tuple[Flaw, ...]
+    movement: Movement | None
+    sights: Mapping[str, Sight]
+    sketch: NDArray[np.uint64]
+
+
+def scale_of(root: Path) -> Scale | None:
+    """What the elements range over in a dataset; None where no episode has a usable state."""
+    dataset = _opened(root)
+    motions = [motion for number in range(len(dataset)) if (motion := _motion(dataset, _rows(dataset, number)))]
+    return Scale.of(iter(motions)) if motions else None
+
+
+def measure(root: Path, scale: Scale | None, images: bool, numbers: Sequence[int]) -> list[Measured]:
+    """Some episodes of a dataset, in order; ExportError when its tables cannot be read."""
+    dataset = _opened(root)
+    return [_measured(dataset, scale, number, images=images) for number in numbers]
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(root: Path) -> LeRobotDataset:
+    return LeRobotDataset(root)
+
+
+def _rows(dataset: LeRobotDataset, number: int) -> dict[str, NDArray[Any]]:
+    return dataset.rows.read(dataset.places[number])
+
+
+def _motion(dataset: LeRobotDataset, rows: Mapping[str, NDArray[Any]]) -> Motion | None:
+    """None where there is no state, a number of it is missing, or the episode is very short."""
+    numbers = [rows[name] for name in (STATE, ACTION) if name in rows]
+    if STATE not in rows or len(rows[STATE]) < _FEWEST_FRAMES or not all(np.isfinite(part).all() for part in numbers):
+        return None
+    return next(motions_of_dataset(dataset.info, [rows], {}, ""), None)
+
+
+def _measured(dataset: LeRobotDataset, scale: Scale | None, number: int, *, images: bool) -> Measured:
+    place, rows = dataset.places[number], _rows(dataset, number)
+    motion = None if scale is None else _motion(dataset, rows)
+    moved = None if motion is None or scale is None else movement(motion, scale)
+    flaws = list(_flaws(rows, place.length, float(dataset.info.fps)))
+    sights: dict[str, Sight] = {}
+    recording = dataset.recording(number)
+    grips = moved.grips if moved is not None else ()
+    first, last = grips[0] if grips else (place.length // 2, place.length // 2)
+    for camera in recording.cameras if images and place.length else ():
+        try:
+            images_at = partial(recording.images_at, camera)
+            sights[camera] = sight(images_at, place.length, float(dataset.info.fps), (first + last) // 2)
+        except ExportError as error:
+            flaws.append(Flaw(kind="images", text=without_path(error, dataset.root), first=0, last=place.length - 1))
+    return Measured(
+        number=number,
+        episode_index=place.episode_index,
+        length=place.length,
+        task="; ".join(place.tasks),
+        flaws=tuple(flaws),
+        movement=moved,
+        sights=sights,
+        sketch=_sketch(rows),
+    )
+
+
+def _flaws(rows: Mapping[str, NDArray[Any]], length: int, fps: float) -> Iterator[Flaw]:
+    if length < _FEWEST_FRAMES:
+        yield Flaw(kind="length", text=f"has {length} frames", first=0, last=max(length - 1, 0))
+    for name in (STATE, ACTION):
+        if name in rows and rows[name].dtype.kind == "f" and not (finite := np.isfinite(rows[name]).all(axis=1)).all():
+            frames = np.flatnonzero(~finite)
+            text = f"lacks numbers of {name} in {len(frames)} frames"
+            yield Flaw(kind="missing", text=text, first=int(frames[0]), last=int(frames[-1]))
+    steps = np.diff(rows["timestamp"][:, 0].astype(np.float64)) * fps
+    odd = np.flatnonzero(~((steps > 2 - _GAP) & (steps < _GAP)))
+    if len(odd):
+        frame = int(odd[0])
+        text = f"has {len(odd)} odd steps of time, of {steps[frame] / fps:.3f} s where {1 / fps:.3f} s are usual"
+        yield Flaw(kind="timing", text=text, first=frame, last=int(odd[-1]) + 1)
+
+
+def _sketch(rows: Mapping[str, NDArray[Any]]) -> NDArray[np.uint64]:
+    numbers = [rows[name] for name in (STATE, ACTION) if name in rows and rows[name].dtype.kind in "fiub"]
+    if not numbers:
+        return np.zeros(0, np.uint64)
+    return np.unique(row_hashes(np.concatenate(numbers, axis=1)))[:_SKETCH]

@@ -1,0 +1,160 @@
+"""How far an episode is from others of its task: what most of them do is taken as sound."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from demorec.check.evidence import Flags
+from demorec.core.geometry import Array
+
+FEWEST = 12
+"""Episodes of one instruction that are compared among themselves; fewer ones are compared with all of the dataset."""
+_NORMAL = 1.4826
+"""Standard deviation of a normal distribution in units of its median absolute deviation."""
+_DAMPING = 1e-2
+_ROWS_EACH = 3
+"""Episodes for each number of a model of them, at least."""
+_RIDGE, _PREDICTED, _LEAST_ERROR = 0.3, 0.75, 0.25
+"""Of the model of words: its damping, the share of the episodes with and without a word that it must tell right, and
+its error at least."""
+_FEWEST_WORDS, _MOST_WORDS = 5, 60
+"""Episodes that have a word, and that lack it, for it to be learned; and how many words are, the most frequent ones."""
+
+
+def groups(tasks: Sequence[str]) -> list[list[int]]:
+    """Numbers of the episodes that are compared with each other."""
+    found: dict[str, list[int]] = {}
+    for number, task in enumerate(tasks):
+        found.setdefault(task, []).append(number)
+    large = [numbers for numbers in found.values() if len(numbers) >= FEWEST]
+    small = [number for numbers in found.values() if len(numbers) < FEWEST for number in numbers]
+    return [*large, small] if small else large
+
+
+def deviation(values: Array, floor: float) -> Array:
+    """(N,) how far each is above the middle one, in units of the usual spread, of which `floor` is the least."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return np.zeros(len(values))
+    middle = np.median(known)
+    spread = max(_NORMAL * float(np.median(np.abs(known - middle))), floor)
+    return np.asarray(np.nan_to_num((values - middle) / spread))
+
+
+def left_out_residuals(inputs: Array, outputs: Array) -> Array:
+    """(N, Q) what a linear model of all other rows gets wrong of each row (ridge regression, leave-one-out).
+
+    Args:
+        inputs: (N, P).
+        outputs: (N, Q).
+    """
+    gram = inputs.T @ inputs
+    gram += _DAMPING * np.trace(gram) / len(gram) * np.eye(len(gram))
+    influence = np.linalg.solve(gram, inputs.T)
+    leverage = np.einsum("np,pn->n", inputs, influence)
+    return np.asarray((outputs - inputs @ (influence @ outputs)) / (1 - np.minimum(leverage, 0.9))[:, None])
+
+
+def course_residuals(ends: Array, courses: Array) -> Array:
+    """(N, S) how far each stretch of a course is from what others with such ends do, at its worst point.
+
+    Args:
+        ends: (N, S + 1, K) of the stretches.
+        courses: (N, S, 12, K) of them.
+    """
+    count, stretches, points, width = courses.shape
+    found = np.empty((count, stretches))
+    for stretch in range(stretches):
+        inputs = ends[:, stretch : stretch + 2].reshape(count, -1)
+        inputs = np.concatenate([np.ones((count, 1)), inputs - inputs.mean(axis=0)], axis=1)
+        residuals = left_out_residuals(inputs, courses[:, stretch].reshape(count, -1))
+        found[:, stretch] = np.linalg.norm(residuals.reshape(count, points, width), axis=2).max(axis=1)
+    return found
+
+
+def cost_residuals(ends: Array, costs: Array) -> Array:
+    """(N, S, 2) by how much each stretch takes longer, in seconds and in length, than those of others as far.
+
+    Args:
+        ends: (N, S + 1, K) of the stretches.
+        costs: (N, S, 2) seconds and length.
+    """
+    found = np.empty_like(costs)
+    for stretch in range(costs.shape[1]):
+        way = np.abs(ends[:, stretch + 1] - ends[:, stretch])
+        inputs = np.column_stack([np.ones(len(way)), np.linalg.norm(way, axis=1), way.max(axis=1)])
+        if len(way) >= _ROWS_EACH * (inputs.shape[1] + way.shape[1]):
+            inputs = np.concatenate([inputs, way - way.mean(axis=0)], axis=1)
+        found[:, stretch] = left_out_residuals(inputs, costs[:, stretch])
+    return found
+
+
+def nearest_distance(points: Array, neighbours: int = 5) -> Array:
+    """(N,) distance of each of (N, K) points to its nearest others, the middle one of five."""
+    found = np.empty(len(points))
+    for number, point in enumerate(points):
+        away = np.sort(np.linalg.norm(points - point, axis=1))[1 : neighbours + 1]
+        found[number] = np.median(away) if len(away) else 0.0
+    return found
+
+
+def words_of(tasks: Sequence[str]) -> Iterator[tuple[str, Flags]]:
+    """(words, (N,) which instructions have them) of those that some have and some have not.
+
+    Single words, and two words in an order that is the other one elsewhere: "red ... blue". Of those that the same
+    instructions have the first ones stand for all.
+    """
+    texts = list(dict.fromkeys(tasks))
+    lists = [list(dict.fromkeys(re.findall(r"\w+", text.lower()))) for text in texts]
+    counts = Counter(word for words in lists for word in words)
+    common = {word for word, _ in counts.most_common(_MOST_WORDS)}
+    kept = [[word for word in words if word in common] for words in lists]
+    single = [set(words) for words in kept]
+    orders = {pair for words in kept for pair in combinations(words, 2)}
+    pairs = [{f"{a} ... {b}" for a, b in combinations(words, 2) if (b, a) in orders} for words in kept]
+    places = np.array([texts.index(task) for task in tasks])
+    seen: set[bytes] = set()
+    for terms in (single, pairs):
+        for term in sorted(set().union(*terms)):
+            has = np.array([term in of_text for of_text in terms])[places]
+            if _FEWEST_WORDS <= has.sum() <= len(tasks) - _FEWEST_WORDS and has.tobytes() not in seen:
+                seen |= {has.tobytes(), (~has).tobytes()}
+                yield term, has
+
+
+def told_otherwise(tasks: Sequence[str], looks: Array) -> tuple[Array, list[str]]:
+    """How surely what is seen contradicts a word of the instruction, or the lack of it, and which word.
+
+    For each word a linear model of all other episodes predicts from the colours whether the instruction has it. Words
+    that it cannot predict (the verb, say) say nothing.
+
+    Args:
+        tasks: Instruction of each of N episodes.
+        looks: (N, Q) shares of colours.
+
+    Returns:
+        (N,) how far off the worst word is, in units of the usual error, 0 where none is contradicted; (N,) the word.
+    """
+    worst, which = np.zeros(len(tasks)), [""] * len(tasks)
+    centred = np.sqrt(looks) - np.sqrt(looks).mean(axis=0)
+    gram = centred.T @ centred
+    gram += (_RIDGE * np.trace(gram) / len(tasks) + 1e-12) * np.eye(len(gram))
+    influence = np.linalg.solve(gram, centred.T)
+    leverage = np.minimum(np.einsum("np,pn->n", centred, influence) + 1 / len(tasks), 0.95)
+    for word, has in words_of(tasks):
+        told = np.where(has, 1.0, -1.0)
+        mean = told.mean()
+        seen = told - (told - mean - centred @ (influence @ (told - mean))) / (1 - leverage)
+        agrees = told * seen
+        if min((agrees[has] > 0).mean(), (agrees[~has] > 0).mean()) < _PREDICTED:
+            continue
+        error = max(float(np.sqrt(((1 - agrees[agrees > 0]) ** 2).mean())), _LEAST_ERROR)
+        off = np.where(agrees < 0, 1 - agrees, 0.0) / error
+        for number in np.flatnonzero(off > worst):
+            worst[number], which[number] = off[number], word
+    return worst, which

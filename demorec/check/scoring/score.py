@@ -1,0 +1,302 @@
+"""A number from 0 to 1 for each episode of a dataset, with its reasons.
+
+Each quantity of an episode is compared with those of the others of its task; how far it is off, in units of the usual
+spread, takes its part off the score. Nothing is taken off for what most do. The spread counts as at least the one of
+`_LAWS`, below which differences do not matter; see docs/datasets.md for where these numbers come from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.rows import longest_run
+from demorec.check.scoring import neighbours
+from demorec.check.scoring.measured import Measured, measure, scale_of
+from demorec.check.scoring.movement import Reading
+from demorec.check.scoring.sight import Sight
+from demorec.core.geometry import Array
+from demorec.core.processes import in_turn
+
+_HALF, _STEEPNESS = 7.0, 4
+"""Usual spreads at which about two thirds are taken off, and how sudden that is."""
+_SHOWN = 0.05
+"""What is taken off at least for a reason to be given."""
+_CHUNK = 8
+"""Episodes that a process measures at once."""
+_TWIN = 0.9
+"""Share of the rows that two episodes have in common, so that one is a copy of the other."""
+_FROZEN, _FROZEN_LEVELS = 0.1, 0.5
+"""Share of the usual change of the image, and levels, below which it stands still while the arm moves."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """What of a quantity is bad.
+
+    Attributes:
+        side: What is odd: more than usual, less, or both.
+        spread: Least unit in which that is measured.
+        text: The reason, with {value}, {usual} and, of logarithms, their {ratio}.
+    """
+
+    side: Literal["more", "less", "both"]
+    spread: float
+    text: str
+
+
+_LAWS: Mapping[str, Law] = {
+    "pause": Law("more", 0.1, "stands still for {value:.1f} s amid the motion, usual are {usual:.1f} s"),
+    "idle": Law("more", 0.2, "stands still for {value:.1f} s in all, usual are {usual:.1f} s"),
+    "duration": Law("both", 0.1, "takes {ratio:.2f} times as long as usual"),
+    "time": Law("more", 0.12, "takes {value:.1f} s longer than others between such places"),
+    "strokes": Law("more", 0.4, "moves in {value:.0f} strokes, usual are {usual:.0f}"),
+    "path": Law("more", 0.1, "goes {value:.0%} of the range farther than others between such places"),
+    "course": Law("more", 0.08, "strays by {value:.0%} of the range from the way of others between such places"),
+    "end": Law("more", 0.03, "ends {value:.0%} of the range away from where others end, usual are {usual:.0%}"),
+    "end speed": Law("more", 0.1, "ends at {value:.0%} of its fast speed, usual are {usual:.0%}"),
+    "state noise": Law("more", 0.2, "the state shakes {ratio:.1f} times as much as usual"),
+    "jump": Law("more", 0.2, "the state jumps, {ratio:.1f} times as far as usual"),
+    "action noise": Law("more", 0.2, "the action shakes {ratio:.1f} times as much as usual"),
+    "lag": Law("both", 0.2, "the state follows the action by {value:+.1f} frames, usual are {usual:+.1f}"),
+    "limit": Law("more", 0.03, "the action is at the end of its range in {value:.0%} of the frames"),
+    "switches": Law("both", 0.12, "the gripper is switched {value:.0f} times, usual are {usual:.0f}"),
+    "slip": Law("more", 0.02, "the gripper closes by {value:.0%} of its range without being told to"),
+    "grip": Law("less", 0.05, "the gripper closes on nothing"),
+    "frozen": Law("more", 0.12, "{camera} shows the same for {value:.1f} s while the arm moves"),
+    "brightness": Law("both", 6.0, "{camera} has a brightness of {value:.0f}, usual are {usual:.0f}"),
+    "sharpness": Law("less", 0.1, "{camera} is {ratio:.2f} times as sharp as usual"),
+    "blank": Law("more", 0.01, "{camera} shows nothing in {value:.0%} of the images"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """Why something is taken off: the factor that is left, in words, the first and the last frame."""
+
+    kind: str
+    factor: float
+    text: str
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeScore:
+    """Of one episode; reasons begin with the heaviest."""
+
+    episode_index: int
+    num_frames: int
+    score: float
+    reasons: tuple[Reason, ...]
+
+
+def score_dataset(
+    root: Path,
+    *,
+    images: bool = True,
+    workers: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[EpisodeScore]:
+    """Score all episodes of a LeRobot dataset, in order.
+
+    Args:
+        root: Its folder.
+        images: Whether to look at images; a few of each episode are decoded.
+        workers: Processes.
+        progress: Called with the episodes that are measured, and all.
+
+    Raises:
+        ExportError: It cannot be read.
+    """
+    from demorec.datasets.lerobot.episodes import LeRobotDataset
+
+    count = len(LeRobotDataset(root))
+    chunks = [range(begin, min(begin + _CHUNK, count)) for begin in range(0, count, _CHUNK)]
+    found: list[Measured] = []
+    for part in in_turn(partial(measure, root, scale_of(root), images), chunks, workers, ahead=2):
+        found += part
+        progress(len(found), count)
+    return scores(found)
+
+
+def scores(episodes: Sequence[Measured]) -> list[EpisodeScore]:
+    """The scores of measured episodes."""
+    reasons: list[list[Reason]] = [
+        [Reason(kind=flaw.kind, factor=0.0, text=flaw.text, first=flaw.first, last=flaw.last) for flaw in episode.flaws]
+        for episode in episodes
+    ]
+    for numbers in neighbours.groups([episode.task for episode in episodes]):
+        group = [episodes[number] for number in numbers]
+        for name, readings, detail in (*_motions(group), *_images(group)):
+            for number, reason in _judged(name, readings, detail):
+                reasons[numbers[number]].append(reason)
+    for number, reason in (*_otherwise(episodes), *_twins(episodes)):
+        reasons[number].append(reason)
+    return [
+        EpisodeScore(
+            episode_index=episode.episode_index,
+            num_frames=episode.length,
+            score=math.prod(reason.factor for reason in own),
+            reasons=tuple(sorted((r for r in own if r.factor < 1 - _SHOWN), key=lambda reason: reason.factor)),
+        )
+        for episode, own in zip(episodes, reasons, strict=True)
+    ]
+
+
+Readings = Sequence[Reading | None]
+"""Of each episode of a group; None where it has none."""
+
+
+def _factor(spreads: float) -> float:
+    """What is left of the score for something so many usual spreads off."""
+    return math.exp(-((max(spreads, 0.0) / _HALF) ** _STEEPNESS))
+
+
+def _judged(name: str, readings: Readings, detail: str) -> Iterator[tuple[int, Reason]]:
+    law = _LAWS[name]
+    values = np.array([math.nan if reading is None else reading.value for reading in readings])
+    off = neighbours.deviation(values, law.spread)
+    off = {"more": off, "less": -off, "both": np.abs(off)}[law.side]
+    usual = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+    for number, (reading, spreads) in enumerate(zip(readings, off.tolist(), strict=True)):
+        if reading is not None:
+            ratio = math.exp(min(reading.value - usual, 50.0))
+            text = law.text.format(value=reading.value, usual=usual, ratio=ratio, camera=detail)
+            yield number, Reason(kind=name, factor=_factor(spreads), text=text, first=reading.first, last=reading.last)
+
+
+def _motions(group: Sequence[Measured]) -> Iterator[tuple[str, Readings, str]]:
+    """(quantity, its readings, "") of a group."""
+    moved = [episode.movement for episode in group]
+    for name in _LAWS:
+        readings = [None if each is None else each.readings.get(name) for each in moved]
+        if any(readings):
+            yield name, readings, ""
+    known = [number for number, each in enumerate(moved) if each is not None]
+    ends = np.array([each.ends[-1] for each in moved if each is not None])
+    if len(known) < neighbours.FEWEST:
+        return
+    away: list[Reading | None] = [None] * len(group)
+    for number, value in zip(known, neighbours.nearest_distance(ends).tolist(), strict=True):
+        last = group[number].length - 1
+        away[number] = Reading(value=value, first=last, last=last)
+    yield "end", away, ""
+    stretches: dict[int, list[int]] = {}
+    for number, each in enumerate(moved):
+        if each is not None:
+            stretches.setdefault(len(each.courses), []).append(number)
+    for numbers in stretches.values():
+        if len(numbers) >= neighbours.FEWEST:
+            yield from ((name, readings, "") for name, readings in _courses(group, numbers))
+
+
+def _courses(group: Sequence[Measured], numbers: Sequence[int]) -> Iterator[tuple[str, Readings]]:
+    """Of the episodes that have as many stretches between switches of the gripper: the odd stretch of each."""
+    moved = [each for number in numbers if (each := group[number].movement) is not None]
+    ends = np.array([each.ends for each in moved])
+    costs = neighbours.cost_residuals(ends, np.array([each.costs for each in moved]))
+    for name, residuals in (
+        ("course", neighbours.course_residuals(ends, np.array([each.courses for each in moved]))),
+        ("time", costs[:, :, 0]),
+        ("path", costs[:, :, 1]),
+    ):
+        found: list[Reading | None] = [None] * len(group)
+        for number, each, row in zip(numbers, moved, residuals, strict=True):
+            worst = int(np.argmax(row))
+            found[number] = Reading(value=float(row[worst]), first=each.bounds[worst], last=each.bounds[worst + 1])
+        yield name, found
+
+
+def _images(group: Sequence[Measured]) -> Iterator[tuple[str, Readings, str]]:
+    """(quantity, its readings, camera) of a group."""
+    for camera in dict.fromkeys(camera for episode in group for camera in episode.sights):
+        sights = [episode.sights.get(camera) for episode in group]
+
+        def whole(of: Callable[[Sight], float], seen: Sequence[Sight | None] = sights) -> Readings:
+            return [
+                None if each is None else Reading(value=of(each), first=0, last=episode.length - 1)
+                for each, episode in zip(seen, group, strict=True)
+            ]
+
+        yield "brightness", whole(lambda each: each.brightness), camera
+        yield "sharpness", whole(lambda each: math.log(each.sharpness + 0.1)), camera
+        yield "blank", whole(lambda each: each.blank), camera
+        yield "frozen", _frozen(group, sights), camera
+
+
+def _frozen(group: Sequence[Measured], sights: Sequence[Sight | None]) -> Readings:
+    """For how many seconds an image stands still though the arm moves as fast as it changes images elsewhere."""
+    pairs = [
+        None
+        if each is None or episode.movement is None
+        else (each.changes, _moved(episode.movement.steps, each.frames))
+        for each, episode in zip(sights, group, strict=True)
+    ]
+    known = [pair for pair in pairs if pair is not None]
+    if not known:
+        return [None] * len(group)
+    changes, moved = (np.concatenate(part) for part in zip(*known, strict=True))
+    fast = moved > np.median(moved)
+    rate = float(np.median(changes[fast] / moved[fast])) if fast.any() else 0.0
+    least = 0.3 * float(np.median(moved))
+    found: list[Reading | None] = []
+    for episode, each, pair in zip(group, sights, pairs, strict=True):
+        if each is None or pair is None:
+            found.append(None)
+            continue
+        stands = (pair[1] > least) & (pair[0] < np.maximum(_FROZEN * rate * pair[1], 0)) & (pair[0] < _FROZEN_LEVELS)
+        length, start = longest_run(stands)
+        first, last = int(each.frames[start]), int(each.frames[start + length])
+        fps = 1.0 if episode.movement is None else episode.movement.fps
+        found.append(Reading(value=(last - first) / fps, first=first, last=last))
+    return found
+
+
+def _moved(steps: Array, frames: NDArray[np.int64]) -> Array:
+    """(N - 1,) how far the arm goes from one of the frames to the next."""
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.diff(along[frames])
+
+
+def _otherwise(episodes: Sequence[Measured]) -> Iterator[tuple[int, Reason]]:
+    """Episodes that show what another instruction of the dataset asks for."""
+    cameras = sorted({camera for episode in episodes for camera in episode.sights})
+    seen = [episode for episode in episodes if cameras and set(episode.sights) == set(cameras)]
+    if len(seen) < neighbours.FEWEST:
+        return
+    looks = np.array([np.concatenate([episode.sights[camera].look for camera in cameras]) for episode in seen])
+    off, words = neighbours.told_otherwise([episode.task for episode in seen], looks)
+    for episode, spreads, word in zip(seen, off.tolist(), words, strict=True):
+        yield (
+            episode.number,
+            Reason(
+                kind="instruction",
+                factor=_factor(spreads),
+                text=f"its images contradict the instruction as to {word!r}",
+                first=0,
+                last=episode.length - 1,
+            ),
+        )
+
+
+def _twins(episodes: Sequence[Measured]) -> Iterator[tuple[int, Reason]]:
+    """Episodes most of whose rows are those of an earlier one."""
+    holders: dict[int, list[int]] = {}
+    for episode in episodes:
+        common: dict[int, int] = {}
+        for value in episode.sketch.tolist():
+            for other in holders.setdefault(value, []):
+                common[other] = common.get(other, 0) + 1
+            holders[value].append(episode.number)
+        twin = max(common, key=lambda other: common[other], default=-1)
+        if twin >= 0 and common[twin] >= _TWIN * len(episode.sketch):
+            text = f"is a copy of episode {episodes[twin].episode_index}"
+            yield episode.number, Reason(kind="copy", factor=0.0, text=text, first=0, last=episode.length - 1)

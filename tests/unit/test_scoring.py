@@ -1,0 +1,202 @@
+"""`demorec dataset score` on a small dataset of somebody else's in which single episodes are spoilt on purpose."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from support.commands import exit_code
+from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
+
+LENGTH, EPISODES_IN_ALL, BAD, SIZE = 60, 24, 5, (32, 24)
+CLOSES, OPENS = 20, 42
+COLORS = {"red": (220, 20, 20), "blue": (20, 20, 220)}
+Rows = dict[str, NDArray[Any]]
+
+
+def demonstration(number: int) -> Rows:
+    """An arm goes from a place to another one and back, smoothly, with something in its hand from frame 20 to 42."""
+    rng = np.random.default_rng(number)
+    bounds = (0, CLOSES, OPENS, LENGTH - 1)
+    places = np.array([[0, 0], [1, 0.2], [-1, 0.6], [0, 0]]) + rng.uniform(-0.1, 0.1, (4, 2))
+    action = np.zeros((LENGTH, 3))
+    for (a, b), start, end in zip(pairwise(bounds), places, places[1:], strict=False):
+        s = np.linspace(0, 1, b - a + 1)[:, None]
+        action[a : b + 1, :2] = start + (end - start) * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    action[:, 2] = 1.0
+    action[CLOSES:OPENS, 2] = 0.0
+    state = np.concatenate([action[:1], action[:-1]])
+    state[:, 2] = np.maximum(state[:, 2], 0.4 + rng.uniform(-0.05, 0.05))
+    color = list(COLORS)[number % 2]
+    images = np.full((LENGTH, SIZE[1], SIZE[0], 3), 90, np.uint8)
+    for t in range(LENGTH):
+        left = int(10 + 6 * state[t, 0])
+        images[t, 6:16, left : left + 8] = COLORS[color]
+    return {"state": state, "action": action, "images": images, "task": np.array(f"take the {color} block")}
+
+
+def write(root: Path, episodes: list[Rows]) -> Path:
+    """As the dataset of `support.foreign_dataset`, with other rows."""
+    write_foreign(root, length=LENGTH, episodes=len(episodes), size=SIZE)
+    lengths = [len(rows["state"]) for rows in episodes]
+    kinds = {field.name: field.type for field in pq.read_schema(root / DATA)}
+    tasks = sorted({str(rows["task"]) for rows in episodes})
+    stored = []
+    for image in np.concatenate([rows["images"] for rows in episodes]):
+        data = io.BytesIO()
+        Image.fromarray(image).save(data, "PNG")
+        stored.append({"bytes": data.getvalue(), "path": None})
+    columns: dict[str, Any] = {
+        "observation.images.top": pa.array(stored, kinds["observation.images.top"]),
+        "timestamp": np.concatenate([np.arange(n) / 10 for n in lengths]).astype(np.float32),
+        "frame_index": np.concatenate([np.arange(n) for n in lengths]),
+        "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+        "task_index": np.repeat([tasks.index(str(rows["task"])) for rows in episodes], lengths),
+    }
+    for name in ("state", "action"):
+        numbers = pa.array(np.concatenate([rows[name] for rows in episodes]).astype(np.float32).ravel())
+        columns["observation.state" if name == "state" else name] = pa.FixedSizeListArray.from_arrays(numbers, 3)
+    columns["index"] = np.arange(sum(lengths))
+    pq.write_table(pa.table({name: columns[name] for name in kinds}), root / DATA)
+    ends = np.cumsum(lengths)
+    places = pq.read_table(root / EPISODES).to_pydict()
+    places |= {"length": lengths, "dataset_to_index": ends, "dataset_from_index": ends - lengths}
+    places["tasks"] = [[str(rows["task"])] for rows in episodes]
+    pq.write_table(pa.table(places), root / EPISODES)
+    pq.write_table(pa.table({"task": tasks, "task_index": np.arange(len(tasks))}), root / TASKS)
+    info = json.loads((root / "meta/info.json").read_text())
+    for name in ("observation.state", "action"):
+        info["features"][name]["names"] = ["shoulder.pos", "elbow.pos", "gripper.pos"]
+    info |= {"total_frames": sum(lengths), "total_tasks": len(tasks)}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    return root
+
+
+def _each(rows: Rows, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Rows:
+    return {name: values if name == "task" else change(values) for name, values in rows.items()}
+
+
+def hesitates(rows: Rows) -> Rows:
+    return _each(rows, lambda values: np.insert(values, [30] * 15, values[30], axis=0))
+
+
+def goes_aside(rows: Rows) -> Rows:
+    longer = hesitates(rows)
+    away = 0.5 * np.sin(np.pi * np.arange(16) / 15)[:, None] ** 2 * [0, 1, 0]
+    for name in ("state", "action"):
+        longer[name][30:46] += away
+    return longer
+
+
+def loses_it(rows: Rows) -> Rows:
+    rows["state"][32:OPENS, 2] = 0.0
+    return rows
+
+
+def shakes(rows: Rows) -> Rows:
+    rows["action"][:, :2] += np.random.default_rng(0).normal(0, 0.02, (LENGTH, 2))
+    return rows
+
+
+def is_late(rows: Rows) -> Rows:
+    return {**rows, "action": np.concatenate([rows["action"][:1]] * 3 + [rows["action"][:-3]])}
+
+
+def takes_the_other(rows: Rows) -> Rows:
+    other = {"take the red block": "take the blue block", "take the blue block": "take the red block"}
+    return {**rows, "task": np.array(other[str(rows["task"])])}
+
+
+def freezes(rows: Rows) -> Rows:
+    rows["images"][24:40] = rows["images"][24]
+    return rows
+
+
+def ends_early(rows: Rows) -> Rows:
+    return _each(rows, lambda values: values[:38])
+
+
+def is_copied(rows: Rows) -> Rows:
+    return demonstration(BAD - 2)
+
+
+def lacks_numbers(rows: Rows) -> Rows:
+    rows["state"][7, 1] = np.nan
+    return rows
+
+
+@pytest.fixture
+def scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[Rows], Rows] | None], Any]:
+    """What is found of a dataset in which one episode is changed by a function."""
+
+    def run(spoil: Callable[[Rows], Rows] | None) -> Any:
+        episodes = [demonstration(number) for number in range(EPISODES_IN_ALL)]
+        if spoil is not None:
+            episodes[BAD] = spoil(episodes[BAD])
+        root = write(tmp_path / "d", episodes)
+        assert exit_code("dataset", "score", str(root), "--workers", "1", "--json") == 0
+        return json.loads(capsys.readouterr().out)["episodes"]
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("spoil", "kinds", "frame"),
+    [
+        (hesitates, {"pause", "time", "idle"}, 35),
+        (goes_aside, {"path", "course", "strokes"}, 38),
+        (loses_it, {"slip"}, 31),
+        (shakes, {"action noise"}, 30),
+        (is_late, {"lag"}, 30),
+        (takes_the_other, {"instruction"}, 30),
+        (freezes, {"frozen"}, 32),
+        (ends_early, {"switches", "end"}, 37),
+        (is_copied, {"copy"}, 30),
+        (lacks_numbers, {"missing"}, 7),
+    ],
+)
+def test_the_spoilt_episode_is_the_worst_and_says_why(
+    scored: Any, spoil: Callable[[Rows], Rows], kinds: set[str], frame: int
+) -> None:
+    found = scored(spoil)
+    assert min(found, key=lambda episode: episode["score"])["episode_index"] == BAD
+    assert found[BAD]["score"] < 0.5
+    assert {reason["kind"] for reason in found[BAD]["reasons"]} & kinds
+    reason = next(reason for reason in found[BAD]["reasons"] if reason["kind"] in kinds)
+    assert reason["first"] <= frame <= reason["last"]
+    assert all(episode["score"] > 0.8 for episode in found if episode["episode_index"] != BAD)
+
+
+def test_sound_episodes_are_sound(scored: Any) -> None:
+    found = scored(None)
+    assert [episode["episode_index"] for episode in found] == list(range(EPISODES_IN_ALL))
+    assert all(episode["score"] > 0.8 and not episode["reasons"] for episode in found)
+
+
+def test_what_is_good_is_selected_and_the_worst_is_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    episodes = [demonstration(number) for number in range(EPISODES_IN_ALL)]
+    episodes[BAD] = is_late(episodes[BAD])
+    root, file = write(tmp_path / "d", episodes), tmp_path / "scores.json"
+    assert exit_code("dataset", "score", str(root), "--workers", "1", "--out", str(file)) == 0
+    assert f"episode {BAD}: the state follows the action by -2.0 frames" in capsys.readouterr().out.splitlines()[0]
+    flags = ("--where", "score > 0.8", "--scores", str(file))
+    assert exit_code("dataset", "select", str(root), *flags, "--out", str(tmp_path / "good")) == 0
+    assert f"{EPISODES_IN_ALL - 1} episodes" in capsys.readouterr().out
+    assert exit_code("dataset", "drop", str(root), "--where", "score < 0.5", "--out", str(tmp_path / "same")) == 0
+    assert exit_code("dataset", "diff", str(tmp_path / "good"), str(tmp_path / "same")) == 0
+    capsys.readouterr()
+    assert exit_code("dataset", "reorder", str(tmp_path / "good"), *("--by", "score"), *flags[2:], "--dry-run",
+                     "--out", str(tmp_path / "x")) == 2  # fmt: skip
+    assert "other episodes" in capsys.readouterr().err
+    assert exit_code("view", str(root), "--rank", "score", "--episodes", "3:7", "--save", str(tmp_path / "v.rrd")) == 0
+    assert f"episode {BAD}: the state follows" in capsys.readouterr().err
