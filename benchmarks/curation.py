@@ -7,9 +7,9 @@ Simulates episodes, of which 30 in 100 are spoilt, and writes them with LeRobot'
 as somebody else may (degrees, gripper in per cent, half the rate, images in the rows, other names). There is no
 sidecar, no scene and no outcome in either. Slips, detours and hesitations happen in the simulation, so that images and
 states go with them: what is carried is pulled out of the hand, the arm goes aside and comes back, the arm stands. The
-others are made of sound episodes: noise on the actions, actions some frames late, the instruction of another object, images
-that stand still, the end cut off. Sizes are drawn, from faults that hardly show on. Simulated episodes and datasets
-stay in OUT and are not made again.
+others are made of sound episodes: noise on the actions, actions some frames late, the instruction of another object,
+images that stand still, the end cut off. Sizes are drawn, from faults that hardly show on. Simulated episodes and
+datasets stay in OUT and are not made again.
 
 The limits of the score were set on other tasks, another arm and another seed than are measured by default:
 

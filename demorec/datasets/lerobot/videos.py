@@ -7,7 +7,7 @@ needs, where no image is shown in another order than it was encoded in.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import cached_property
@@ -307,15 +307,19 @@ class StoredImages:
         self._allowed = _PIXEL_BYTES
         self._counted: set[Path] = set()
 
-    def read(self, place: EpisodePlace) -> Iterator[Rgb]:
-        """(H, W, 3) uint8 RGB of every frame of an episode; ExportError when they cannot be read."""
+    def read(self, place: EpisodePlace, frames: Collection[int] | None = None) -> Iterator[Rgb]:
+        """(H, W, 3) uint8 RGB of some frames of an episode, of all by default; ExportError when they cannot be read."""
         path = self._root / place.data.path(self._info.data_path)
         if path not in self._counted and path.is_file():
             self._counted.add(path)
             self._allowed += _FILE_RATIO * path.stat().st_size
         shape: tuple[int, ...] | None = None
+        number = -1
         for batch in self._stream.batches(place):
             for value in batch.column(self._key).to_pylist():
+                number += 1
+                if frames is not None and number not in frames:
+                    continue
                 data = value.get("bytes") if isinstance(value, dict) else None
                 try:
                     image = self._decoded(data or b"")
