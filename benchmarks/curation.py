@@ -6,13 +6,14 @@
 Simulates episodes, of which 30 in 100 are spoilt, and writes them with LeRobot's own writer: under demorec's names, and
 as somebody else may (degrees, gripper in per cent, half the rate, images in the rows, other names). There is no
 sidecar, no scene and no outcome in either. Slips, detours and hesitations happen in the simulation, so that images and
-states go with them: friction vanishes while an object is carried, the arm goes aside and comes back, the arm stands.
-The others are made of sound episodes: noise on the actions, actions some frames late, the instruction of another
-object, images that stand still, the end cut off. Sizes are drawn, from faults that hardly show on. Simulated episodes
-stay in OUT and are not made again.
+states go with them: what is carried is pulled out of the hand, the arm goes aside and comes back, the arm stands. The
+others are made of sound episodes: noise on the actions, actions some frames late, the instruction of another object,
+images that stand still, the end cut off. Sizes are drawn, from faults that hardly show on. Simulated episodes and
+datasets stay in OUT and are not made again.
 
-The limits of the score were set on pick_place/panda/1 and pick_shapes/panda/1; `--only` names those for it. The
-default measures on other tasks, another arm and other seeds.
+The limits of the score were set on other tasks, another arm and another seed than are measured by default:
+
+    python benchmarks/curation.py --out set --episodes 50 --only pick_place/panda/1 pick_shapes/panda/1
 """
 
 from __future__ import annotations

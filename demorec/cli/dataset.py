@@ -220,7 +220,7 @@ class Dataset:
         """Where a condition or an order is by score, and the dataset has no column of that name."""
         from demorec.datasets.editing.where import names_in
 
-        if "score" not in names_in(self.where) | {self.by} or "score" in source.columns()[0]:
+        if "score" not in names_in(self.where) | {self.by} or any("score" in row for row in source.columns()):
             return
         if self.scores is not None:
             from demorec.check.scoring.file import read_scores

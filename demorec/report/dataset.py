@@ -9,7 +9,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from demorec.check.base import Result
 from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.check.scoring.neighbours import FEWEST
+from demorec.check.scoring.score import SOUND, score_dataset
 from demorec.core.errors import ConfigError, ExportError, in_words, without_path
 from demorec.datasets.lerobot.files import read_json, read_table
 from demorec.datasets.lerobot.layout import DatasetInfo
@@ -51,14 +54,16 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
     stride = max(1, -(-info.total_episodes // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
+    flags = {} if checks is None else _flags(root, info, missing, images=checks.pictures)
     for number, place in enumerate(episode_places(root, info)):
         columns = {} if reader is None else reader.read(place)
         _count_components(components, root, info, columns)
         strip, problem = None, ""
-        if key is not None and number % stride == 0:
+        odd = flags.get(place.episode_index, ())
+        if key is not None and (odd or number % stride == 0):
             strip, problem = _strip(root, info, key, place)
         episode = _episode(place, info.fps, columns, rows.get(place.episode_index))
-        episodes.append(replace(episode, filmstrip=strip, problem=problem))
+        episodes.append(replace(episode, filmstrip=strip, problem=problem, flags=odd))
         advance(len(episodes), total)
     episodes += [_left_out(row) for row in left_out]
     summaries = CheckSummaries()
@@ -78,6 +83,34 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
         missing=tuple(missing),
         configs=tuple(configs.values()),
     )
+
+
+def _flags(root: Path, info: DatasetInfo, missing: list[str], *, images: bool) -> dict[int, tuple[Result]]:
+    """episode_index -> its score, of the worst of those below `SOUND`; why there are no scores goes into `missing`."""
+    if info.total_episodes < FEWEST:
+        return {}
+    try:
+        found = sorted(score_dataset(root, images=images), key=lambda episode: episode.score)
+    except ExportError as error:
+        missing.append(f"Its episodes have no scores: {without_path(error, root)}")
+        return {}
+    return {
+        episode.episode_index: (
+            Result(
+                check="score",
+                group="demonstration",
+                level="warn",
+                value=episode.score,
+                unit="",
+                warn=SOUND,
+                fail=0.0,
+                frame=episode.reasons[0].first if episode.reasons else None,
+                detail="; ".join(reason.text for reason in episode.reasons),
+            ),
+        )
+        for episode in found[:MAX_SHOWN]
+        if episode.score < SOUND
+    }
 
 
 def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row], _Row]:

@@ -118,14 +118,19 @@ def _digest(content: str) -> str:
 
 
 def _shown(episodes: Sequence[ReportedEpisode]) -> list[tuple[int, ReportedEpisode]]:
-    """(number, episode), those first that need attention."""
+    """(number, episode), those first that need attention, of flagged ones the worst scores first."""
     stride = max(1, -(-len(episodes) // MAX_SHOWN))
     chosen = [
         (number, episode)
         for number, episode in enumerate(episodes)
         if number % stride == 0 or episode.state not in ("unknown", "succeeded")
     ]
-    return sorted(chosen, key=lambda item: list(_STATES).index(item[1].state))[:MAX_SHOWN]
+
+    def urgency(item: tuple[int, ReportedEpisode]) -> tuple[int, float]:
+        scores = [flag.value for flag in item[1].flags if flag.check == "score" and flag.value is not None]
+        return list(_STATES).index(item[1].state), min(scores, default=1.0)
+
+    return sorted(chosen, key=urgency)[:MAX_SHOWN]
 
 
 def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]]:

@@ -183,20 +183,34 @@ def test_sound_episodes_are_sound(scored: Any) -> None:
     assert all(episode["score"] > 0.8 and not episode["reasons"] for episode in found)
 
 
-def test_what_is_good_is_selected_and_the_worst_is_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture
+def late(tmp_path: Path) -> Path:
+    """A dataset in which the actions of one episode are late."""
     episodes = [demonstration(number) for number in range(EPISODES_IN_ALL)]
     episodes[BAD] = is_late(episodes[BAD])
-    root, file = write(tmp_path / "d", episodes), tmp_path / "scores.json"
-    assert exit_code("dataset", "score", str(root), "--workers", "1", "--out", str(file)) == 0
+    return write(tmp_path / "d", episodes)
+
+
+def test_what_is_good_is_selected(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = str(tmp_path / "scores.json")
+    assert exit_code("dataset", "score", str(late), "--workers", "1", "--out", file) == 0
     assert f"episode {BAD}: the state follows the action by -2.0 frames" in capsys.readouterr().out.splitlines()[0]
-    flags = ("--where", "score > 0.8", "--scores", str(file))
-    assert exit_code("dataset", "select", str(root), *flags, "--out", str(tmp_path / "good")) == 0
+    good, same = str(tmp_path / "good"), str(tmp_path / "same")
+    assert exit_code("dataset", "select", str(late), "--where", "score > 0.8", "--scores", file, "--out", good) == 0
     assert f"{EPISODES_IN_ALL - 1} episodes" in capsys.readouterr().out
-    assert exit_code("dataset", "drop", str(root), "--where", "score < 0.5", "--out", str(tmp_path / "same")) == 0
-    assert exit_code("dataset", "diff", str(tmp_path / "good"), str(tmp_path / "same")) == 0
+    assert exit_code("dataset", "drop", str(late), "--where", "score < 0.5", "--out", same) == 0
+    assert exit_code("dataset", "diff", good, same) == 0
     capsys.readouterr()
-    assert exit_code("dataset", "reorder", str(tmp_path / "good"), *("--by", "score"), *flags[2:], "--dry-run",
-                     "--out", str(tmp_path / "x")) == 2  # fmt: skip
+    assert exit_code("dataset", "reorder", good, "--by", "score", "--scores", file, "--out", str(tmp_path / "x")) == 2
     assert "other episodes" in capsys.readouterr().err
-    assert exit_code("view", str(root), "--rank", "score", "--episodes", "3:7", "--save", str(tmp_path / "v.rrd")) == 0
+
+
+def test_the_worst_is_shown_first(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ("--episodes", "3:7", "--save", str(tmp_path / "v.rrd"))
+    assert exit_code("view", str(late), "--rank", "score", *flags) == 0
     assert f"episode {BAD}: the state follows" in capsys.readouterr().err
+    assert exit_code("report", str(late), "--out", str(tmp_path / "page.html")) == 0
+    page = (tmp_path / "page.html").read_text()
+    first = page.partition('<section id="episodes">')[2].partition("<article")[2].partition("</article>")[0]
+    assert f"episode {BAD}<" in first
+    assert "the state follows the action by -2.0 frames" in first

@@ -63,8 +63,8 @@ class Measured:
 def scale_of(root: Path) -> Scale | None:
     """What the elements range over in a dataset; None where no episode has a usable state."""
     dataset = _opened(root)
-    motions = [motion for number in range(len(dataset)) if (motion := _motion(dataset, _rows(dataset, number)))]
-    return Scale.of(iter(motions)) if motions else None
+    motions = (_motion(dataset, _rows(dataset, number)) for number in range(len(dataset)))
+    return Scale.of(motion for motion in motions if motion is not None)
 
 
 def measure(root: Path, scale: Scale | None, images: bool, numbers: Sequence[int]) -> list[Measured]:

@@ -5,7 +5,7 @@ Elements count in units of the range that the dataset has of them, so that radia
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -59,8 +59,8 @@ class Scale:
     outermost: Array
 
     @classmethod
-    def of(cls, motions: Iterator[Motion]) -> Scale:
-        """Of all episodes."""
+    def of(cls, motions: Iterable[Motion]) -> Scale | None:
+        """Of all episodes; None for none."""
         found = [
             [
                 np.stack([values.min(axis=0), values.max(axis=0)])
@@ -68,6 +68,8 @@ class Scale:
             ]
             for motion in motions
         ]
+        if not found:
+            return None
         state, action = (np.stack(part) for part in zip(*found, strict=True))
         outermost = np.stack([action[:, 0].min(axis=0), action[:, 1].max(axis=0)])
         return cls(state=_inner(state), action=_inner(action), outermost=outermost)
@@ -133,7 +135,10 @@ def movement(motion: Motion, scale: Scale) -> Movement:
         readings |= {"lag": Reading(value=lag, first=0, last=len(state) - 1)} if lag is not None else {}
     readings["strokes"] = Reading(value=_strokes(guide, motion.fps), first=0, last=len(state) - 1)
     for opening, command in hands:
-        readings |= dict(_of_hand(opening, command, motion.fps))
+        for name, reading in _of_hand(opening, command, motion.fps):
+            known = readings.setdefault(name, reading)
+            if (reading.value > known.value) == (name == "slip"):  # of two hands the one that holds less, or loses more
+                readings[name] = reading
     stretches = [guide[a : b + 1] for a, b in pairwise(bounds)]
     return Movement(
         readings=readings,

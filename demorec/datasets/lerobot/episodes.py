@@ -12,7 +12,7 @@ where it is there. Memory is that of an episode's numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -222,11 +222,11 @@ class LeRobotDataset:
             found = self._videos[key, place.episode_index] = EpisodeVideo(self.root, self.info, key, place)
         return found
 
-    def stored_images(self, key: str, place: EpisodePlace) -> Iterator[Rgb]:
-        """(H, W, 3) uint8 RGB of every frame of an episode, of an image feature."""
+    def stored_images(self, key: str, place: EpisodePlace, frames: Collection[int] | None = None) -> Iterator[Rgb]:
+        """(H, W, 3) uint8 RGB of some frames of an episode, of all by default, of an image feature."""
         if key not in self._stored:
             self._stored[key] = StoredImages(self.root, self.info, key)
-        return self._stored[key].read(place)
+        return self._stored[key].read(place, frames)
 
     def recording(self, number: int) -> DatasetRecording:
         """The episode of a place, counted from 0; one after the other they are read in one pass."""
@@ -385,7 +385,7 @@ class DatasetRecording:
         key = self.dataset.keys[camera]
         if self.dataset.info.features[key].is_video:
             return self.dataset.video(key, self.place).images_at(frames)
-        return (image for frame, image in enumerate(self.images(camera)) if frame in frames)
+        return self.dataset.stored_images(key, self.place, frames)
 
     def distances(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """The images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""

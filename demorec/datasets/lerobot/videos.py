@@ -7,7 +7,7 @@ needs, where no image is shown in another order than it was encoded in.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import cached_property
@@ -308,9 +308,10 @@ class StoredImages:
         self._allowed = _PIXEL_BYTES
         self._counted: set[Path] = set()
 
-    def read(self, place: EpisodePlace) -> Iterator[Rgb]:
-        """(H, W, 3) uint8 RGB of every frame of an episode; ExportError when they cannot be read."""
-        yield from self.decode(place, (batch.column(self._key) for batch in self._stream.batches(place)))
+    def read(self, place: EpisodePlace, frames: Collection[int] | None = None) -> Iterator[Rgb]:
+        """(H, W, 3) uint8 RGB of some frames of an episode, of all by default; ExportError when they cannot be read."""
+        columns = (batch.column(self._key) for batch in self._stream.batches(place))
+        yield from self.decode(place, columns if frames is None else _some_rows(columns, frames))
 
     def decode(self, place: EpisodePlace, columns: Iterable[pa.Array]) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of some rows of an episode, whose column was read already; ExportError as `read`."""
@@ -348,3 +349,12 @@ class StoredImages:
             if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
                 raise ValueError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
             return np.asarray(image.convert("RGB"))
+
+
+def _some_rows(columns: Iterable[pa.Array], wanted: Collection[int]) -> Iterator[pa.Array]:
+    """Of a column that comes in pieces, the rows of some numbers."""
+    first = 0
+    for column in columns:
+        is_wanted = [first + row in wanted for row in range(len(column))]
+        yield column.filter(pa.array(is_wanted, pa.bool_()))
+        first += len(column)
