@@ -515,10 +515,10 @@ def judge(subject: Any) -> dict[str, Result]:
     found = {}
     for name in CHECKS.names():
         check = CHECKS.load(name)
-        is_motion = check.measure.__module__ == "demorec.check.motion"
+        is_motion = check.measure.__module__.rpartition(".")[2] in ("motion", "targets", "mounts")
         if subject.form not in check.on or check.needs_pictures or check.group in ("file", "time"):
             continue
-        if subject.form == "external" and not (is_motion or name in ("pose_follows_joints",)):
+        if subject.form == "external" and not is_motion:
             continue
         result = check.run(subject)
         if result.level in ("warn", "fail"):

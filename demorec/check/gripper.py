@@ -8,8 +8,7 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.objects import SOLID
-from demorec.episode.scene import Body
+from demorec.check.objects import top_of
 
 CARRIED_HEIGHT = 0.03
 """Metres above its start from which on an object counts as carried."""
@@ -59,7 +58,7 @@ def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
     """Fingers far above all supports and away from all objects touch nothing but each other."""
     c, scene = episode.columns, episode.info.scene
     tcp = episode.world_from_tcp[:, :3, 3]
-    alone = tcp[:, 2] > max((_top(body) for body in scene.fixed if body.collides), default=-math.inf) + 0.06
+    alone = tcp[:, 2] > max((top_of(body) for body in scene.fixed if body.collides), default=-math.inf) + 0.06
     for body in scene.movable:
         reach = math.hypot(*body.shape.extents) / 2 + 0.08
         alone &= np.linalg.norm(c.object_poses[body.name][:, :3] - tcp, axis=1) > reach
@@ -68,12 +67,6 @@ def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
     if not alone.any():
         return None
     return worst_frame(np.where(alone, np.abs(c.contact_force), 0.0), f"{int(alone.sum())} frames alone")
-
-
-def _top(body: Body) -> float:
-    """Height of a standing body, metres, or more: a model may have its origin at its bottom."""
-    share = 0.5 if body.shape.kind in SOLID else 1.0
-    return float(body.world_from_body.position[2]) + share * body.shape.extents[2]
 
 
 @physics_check(

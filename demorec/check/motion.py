@@ -14,7 +14,6 @@ import numpy as np
 
 from demorec.check.base import (
     ACTIONS,
-    EE_POSES,
     EFFORTS,
     GRIPPER,
     STATE_ALONE,
@@ -31,46 +30,34 @@ from demorec.check.base import (
 )
 from demorec.check.dynamics import Dynamics, masses_of
 from demorec.check.evidence import Flags, Motion
-from demorec.check.rows import LinkMatrices, displacement, finest_lag, longest_run, matrices
+from demorec.check.rows import LinkMatrices, longest_run
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
 from demorec.robots.urdf import Urdf
 
-_REACH_S = 1.0
-"""How far apart in time an action and the state that follows it are looked for, seconds."""
-_LATEST_S = 0.35
-"""How far behind its action a state may be, seconds: hobby servos under teleoperation need 0.1 to 0.2."""
 _FEW_FPS = 20
 """Frames a second below which exploration noise moves a joint to and fro between two frames."""
-_HELD_S = 0.3
-"""How long an action has not changed before its joint should be there, seconds."""
-_FEWEST = 30
+FEWEST = 30
 """Frames below which an episode says nothing of lags and orders."""
 _OWN = 0.5
 """Correlation with its own element above which an action is a target of the state: 0.97 and more in demonstrations of
 Panda and iiwa, where increments and poses have 0.3 and less."""
-_ALIKE = 3.0
-"""Times the movement of the state that an action of its unit may move: teleoperation is scaled to half or double."""
 _VELOCITY_S = 0.3
 """Over which velocities are added up: filters of drivers are 20 to 100 ms late, which cancels over longer times."""
 _SLOW = 0.05
 """Root mean square speed, rad/s or m/s, above which a joint is judged even where others move ten times as far."""
+_MIDWAY = 1e-6
+"""Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
 _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
 """After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
 _STILL_FRAMES = 19
 """Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
-_LARGEST = 2.0
-"""How many times as large as its model a robot may be built, or as small."""
-_FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1
-"""By which fixed mounts are found, and metres at which a turn counts beside a distance."""
 
 EVERYWHERE: tuple[Form, ...] = ("simulated", "external", "dataset")
 
 motion_check = partial(check, group="physics", on=EVERYWHERE)
-target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
-"""Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
 
 
 class Motions:
@@ -92,7 +79,7 @@ class Motions:
     def targets(self) -> list[tuple[Array, Array]]:
         """(T, K) states and actions of each episode, of the K elements that have an action and move; less their means
         and in units of the state's deviation. Empty where the action is no target of the state."""
-        pairs = [motion for motion in self.all if motion.action is not None and len(motion.state) >= _FEWEST]
+        pairs = [motion for motion in self.all if motion.action is not None and len(motion.state) >= FEWEST]
         kept = self.moving
         if not pairs or not kept.any():
             return []
@@ -100,7 +87,7 @@ class Motions:
             (_scaled(motion.state, motion.state)[:, kept], _scaled(_action(motion), motion.state)[:, kept])
             for motion in pairs
         ]
-        own = np.diag(_correlations(found))
+        own = np.diag(correlations(found))
         return found if float(np.median(own)) > _OWN else []
 
     @cached_property
@@ -123,7 +110,7 @@ def _scaled(values: Array, state: Array) -> Array:
     return np.asarray((values - values.mean(axis=0)) / np.maximum(state.std(axis=0), _MOVES))
 
 
-def _correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
+def correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
     """(K, K) of each element of the state with each of the action, over all episodes; 0 where one does not change."""
     state, action = (np.concatenate(part) for part in zip(*targets, strict=True))
     size = np.sqrt(np.outer((state**2).sum(axis=0), (action**2).sum(axis=0)))
@@ -229,97 +216,13 @@ def velocity_matches_position(subject: Moving) -> Found:
     return Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
 
 
-@target_check(
-    measures="frames by which the state is too early for its action, or too late",
-    warn=0.75,
-    fail=1.5,
-    group="alignment",
-)
-def state_follows_action(subject: Moving) -> Found:
-    """The state follows the action by about a frame or more, and by less than a third of a second: catches actions that
-    were recorded late or early, or that are the state itself, from which a policy learns to stand still."""
-    if not (targets := subject.motions.targets):
-        return NotMeasured(why=_NO_TARGETS)
-    reach = max(2, round(_REACH_S * subject.motions.all[0].fps))
-    lags = range(-reach, reach + 1)
-    long = [(state, action) for state, action in targets if len(state) > 3 * reach]
-    if not long:
-        return NotMeasured(why="the episodes are too short to tell which of state and action is first")
-    squares = np.zeros((len(lags), long[0][0].shape[1]))
-    for state, action in long:
-        core = slice(reach, len(state) - reach)
-        # The variance: a zero that is off, and weight, keep state and action apart whatever the lag.
-        squares += [len(state) * (state[core] - np.roll(action, lag, axis=0)[core]).var(axis=0) for lag in lags]
-    off = np.sqrt(squares)
-    told = np.flatnonzero(off.min(axis=0) < 0.8 * np.minimum(off[0], off[-1]))
-    if not len(told):
-        return NotMeasured(why="state and action move too little to tell which of them is first")
-    # The middle one: a gripper is slower than the arm, and stops at what it holds.
-    lag = float(np.median([finest_lag(lags, off[:, element].tolist()) for element in told]))
-    late = lag - _LATEST_S * subject.motions.all[0].fps
-    return Measurement(value=max(1 - lag, late, 0.0), detail=f"the state follows by {lag:+.2f} frames")
-
-
-@target_check(
-    measures="elements of the state that follow the action of another one",
-    group="alignment",
-)
-def actions_in_order(subject: Moving) -> Found:
-    """Every element of the state follows its own action: catches joints exchanged in one of the two."""
-    if not (targets := subject.motions.targets):
-        return NotMeasured(why=_NO_TARGETS)
-    table = _correlations(targets)
-    count = len(table)
-    names = [name for name, moves in zip(subject.motions.all[0].names, subject.motions.moving, strict=True) if moves]
-    best = table.argmax(axis=1)
-    # Two joints of one motion may go alike; an exchange shows where an element hardly follows its own action at all.
-    wrong = [i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3]
-    told = [f"{names[i]} follows that of {names[best[i]]}" for i in wrong]
-    return Measurement(value=len(wrong), detail="; ".join(told[:3]))
-
-
-@target_check(
-    group="physics",
-    measures="distance at which a joint always stays from its action",
-    unit="rad, m",
-    warn=0.1,
-    fail=0.3,
-)
-def state_reaches_action(subject: Moving) -> Found:
-    """A joint that is held comes to where it was sent, at least at some time: catches a zero that is off.
-
-    Weight and friction keep an arm off by a few hundredths of a rad, and what a gripper holds keeps its fingers apart;
-    only a false zero does so always. Velocities, increments and shares of a range are no places to be at.
-    """
-    if not (targets := subject.motions.targets):
-        return NotMeasured(why=_NO_TARGETS)
-    spread = float(np.median([np.nanmedian(action.std(axis=0)) for _, action in targets]))
-    if not 1 / _ALIKE < spread < _ALIKE:
-        return NotMeasured(why=f"actions move {spread:.3g} times as far as the state, so they are in another unit")
-    offsets: dict[str, list[Array]] = {}
-    for motion in subject.motions.all:
-        if motion.action is None:
-            continue
-        still = max(2, round(_HELD_S * motion.fps))
-        known = np.flatnonzero(np.isfinite(motion.lower) & np.isfinite(motion.action).all(axis=0))
-        for element in known.tolist():
-            action = motion.action[:, element]
-            held = [t for t in range(still, len(action)) if np.ptp(action[t - still : t + 1]) < 0.01]
-            offsets.setdefault(motion.names[element], []).append(np.abs(motion.state[held, element] - action[held]))
-    least = {name: float(np.quantile(np.concatenate(of), 0.1)) for name, of in offsets.items() if sum(map(len, of))}
-    if not least:
-        return NotMeasured(why="no joint is known whose action stays where it is for a while")
-    name = max(least, key=lambda key: least[key])
-    return Measurement(value=least[name], detail=name)
-
-
 @motion_check(
     measures="elements of the state that never change while their action does",
     needs=ACTIONS,
 )
 def elements_alive(subject: Moving) -> Found:
     """Encoders are alive: no element stays at one value in all episodes while what it is sent changes."""
-    pairs = [motion for motion in subject.motions.all if motion.action is not None and len(motion.state) >= _FEWEST]
+    pairs = [motion for motion in subject.motions.all if motion.action is not None and len(motion.state) >= FEWEST]
     if not pairs:
         return Lacking(need=ACTIONS)
     stands = np.all([np.ptp(motion.state, axis=0) == 0 for motion in pairs], axis=0)
@@ -353,71 +256,50 @@ def stuck_sensors(subject: Moving) -> Iterator[Found]:
             yield Measurement(value=length, frame=start + 1 if length else None, detail=label)
 
 
-@check(
-    group="physics",
-    on=("external", "dataset"),  # of simulated recordings the mounts are known: `forward_kinematics` judges these
-    measures="how far the EE pose strays from the joints' forward kinematics, between fixed mounts, nine tenths of it",
-    unit="m",
+@motion_check(
+    measures="share of frames that repeat the one before, number by number, while the arm moves",
     warn=0.02,
-    fail=0.05,
-    needs=EE_POSES,
+    fail=math.inf,
+    simulated=(0.0, 0.0),
+    needs=STATE_ALONE,
 )
-def pose_follows_joints(subject: Moving) -> Iterator[Found]:
-    """The hand goes where the joints take it, whatever its frame and the base's are: catches exchanged joints,
-    other units and orders of a quaternion, and some zeros that are off. 0.1 m are added for each rad of rotation.
+def repeated_frames(subject: Moving) -> Iterator[Found]:
+    """Each frame is one of its own: catches gaps that were filled with what came before. Of simulated recordings, of
+    which all numbers are measured anew, in any frame."""
+    for motion in subject.motions.all:
+        tables = [motion.state, *motion.sensors.values(), *([] if motion.action is None else [motion.action])]
+        rows = np.column_stack([table.reshape(len(table), -1) for table in tables])
+        same = ((rows[1:] == rows[:-1]) | np.isnan(rows[1:])).all(axis=1)
+        moves = (motion.state[1:] != motion.state[:-1]).any(axis=1)
+        around = np.zeros_like(same)
+        around[1:-1] = moves[:-2] & moves[2:]
+        wrong = same if motion.contact is not None else same & around
+        frame = int(np.argmax(wrong)) + 1 if wrong.any() else None
+        yield Measurement(value=float(wrong.mean()) if len(wrong) else 0.0, frame=frame, detail=motion.where)
 
-    A robot that is known by the names of its joints may be built larger or smaller, to half or double.
+
+@motion_check(
+    measures="share of moving frames in which every joint is exactly midway between its neighbours",
+    warn=0.02,
+    fail=0.2,
+    needs=STATE_ALONE,
+)
+def interpolated_frames(subject: Moving) -> Iterator[Found]:
+    """States were measured, not made by interpolation between others, which halves velocities where they turn.
+
+    A gripper may move at one speed while the arm stands still.
     """
-    motions = subject.motions.all
-    for motion in motions[:: max(1, len(motions) // _FITTED_EPISODES)]:
-        if motion.ee_pose is None or motion.urdf is None:
-            yield Lacking(need=EE_POSES)
-            return
-        if motion.tcp_link:
-            yield NotMeasured(why="the link is known of which these are the poses, and forward_kinematics judges them")
+    for motion in subject.motions.all:
+        state = motion.state[:, [i for i in range(len(motion.names)) if i != motion.gripper]]
+        if len(state) < FEWEST or not state.size:
             continue
-        if len(motion.state) < _FEWEST:
-            yield NotMeasured(why=f"an episode has fewer than {_FEWEST} frames")
-            continue
-        links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
-        last = [joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]
-        off = _mounted(links[last], matrices(motion.ee_pose))
-        frame = int(np.argmax(off))
-        yield Measurement(value=float(np.quantile(off, 0.9)), frame=frame, detail=motion.where)
-
-
-def _mounted(links: Array, poses: Array) -> Array:
-    """(T,) metres by which poses (T, 4, 4) are off X @ links @ Y, for the fixed X and Y and the size that fit best."""
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
-
-    def fixed(numbers: Array) -> Array:
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:]
-        return out
-
-    def placed(numbers: Array, links: Array) -> Array:
-        sized = links.copy()
-        sized[:, :3, 3] *= _LARGEST ** math.tanh(numbers[12])
-        return np.asarray(fixed(numbers[:6]) @ sized @ fixed(numbers[6:12]))
-
-    rows = np.unique(np.linspace(0, len(links) - 1, _FITTED_FRAMES).astype(int))
-
-    def residual(numbers: Array) -> Array:
-        off = placed(numbers, links[rows]) - poses[rows]
-        return np.asarray((off[:, :3] * [_LEVER, _LEVER, _LEVER, 1.0]).reshape(-1))
-
-    best = None
-    for yaw in np.arange(4) * (math.pi / 2):  # bases that are turned may be far from each other's fit
-        start = np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0])
-        mount = np.linalg.inv(fixed(start) @ links[0]) @ poses[0]
-        guess = np.concatenate([start, Rotation.from_matrix(mount[:3, :3]).as_rotvec(), mount[:3, 3], [0.0]])
-        found = least_squares(residual, guess)
-        best = found if best is None or found.cost < best.cost else best
-        if best.cost < 1e-3 * _LEVER * len(rows):
-            break
-    assert best is not None
-    return displacement(placed(best.x, links), poses)
+        near, way = _MIDWAY * max(float(np.ptp(state, axis=0).max()), 1e-9), np.abs(state[2:] - state[:-2])
+        # Encoders of coarse steps may go as far twice; not several of them at once, over many steps.
+        least = np.where(state[1:] == state[:-1], np.inf, np.abs(np.diff(state, axis=0))).min(axis=0)
+        moves = (way > np.maximum(1e3 * near, 10 * least)).sum(axis=1) >= min(3, state.shape[1])
+        midway = np.abs(state[1:-1] - (state[2:] + state[:-2]) / 2).max(axis=1) < near
+        if moves.sum() >= FEWEST:
+            yield Measurement(value=float(midway[moves].mean()), detail=motion.where)
 
 
 @motion_check(
@@ -501,6 +383,3 @@ def point_masses(motion: Motion) -> Dynamics | NotMeasured | None:
 
 def _children(urdf: Urdf) -> set[str]:
     return {joint.child for joint in urdf.joints}
-
-
-_NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.rows import angle_between, displacement, inverse, matrices
+from demorec.check.rows import angle_between, displacement, inverse, longest_run, matrices
 from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Shape
 
 COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""
+_GAP = 0.005
+"""Metres above a support from which on it bears nothing."""
 SOLID = ("box", "sphere", "cylinder", "capsule")
 """Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 
@@ -244,3 +246,51 @@ def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
             yield Measurement(value=int(wrong.sum()), frame=frame + 1, detail=detail)
         else:
             yield Measurement(value=0, detail=f"{body.name} travels {int(travelling.sum())} frames")
+
+
+@physics_check(
+    measures="longest time in which an object hangs in the air, or sinks, with nothing that bears it",
+    unit="s",
+)
+def falls_unheld(episode: CheckedEpisode) -> Iterator[Found]:
+    """What no finger presses on and nothing is below falls freely: catches objects that are glued to the hand or stay
+    in the air (boxes, spheres, cylinders, capsules)."""
+    c, scene, fps = episode.columns, episode.info.scene, episode.info.fps
+    if c.num_frames < 4:
+        return
+    free = (c.contact_force[:-2] == 0) & (c.contact_force[1:-1] == 0) & (c.contact_force[2:] == 0)
+    gravity = scene.physics.gravity[2]
+    for body in (body for body in scene.movable if body.shape.kind in SOLID):
+        pose = episode.world_from_object(body.name)
+        fall = np.diff(pose[:, 2, 3], 2) * fps**2
+        wrong = free & (fall > 0.5 * gravity) & ~_is_borne(episode, body, pose)[1:-1]
+        length, start = longest_run(wrong)
+        yield Measurement(value=length / fps, frame=start + 1 if length else None, detail=body.name)
+
+
+def _is_borne(episode: CheckedEpisode, body: Body, pose: Array) -> NDArray[np.bool_]:
+    """(T,) whether anything is within reach below a body that may bear it, or beside it."""
+    half = math.hypot(*body.shape.extents) / 2
+    points = np.einsum("tij,pj->tpi", pose[:, :3, :3], _surface_points(body.shape))
+    bottom = pose[:, 2, 3] + points[:, :, 2].min(axis=1)
+    borne = np.zeros(len(pose), dtype=np.bool_)
+    for other in episode.info.scene.bodies:
+        if other.name == body.name or not other.collides:
+            continue
+        theirs = (
+            episode.world_from_object(other.name)[:, :3, 3] if other.movable else other.world_from_body.position[None]
+        )
+        reach = half + math.hypot(*other.shape.extents) / 2 + _GAP
+        if other.movable:
+            borne |= np.linalg.norm(theirs - pose[:, :3, 3], axis=1) < reach
+            continue
+        across = np.linalg.norm(theirs[:, :2] - pose[:, :2, 3], axis=1)
+        is_large = other.shape.kind not in SOLID or not other.shape.size  # a plane has no end
+        borne |= ((across < reach) | is_large) & (bottom < top_of(other) + _GAP)
+    return borne
+
+
+def top_of(body: Body) -> float:
+    """Height of a standing body, metres, or more: a model may have its origin at its bottom."""
+    share = 0.5 if body.shape.kind in SOLID else 1.0
+    return float(body.world_from_body.position[2]) + share * body.shape.extents[2]

@@ -194,8 +194,8 @@ def starts_at_rest(episode: CheckedEpisode) -> Measurement | None:
 
 
 @physics_check(
-    measures="speed of the last wanted motion at 30 frames a second",
-    unit="rad/s",
+    measures="speed of the last wanted motion against the joints' accelerations, at 30 frames a second",
+    unit="s",
 )
 def ends_at_rest(episode: CheckedEpisode) -> Found:
     """The script of a success ends where its last motion does: catches frames cut off at the tail.
@@ -208,7 +208,8 @@ def ends_at_rest(episode: CheckedEpisode) -> Found:
     if POLICY_PHASE in c.phase:
         return NotMeasured(why="a policy may succeed in mid-motion")
     step = np.abs(c.action_joint_target[-1:] - c.action_joint_target[-2:-1]) * fps * (fps / 30) ** 2
-    return worst_entry(step, episode.info.robot.arm_joints, first=c.num_frames - 1)
+    robot = episode.info.robot
+    return worst_entry(step / np.array(robot.acceleration_limit), robot.arm_joints, first=c.num_frames - 1)
 
 
 @physics_check(

@@ -100,7 +100,7 @@ def _unborne(hand: _Hand, rows: NDArray[np.bool_], what: str) -> Measurement:
 
 
 @physics_check(
-    measures="torque of the last motor against that of the wrench about its axis, root mean square difference of it",
+    measures="torque of the wrist's motor against that of the wrench about its axis, root mean square difference of it",
 )
 def wrench_turns_the_wrist(episode: CheckedEpisode) -> Found:
     """The last motor of the arm gives what the wrench asks for about its axis, in every frame, contacts included:
@@ -108,7 +108,9 @@ def wrench_turns_the_wrist(episode: CheckedEpisode) -> Found:
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
         return hand
-    needed, effort = _of_joint(episode, hand, -1)
+    # Where the hand is on the last joint itself, that motor's own torque is no load of the joint.
+    joints = [name for name in episode.info.robot.arm_joints if name != _mount(episode)]
+    needed, effort = _of_joint(episode, hand, joints[-1])
     if len(needed) < MIN_FRAMES or max(np.abs(needed).max(), np.abs(effort).max()) < _LEAST_TORQUE:
         return NotMeasured(why="the last motor has nothing to turn")
     size = max(float((effort**2).mean()), _LEAST_TORQUE**2)
@@ -127,16 +129,15 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
         return NotMeasured(why="what is carried is held by a constraint")
     if episode.num_arm < 2 or episode.num_frames < MIN_FRAMES + 2 * _MOST_LAG:
         return NotMeasured(why="there are too few joints or frames")
-    needed, effort = _of_joint(episode, hand, -2)
+    needed, effort = _of_joint(episode, hand, episode.info.robot.arm_joints[-2])
     lags = range(-_MOST_LAG, _MOST_LAG + 1)
     core = slice(_MOST_LAG, -_MOST_LAG)
     off = [float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags]
     return Measurement(value=abs(lags[int(np.argmin(off))]), detail=f"{lags[int(np.argmin(off))]:+d} frames")
 
 
-def _of_joint(episode: CheckedEpisode, hand: _Hand, number: int) -> tuple[Array, Array]:
+def _of_joint(episode: CheckedEpisode, hand: _Hand, name: str) -> tuple[Array, Array]:
     """(T - 4,) N m each: what a joint's motor needs to give by the wrench and the links above it, and what it gave."""
-    name = episode.info.robot.arm_joints[number]
     joint = next(joint for joint in episode.urdf.joints if joint.name == name)
     pose = episode.world_from_link(joint.child)
     below = hand.dynamics.below(_mount(episode))
@@ -145,4 +146,4 @@ def _of_joint(episode: CheckedEpisode, hand: _Hand, number: int) -> tuple[Array,
         if not any(load is other for other in below):
             total = total + np.cross(load.point - pose[:, :3, 3], load.force)
     needed = ((pose[:, :3, :3] @ np.array(joint.axis)) * total).sum(axis=1)
-    return needed[2:-2], episode.columns.joint_effort[2:-2, episode.num_arm + number]
+    return needed[2:-2], episode.columns.joint_effort[2:-2, episode.info.robot.arm_joints.index(name)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -51,6 +52,28 @@ def late(rows: Rows) -> Rows:
     return np.concatenate([np.repeat(rows[:1], 3, axis=0), rows[:-3]])
 
 
+def interpolated(rows: Rows) -> Rows:
+    """Every second frame, and the gripper as it was."""
+    out = rows.copy()
+    out[1:-1:2, :7] = (rows[:-2:2, :7][: len(rows[1:-1:2])] + rows[2::2, :7][: len(rows[1:-1:2])]) / 2
+    return out
+
+
+def repeats(rows: Rows) -> Rows:
+    """Every fifth frame is the one before."""
+    out = rows.copy()
+    out[5::5] = rows[4:-1:5]
+    return out
+
+
+def late_when_opening(rows: Rows) -> Rows:
+    """The gripper alone, by eight frames."""
+    out = rows.copy()
+    for frame in np.flatnonzero(np.diff(rows[:, 7]) > 0.01) + 1:
+        out[frame : frame + 8, 7] = rows[frame - 1, 7]
+    return out
+
+
 def slower(data: dict[str, Any]) -> None:
     data["fps"] = 15
 
@@ -63,6 +86,8 @@ FAULTS: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
     "degrees": (STATE, np.degrees, "joint_limits"),
     "a dead encoder": (STATE, lambda rows: rows * (np.arange(rows.shape[1]) != 2), "elements_alive"),
     "velocities of another joint": (VELOCITY, exchanged, "velocity_matches_position"),
+    "states by interpolation": (STATE, interpolated, "interpolated_frames"),
+    "a gripper that opens before it is told": (ACTION, late_when_opening, "gripper_waits_for_action"),
     "velocities in degrees": (VELOCITY, np.degrees, "velocity_matches_position"),
 }
 
@@ -134,6 +159,26 @@ def test_a_state_that_is_its_own_action_is_found(strange: Path, tmp_path: Path) 
         place = table.schema.get_field_index(ACTION)
         pq.write_table(table.set_column(place, table.schema.field(ACTION), table.column(STATE)), file)
     assert level(spoilt, "state_follows_action") == "warn"
+
+
+def test_an_action_that_is_the_next_observation_is_found(strange: Path, tmp_path: Path) -> None:
+    spoilt = copy(strange, tmp_path / "ds")
+    states: list[Rows] = []
+    edit_column(spoilt, STATE, lambda rows: states.append(rows.copy()) or rows * (1 + 1e-7))
+    edit_column(spoilt, ACTION, lambda rows: np.concatenate([states[0][1:], states[0][-1:]]))
+    assert level(strange, "action_is_no_observation") == "pass"
+    assert level(spoilt, "action_is_no_observation") == "warn"
+
+
+def test_frames_that_repeat_others_are_found(strange: Path, tmp_path: Path) -> None:
+    """As where a gap was filled with what came before."""
+    spoilt = copy(strange, tmp_path / "ds")
+    described = json.loads((spoilt / "meta/info.json").read_text())["features"]
+    for name, feature in described.items():
+        if name == ACTION or (name.startswith("observation.") and feature["dtype"] == "float32"):
+            edit_column(spoilt, name, repeats)
+    assert level(strange, "repeated_frames") == "pass"
+    assert level(spoilt, "repeated_frames") == "warn"
 
 
 def make_by_lerobot(run: Path, root: Path, *, frozen: range = range(0)) -> Path:

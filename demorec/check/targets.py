@@ -1,0 +1,174 @@
+"""Do actions and states of any robot belong together, where actions are targets of the state's elements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from demorec.check.base import ACTIONS, GRIPPER, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.evidence import Motion
+from demorec.check.motion import FEWEST, Moving, correlations
+from demorec.check.rows import finest_lag
+from demorec.core.geometry import Array
+
+_REACH_S = 1.0
+"""How far apart in time an action and the state that follows it are looked for, seconds."""
+_LATEST_S = 0.35
+"""How far behind its action a state may be, seconds: hobby servos under teleoperation need 0.1 to 0.2."""
+_HELD_S = 0.3
+"""How long an action has not changed before its joint should be there, seconds."""
+_ALIKE = 3.0
+"""Times the movement of the state that an action of its unit may move: teleoperation is scaled to half or double."""
+_COPIED = 1e-6
+"""Share of the state's range within which an action is a state."""
+_JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
+"""Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
+_NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
+
+target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
+"""Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
+
+
+@target_check(
+    measures="frames by which the state is too early for its action, or too late",
+    warn=0.75,
+    fail=1.5,
+    group="alignment",
+)
+def state_follows_action(subject: Moving) -> Found:
+    """The state follows the action by about a frame or more, and by less than a third of a second: catches actions that
+    were recorded late or early, or that are the state itself, from which a policy learns to stand still."""
+    if not (targets := subject.motions.targets):
+        return NotMeasured(why=_NO_TARGETS)
+    reach = max(2, round(_REACH_S * subject.motions.all[0].fps))
+    lags = range(-reach, reach + 1)
+    long = [(state, action) for state, action in targets if len(state) > 3 * reach]
+    if not long:
+        return NotMeasured(why="the episodes are too short to tell which of state and action is first")
+    squares = np.zeros((len(lags), long[0][0].shape[1]))
+    for state, action in long:
+        core = slice(reach, len(state) - reach)
+        # The variance: a zero that is off, and weight, keep state and action apart whatever the lag.
+        squares += [len(state) * (state[core] - np.roll(action, lag, axis=0)[core]).var(axis=0) for lag in lags]
+    off = np.sqrt(squares)
+    told = np.flatnonzero(off.min(axis=0) < 0.8 * np.minimum(off[0], off[-1]))
+    if not len(told):
+        return NotMeasured(why="state and action move too little to tell which of them is first")
+    # The middle one: a gripper is slower than the arm, and stops at what it holds.
+    lag = float(np.median([finest_lag(lags, off[:, element].tolist()) for element in told]))
+    late = lag - _LATEST_S * subject.motions.all[0].fps
+    return Measurement(value=max(1 - lag, late, 0.0), detail=f"the state follows by {lag:+.2f} frames")
+
+
+@target_check(
+    measures="elements of the state that follow the action of another one",
+    group="alignment",
+)
+def actions_in_order(subject: Moving) -> Found:
+    """Every element of the state follows its own action: catches joints exchanged in one of the two."""
+    if not (targets := subject.motions.targets):
+        return NotMeasured(why=_NO_TARGETS)
+    table = correlations(targets)
+    count = len(table)
+    names = [name for name, moves in zip(subject.motions.all[0].names, subject.motions.moving, strict=True) if moves]
+    best = table.argmax(axis=1)
+    # Two joints of one motion may go alike; an exchange shows where an element hardly follows its own action at all.
+    wrong = [i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3]
+    told = [f"{names[i]} follows that of {names[best[i]]}" for i in wrong]
+    return Measurement(value=len(wrong), detail="; ".join(told[:3]))
+
+
+@target_check(
+    group="physics",
+    measures="distance at which a joint always stays from its action",
+    unit="rad, m",
+    warn=0.1,
+    fail=0.3,
+)
+def state_reaches_action(subject: Moving) -> Found:
+    """A joint that is held comes to where it was sent, at least at some time: catches a zero that is off.
+
+    Weight and friction keep an arm off by a few hundredths of a rad, and what a gripper holds keeps its fingers apart;
+    only a false zero does so always. Velocities, increments and shares of a range are no places to be at.
+    """
+    if not (targets := subject.motions.targets):
+        return NotMeasured(why=_NO_TARGETS)
+    spread = float(np.median([np.nanmedian(action.std(axis=0)) for _, action in targets]))
+    if not 1 / _ALIKE < spread < _ALIKE:
+        return NotMeasured(why=f"actions move {spread:.3g} times as far as the state, so they are in another unit")
+    offsets: dict[str, list[Array]] = {}
+    for motion in subject.motions.all:
+        if motion.action is None:
+            continue
+        still = max(2, round(_HELD_S * motion.fps))
+        known = np.flatnonzero(np.isfinite(motion.lower) & np.isfinite(motion.action).all(axis=0))
+        for element in known.tolist():
+            action = motion.action[:, element]
+            held = [t for t in range(still, len(action)) if np.ptp(action[t - still : t + 1]) < 0.01]
+            offsets.setdefault(motion.names[element], []).append(np.abs(motion.state[held, element] - action[held]))
+    least = {name: float(np.quantile(np.concatenate(of), 0.1)) for name, of in offsets.items() if sum(map(len, of))}
+    if not least:
+        return NotMeasured(why="no joint is known whose action stays where it is for a while")
+    name = max(least, key=lambda key: least[key])
+    return Measurement(value=least[name], detail=name)
+
+
+@target_check(
+    group="alignment",
+    measures="share of moving frames whose action is an observed state, number by number",
+    warn=0.5,
+    fail=float("inf"),
+)
+def action_is_no_observation(subject: Moving) -> Found:
+    """Actions are what was sent, not the states that came of it: what is copied from the next observation lacks what
+    the robot was told beyond what it did. Of a gripper the two may be the same."""
+    if not subject.motions.targets:
+        return NotMeasured(why=_NO_TARGETS)
+    same, count = 0, 0
+    for motion in subject.motions.all:
+        if motion.action is None or len(motion.state) < FEWEST:
+            continue
+        arm = [i for i in range(len(motion.names)) if i != motion.gripper and np.isfinite(motion.action[:, i]).all()]
+        state, action = motion.state[:, arm], motion.action[:, arm]
+        near = _COPIED * max(float(np.ptp(state, axis=0).max(initial=0.0)), 1e-9)
+        moves = np.abs(np.diff(state, axis=0)).max(axis=1, initial=0.0) > 10 * near
+        copied = np.abs(state[1:] - action[:-1]).max(axis=1, initial=0.0) < near
+        same, count = same + int((copied & moves).sum()), count + int(moves.sum())
+    return Measurement(value=same / count, detail=f"of {count} frames") if count else NotMeasured(why="nothing moves")
+
+
+@check(
+    group="alignment",
+    on=("external", "dataset"),  # of simulated recordings `gripper_lag` knows when the motor may begin
+    measures="frames by which a gripper moves before its command jumps",
+    warn=1,
+    fail=3,
+    needs=GRIPPER,
+)
+def gripper_waits_for_action(subject: Moving) -> Iterator[Found]:
+    """A gripper opens and closes after it was told to: catches actions that are late in one of the two directions."""
+    for motion in subject.motions.all:
+        place = motion.gripper
+        if place is None or motion.action is None or not np.isfinite(motion.action[:, place]).all():
+            yield Lacking(need=GRIPPER)
+            return
+        early = _early(motion, place)
+        yield NotMeasured(why="the gripper's command never jumps after a pause") if early is None else early
+
+
+def _early(motion: Motion, place: int) -> Measurement | None:
+    """By how much the opening is ahead of the worst jump of its command."""
+    assert motion.action is not None
+    command, opening = motion.action[:, place], motion.state[:, place]
+    reach, before = float(np.ptp(command)), round(_HELD_S * 2 * motion.fps)
+    found = []
+    for frame in np.flatnonzero(np.abs(np.diff(command)) > _JUMP * max(reach, 1e-9)) + 1:
+        if frame < before or np.ptp(command[frame - before : frame]) > _STILL * reach:
+            continue
+        direction = np.sign(command[frame] - command[frame - 1])
+        moved = direction * (opening[frame - before : frame + 1] - opening[frame - before]) > _BEGUN * np.ptp(opening)
+        ahead = int(moved[::-1].argmin()) if moved[-1] else 0  # frames in a row up to the command
+        found.append(Measurement(value=ahead, frame=int(frame), detail=motion.where))
+    return max(found, key=lambda one: one.value, default=None)
