@@ -17,6 +17,12 @@ from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
 from demorec.episode.features import STATE
 
+_REACH_S = 0.7
+"""How far apart in time motions of images and state are compared, seconds."""
+_SHOWN = 0.35
+"""The least usual correlation from which anything is told."""
+_FEWEST_EPISODES = 3
+
 
 @dataset_check(
     measures="pictures that are of one colour, or unlike both of their neighbours",
@@ -74,6 +80,58 @@ def dataset_frozen(dataset: Dataset) -> Iterator[Found]:
             yield NotMeasured(why=f"{key} hardly sees the robot move")
         else:
             yield from found
+
+
+@dataset_check(
+    measures="by how much less than usual an episode's images move when its state does, as a correlation",
+    warn=0.35,
+    fail=0.45,
+    needs_pictures=True,
+)
+def images_follow_state(dataset: Dataset) -> Iterator[Found]:
+    """Images move when the robot does: catches those of another episode, or that are late from somewhere on.
+
+    How much an image changes is correlated with the speed of the state, over an episode and each of its halves. What
+    counts is how far that is below the camera's usual correlation, and below that at another lag, both added.
+    """
+    if STATE not in dataset.info.features or len(dataset.rows) < _FEWEST_EPISODES:
+        return
+    states = [rows[STATE].astype(np.float64) for rows in dataset.rows]
+    scale = np.concatenate(states).std(axis=0) + 1e-3
+    reach = max(2, round(_REACH_S * dataset.info.fps))
+    for key in dataset.colour_keys:
+        parts: list[tuple[int, str, Array]] = []
+        for number, (state, pictures) in enumerate(zip(states, dataset.pictures(key), strict=True)):
+            steps = np.abs(np.diff(pictures.cells.astype(np.float32), axis=0)).mean(axis=(1, 2, 3), dtype=np.float64)
+            speed = np.linalg.norm(np.diff(state / scale, axis=0), axis=1)
+            half = len(speed) // 2
+            for words, part in (("", slice(None)), (", first half", slice(half)), (", second half", slice(half, None))):
+                if len(speed[part]) >= 4 * reach:
+                    parts.append((number, words, _correlations(steps[part], speed[part], reach)))
+        whole = [table for _, words, table in parts if not words]
+        if len(whole) < _FEWEST_EPISODES or (usual := float(np.median([_near(table) for table in whole]))) < _SHOWN:
+            yield NotMeasured(why=f"{key} hardly shows when the robot moves")
+            continue
+        for number, words, table in parts:
+            off = max(usual - _near(table), 0.0) + float(table.max()) - _near(table)
+            yield Measurement(value=off, detail=f"{key}, episode {number}{words}")
+
+
+def _correlations(steps: Array, speed: Array, reach: int) -> Array:
+    """(2 reach + 1,) of the roots of two courses (T,), smoothed over three frames, with `steps` so much later."""
+    a, b = (np.convolve(np.sqrt(values), np.ones(3) / 3, mode="same") for values in (steps, speed))
+    b = b[reach : len(b) - reach] - b[reach : len(b) - reach].mean()
+    found = np.zeros(2 * reach + 1)
+    for lag in range(2 * reach + 1):
+        c = a[lag : lag + len(b)] - a[lag : lag + len(b)].mean()
+        found[lag] = (c * b).sum() / max(float(np.sqrt((c * c).sum() * (b * b).sum())), 1e-9)
+    return found
+
+
+def _near(table: Array) -> float:
+    """The best correlation within a frame of no lag."""
+    middle = len(table) // 2
+    return float(table[middle - 1 : middle + 2].max())
 
 
 @dataset_check(

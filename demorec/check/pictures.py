@@ -29,8 +29,8 @@ MIN_MOTION = 2.5
 STALE_SHARE, STALE_EXCESS = 0.3, 2.5
 """A picture is stale that shows less than this share of the motion, and is more unlike the drawn one than the usual
 picture by more than this, of 255: a predicted picture may leave a small motion to the next keyframe."""
-_PREDICTED_WEIGHT = 0.5
-"""Of the difference of a predicted picture of AV1, which at low qualities leaves whole motions to the next keyframe."""
+_PREDICTED_WEIGHT = 0.25
+"""Of the difference of a predicted picture of AV1, which leaves whole motions to the next keyframe (15 levels seen)."""
 
 
 @picture_check(

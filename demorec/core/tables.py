@@ -125,7 +125,7 @@ CHECKS: Registry[Check] = Registry(
         ("dataset_schema", "dataset_schema", "dataset_description"),
         ("dataset_statistics", "dataset_statistics", "dataset_episode_statistics"),
         ("dataset_pictures", "dataset_pictures", "dataset_picture_statistics", "dataset_pictures_as_drawn"),
-        ("dataset_pictures", "dataset_picture_lag", "dataset_frozen"),
+        ("dataset_pictures", "dataset_picture_lag", "dataset_frozen", "images_follow_state"),
         ("targets", "state_follows_action", "actions_in_order", "state_reaches_action"),
         ("targets", "action_is_no_observation", "gripper_waits_for_action"),
         ("run", "duplicates", "coverage"),
