@@ -72,6 +72,7 @@ def _values(scene: Scene) -> dict[str, float]:
         if goal.onto:
             place = scene.body(goal.onto).world_from_body.position
             values[f"{goal_label}'s support x"], values[f"{goal_label}'s support y"] = float(place[0]), float(place[1])
+            goal_label += " on it"
         position = goal.onto_from_goal.position
         values[f"{goal_label} x"], values[f"{goal_label} y"] = float(position[0]), float(position[1])
     return values

@@ -96,8 +96,8 @@ class GenerateConfig:
     ranges: Ranges = field(default_factory=Ranges)
     """Single ranges that override those of --variation (auto: as --variation has them)."""
     objects: tuple[str, ...] = ()
-    """Shelves that things are drawn from: names from `demorec list objects`, or my_package.my_module:MY_SHELF
-    (auto: those of the task, if it draws from shelves)."""
+    """Shelves that things are drawn from: names from `demorec list objects`, my_package.my_module:MY_SHELF, or a folder
+    of .obj and .stl files in metres, with a slash: ./my_meshes (auto: those of the task, if it draws from shelves)."""
     object_split: Literal["all", "train", "eval"] = "all"
     """train leaves out one shape in five of each kind; eval has only those."""
     interject: bool = False
@@ -147,7 +147,8 @@ class GenerateConfig:
                 raise ConfigError(f"--cameras none stands alone, found {' '.join(self.cameras)}.")
             CAMERAS.check_name(name, allowed)
         for name in self.objects:
-            OBJECTS.check_name(name, allowed)
+            if "/" not in name:  # a folder runs no code
+                OBJECTS.check_name(name, allowed)
 
     def validate(self) -> None:
         """Check all values that can be judged without loading anything heavy; the config is the user's own words.

@@ -32,7 +32,8 @@ class SolidMesh:
     Attributes:
         points: (V, 3) metres.
         faces: (F, 3) rows of `points`, counter-clockwise from outside.
-        parts: Rows of `points`; the hull of each is one convex part of the solid as physics has it.
+        parts: Rows of `points`; the hull of each is one convex part of the solid as physics has it. Of a mesh that has
+            just been read from a file, none: `demorec.sim.parts` finds them.
     """
 
     points: Array

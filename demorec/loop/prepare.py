@@ -14,11 +14,12 @@ from demorec.core.geometry import Pose
 from demorec.core.plain import digest, to_plain
 from demorec.core.registry import modules_of
 from demorec.core.seeding import Purpose, generator
-from demorec.core.tables import CAMERAS, OBJECTS, RENDERERS, TASKS, camera_name, load_robot
+from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.episode.camera_error import error_values
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
+from demorec.objects.folder import load_shelf
 from demorec.render import Renderer
 from demorec.render.painter import WarmRenderer
 from demorec.robots.assets import allow_models, model_name
@@ -178,7 +179,7 @@ def _sampler(plan: EpisodePlan, ranges: Ranges, task: Task) -> Sampler:
         ranges=ranges,
         split=config.split,
         fixed=config.fixed,
-        shelves=[OBJECTS.load(name, config.modules) for name in config.objects or task.shelves],
+        shelves=[load_shelf(name, config.modules) for name in config.objects or task.shelves],
         object_split=config.object_split,
     )
 

@@ -7,12 +7,13 @@ import math
 import numpy as np
 
 from demorec.episode.mesh import SolidMesh
-from demorec.objects.shelf import Kind, Shelf
+from demorec.objects.shelf import Kind, Shelf, by_seed
 from demorec.objects.solids import arc, board, joined, lathe, rod, rounded
 
 Rng = np.random.Generator
 
 
+@by_seed
 def _mug(rng: Rng) -> SolidMesh:
     radius, height, wall = rng.uniform(0.021, 0.028), rng.uniform(0.045, 0.065), rng.uniform(0.003, 0.004)
     taper = rng.uniform(0.85, 1.0)
@@ -29,12 +30,14 @@ def _mug(rng: Rng) -> SolidMesh:
     return joined(lathe(outside, cavity=inside), handle)
 
 
+@by_seed
 def _glass(rng: Rng) -> SolidMesh:
     radius, height, wall = rng.uniform(0.02, 0.028), rng.uniform(0.05, 0.08), 0.0025
     foot = radius * rng.uniform(0.72, 0.9)
     return lathe([(foot, 0.0), (radius, height)], cavity=[(radius - wall, height), (foot - wall, 0.006)])
 
 
+@by_seed
 def _bowl(rng: Rng) -> SolidMesh:
     radius, height, wall = rng.uniform(0.026, 0.031), rng.uniform(0.03, 0.04), 0.003
     foot = radius * rng.uniform(0.5, 0.65)
@@ -43,6 +46,7 @@ def _bowl(rng: Rng) -> SolidMesh:
     return lathe(outside, cavity=[(r - wall, max(z, wall)) for r, z in reversed(outside)])
 
 
+@by_seed
 def _bottle(rng: Rng) -> SolidMesh:
     radius, height = rng.uniform(0.018, 0.024), rng.uniform(0.07, 0.085)
     neck, shoulder = rng.uniform(0.01, 0.012), height * rng.uniform(0.42, 0.5)
@@ -58,23 +62,27 @@ def _bottle(rng: Rng) -> SolidMesh:
     return lathe(profile)
 
 
+@by_seed
 def _can(rng: Rng) -> SolidMesh:
     radius, height = rng.uniform(0.02, 0.03), rng.uniform(0.035, 0.08)
     edge = 0.0025
     return lathe([(radius - edge, 0.0), (radius, edge), (radius, height - edge), (radius - edge, height)])
 
 
+@by_seed
 def _jar(rng: Rng) -> SolidMesh:
     radius, height = rng.uniform(0.022, 0.029), rng.uniform(0.04, 0.06)
     lid = radius * rng.uniform(0.8, 0.95)
     return lathe([(0.9 * radius, 0.0), (radius, 0.004), (radius, height), (lid, height + 0.004), (lid, height + 0.016)])
 
 
+@by_seed
 def _box(rng: Rng) -> SolidMesh:
     x, y, z = rng.uniform(0.04, 0.08), rng.uniform(0.022, 0.045), rng.uniform(0.03, 0.075)
     return board([(-x / 2, -y / 2), (x / 2, -y / 2), (x / 2, y / 2), (-x / 2, y / 2)], [(0, 1, 2, 3)], z)
 
 
+@by_seed
 def _apple(rng: Rng) -> SolidMesh:
     radius, squash = rng.uniform(0.024, 0.03), rng.uniform(0.85, 0.95)
     angles = [math.radians(a) for a in (-63, -45, -25, -5, 15, 35, 55, 72)]
@@ -82,12 +90,14 @@ def _apple(rng: Rng) -> SolidMesh:
     return lathe([*profile, (0.0, 0.8 * squash * radius)])
 
 
+@by_seed
 def _pear(rng: Rng) -> SolidMesh:
     radius, height = rng.uniform(0.022, 0.028), rng.uniform(0.06, 0.075)
     rows = ((0.65, 0.0), (0.9, 0.08), (1.0, 0.25), (0.95, 0.42), (0.72, 0.6), (0.52, 0.76), (0.42, 0.9), (0.22, 1.0))
     return lathe([(radius * r, height * z) for r, z in rows])
 
 
+@by_seed
 def _lemon(rng: Rng) -> SolidMesh:
     radius, length = rng.uniform(0.018, 0.024), rng.uniform(0.05, 0.065)
     steps = (0.0, 0.1, 0.2, 0.33, 0.67, 0.8, 0.9, 1.0)
@@ -95,6 +105,7 @@ def _lemon(rng: Rng) -> SolidMesh:
     return rod(path, [radius * max(0.2, math.sin(math.pi * step)) ** 0.7 for step in steps], (0.0, 0.0, 1.0))
 
 
+@by_seed
 def _banana(rng: Rng) -> SolidMesh:
     radius, bend = rng.uniform(0.011, 0.014), rng.uniform(0.055, 0.07)
     spine = rounded(arc((0.0, -bend), bend, math.radians(145), math.radians(35), 9))
@@ -106,17 +117,17 @@ def _banana(rng: Rng) -> SolidMesh:
 _SHAPES = 30
 HOUSEHOLD = Shelf(
     kinds=(
-        Kind(noun="mug", material="ceramic", make=_mug, count=_SHAPES),
-        Kind(noun="glass", material="plastic", make=_glass, count=_SHAPES, yaw_symmetry=0),
-        Kind(noun="bowl", material="ceramic", make=_bowl, count=_SHAPES, yaw_symmetry=0),
-        Kind(noun="bottle", material="plastic", make=_bottle, count=_SHAPES, yaw_symmetry=0),
-        Kind(noun="can", material="metal", make=_can, count=_SHAPES, yaw_symmetry=0),
-        Kind(noun="jar", material="plastic", make=_jar, count=_SHAPES, yaw_symmetry=0),
-        Kind(noun="box", material="carton", make=_box, count=_SHAPES, yaw_symmetry=2),
-        Kind(noun="apple", material="fruit", make=_apple, count=_SHAPES, colors=("red", "yellow"), yaw_symmetry=0),
-        Kind(noun="pear", material="fruit", make=_pear, count=_SHAPES, colors=("yellow", "orange"), yaw_symmetry=0),
-        Kind(noun="lemon", material="fruit", make=_lemon, count=_SHAPES, colors=("yellow",), yaw_symmetry=2),
-        Kind(noun="banana", material="fruit", make=_banana, count=_SHAPES, colors=("yellow",)),
+        Kind(noun="mug", material="ceramic", shape=_mug, count=_SHAPES),
+        Kind(noun="glass", material="glass", shape=_glass, count=_SHAPES, yaw_symmetry=0),
+        Kind(noun="bowl", material="ceramic", shape=_bowl, count=_SHAPES, yaw_symmetry=0),
+        Kind(noun="bottle", material="plastic", shape=_bottle, count=_SHAPES, yaw_symmetry=0),
+        Kind(noun="can", material="metal", shape=_can, count=_SHAPES, yaw_symmetry=0),
+        Kind(noun="jar", material="plastic", shape=_jar, count=_SHAPES, yaw_symmetry=0),
+        Kind(noun="box", material="carton", shape=_box, count=_SHAPES, yaw_symmetry=2),
+        Kind(noun="apple", material="fruit", shape=_apple, count=_SHAPES, colors=("red", "yellow"), yaw_symmetry=0),
+        Kind(noun="pear", material="fruit", shape=_pear, count=_SHAPES, colors=("yellow", "orange"), yaw_symmetry=0),
+        Kind(noun="lemon", material="fruit", shape=_lemon, count=_SHAPES, colors=("yellow",), yaw_symmetry=2),
+        Kind(noun="banana", material="fruit", shape=_banana, count=_SHAPES, colors=("yellow",)),
     )
 )
 """330 shapes."""

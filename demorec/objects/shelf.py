@@ -31,12 +31,19 @@ class Material:
 
 MATERIALS: Mapping[str, Material] = {
     "ceramic": Material(density=(1500.0, 2200.0), friction=(0.5, 0.9)),
+    "glass": Material(density=(2200.0, 2600.0), friction=(0.5, 0.9)),
     "metal": Material(density=(500.0, 1100.0), friction=(0.5, 0.8)),
     "plastic": Material(density=(300.0, 900.0), friction=(0.5, 0.9)),
     "carton": Material(density=(200.0, 600.0), friction=(0.5, 0.9)),
     "fruit": Material(density=(700.0, 1000.0), friction=(0.6, 1.0)),
     "wood": Material(density=(400.0, 800.0), friction=(0.5, 1.0)),
 }
+
+
+def by_seed(make: Callable[[np.random.Generator], SolidMesh]) -> Callable[[int], SolidMesh]:
+    """Shapes by number from a function that draws one; its name seeds them."""
+    name = zlib.crc32(make.__name__.strip("_").encode())
+    return lambda number: make(np.random.default_rng((name, number)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +53,7 @@ class Kind:
     Attributes:
         noun: Its word in instructions.
         material: Row of `MATERIALS`.
-        make: Draws one shape, standing or lying as it is to lie on a table.
+        shape: Number 0 .. count - 1 -> that shape, about as it is to lie on a table; always the same.
         count: How many different shapes there are.
         colors: Words of the colours that it may have; empty for all.
         yaw_symmetry: As `Body.yaw_symmetry`.
@@ -54,14 +61,10 @@ class Kind:
 
     noun: str
     material: str
-    make: Callable[[np.random.Generator], SolidMesh]
+    shape: Callable[[int], SolidMesh]
     count: int
     colors: tuple[str, ...] = ()
     yaw_symmetry: int = 1
-
-    def shape(self, number: int) -> SolidMesh:
-        """Shape number 0 .. count - 1: always the same."""
-        return self.make(np.random.default_rng((zlib.crc32(self.noun.encode()), number)))
 
     def numbers(self, split: Split) -> Sequence[int]:
         """The shapes of a split; with fewer than `HELD_OUT` none is held out."""

@@ -13,8 +13,11 @@ from demorec.core.geometry import Pose
 from demorec.episode.mesh import decode_mesh, encode_mesh
 from demorec.episode.scene import Body, Goal, Role, Scene, Shape
 from demorec.objects.shelf import MATERIALS, Kind
+from demorec.robots.robot import RobotSpec
+from demorec.sim.parts import with_parts
 from demorec.sim.resting import ROLLING_FRICTION, at_rest
 from demorec.tasks.furniture import COLORS, mark, words_for
+from demorec.tasks.grasping import found_grasps
 from demorec.tasks.placing import Layout, TableTask
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
 from demorec.tasks.trays import TRAY_FLOOR, TRAYS, tray
@@ -48,6 +51,16 @@ class PickAnything(TableTask):
         "put the {thing} {place}",
         "find the {thing} and place it {place}",
     )
+
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        """Draw a layout."""
+
+        def can_grasp(shape: Shape) -> bool:
+            shape = replace(shape, scale=robot.task_scale * shape.scale)
+            return bool(found_grasps(shape, robot, np.array([0.0, 0.0, 1.0])))
+
+        sampler.can_grasp = can_grasp
+        return super().sample_scene(robot, sampler)
 
     def layout(self, sampler: Sampler) -> Layout:
         """Draw it."""
@@ -88,7 +101,10 @@ def radius_of(body: Body) -> float:
 
 
 def _things(sampler: Sampler, count: int) -> list[Body]:
-    """Up to so many things at the origin, each of another name or colour; fewer where the shelves have no more."""
+    """Up to so many things at the origin, each of another name or colour; fewer where the shelves have no more.
+
+    The first one can be grasped; SceneError when none can.
+    """
     kinds = [kind for shelf in sampler.shelves for kind in shelf.kinds if kind.numbers(sampler.object_split)]
     if not kinds:
         raise SceneError(f"The shelves have nothing for --object-split {sampler.object_split}.")
@@ -99,7 +115,10 @@ def _things(sampler: Sampler, count: int) -> list[Body]:
         color = sampler.choice([color for other, color in left if other.noun == kind.noun])
         left = [entry for entry in left if (entry[0].noun, entry[1]) != (kind.noun, color)]
         thing = make_object(sampler, kind, sampler.choice(kind.numbers(sampler.object_split)), color)
-        things[thing.name] = thing
+        if things or sampler.can_grasp(thing.shape):
+            things[thing.name] = thing
+    if not things:
+        raise SceneError("The gripper finds no grasp of any thing on the shelves: give others with --objects.")
     return list(things.values())
 
 
@@ -109,7 +128,7 @@ _COLORS = tuple(name for name in COLORS if name != "green")
 def make_object(sampler: Sampler, kind: Kind, number: int, color_name: str) -> Body:
     """A thing from a shelf as it rests at the world's origin, with drawn density and friction of its material."""
     material = MATERIALS[kind.material]
-    mesh, height = at_rest(encode_mesh(kind.shape(number)))
+    mesh, height = at_rest(encode_mesh(with_parts(kind.shape(number))))
     solid = decode_mesh(mesh)
     x, y, z = solid.extents.tolist()
     mass = sampler.uniform(*material.density) * solid.mass_properties()[0]

@@ -13,6 +13,7 @@ import numpy as np
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
+from demorec.episode.scene import Shape
 from demorec.episode.variation import PRESETS, Ranges
 from demorec.objects.shelf import Shelf, Split
 
@@ -73,6 +74,7 @@ class Sampler:
         fixed: Whether the task's exact layout is wanted, of those that have one.
         shelves: What things are drawn from, for tasks that draw from shelves.
         object_split: Which of their shapes: `demorec.objects.shelf.Split`.
+        can_grasp: Whether the robot's gripper finds a grasp of a mesh.
         is_free: Whether something may lie at a point (x, y), beside what a caller of `point` accepts.
     """
 
@@ -83,6 +85,7 @@ class Sampler:
     fixed: bool = False
     shelves: Sequence[Shelf] = ()
     object_split: Split = "all"
+    can_grasp: Callable[[Shape], bool] = lambda shape: True
     is_free: Callable[[tuple[float, float]], bool] = lambda point: True
     _used: int = field(default=0, init=False)
     _points: int = field(default=0, init=False)

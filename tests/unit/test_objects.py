@@ -5,18 +5,21 @@ from __future__ import annotations
 import base64
 import math
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from support.commands import exit_code
-from support.sim import episode
+from support.sim import episode, run
 
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.objects.antipodal import Hand, antipodal_grasps
+from demorec.objects.folder import load_shelf
 from demorec.objects.shelf import Kind
+from demorec.sim.parts import with_parts
 from demorec.sim.resting import at_rest
 
 PANDA_HAND = Hand(max_width=0.08, finger_depth=0.007, palm_clearance=0.035)
@@ -172,6 +175,58 @@ def test_tasks_with_things_of_their_own_refuse_shelves() -> None:
         episode(task="stack", object_split="train")
     with pytest.raises(ConfigError, match=r"Unknown shelf 'houshold'.*household"):
         episode(task="pick_anything", objects=("houshold",))
+
+
+def export(mesh: trimesh.Trimesh, path: Path) -> Path:
+    mesh.export(path)
+    return path
+
+
+def test_a_folder_of_meshes_is_a_shelf_and_a_ring_keeps_its_hole(tmp_path: Path) -> None:
+    ring = trimesh.creation.annulus(r_min=0.012, r_max=0.025, height=0.03)
+    export(ring, tmp_path / "red_ring_1.stl")
+    export(trimesh.creation.annulus(r_min=0.01, r_max=0.02, height=0.03), tmp_path / "ring_2.stl")
+    export(trimesh.creation.box(extents=(0.03, 0.05, 0.03)), tmp_path / "Soap Bar.obj")
+    (tmp_path / "notes.txt").write_text("no mesh")
+    shelf = load_shelf(f"{tmp_path}/")
+    assert {kind.noun: kind.count for kind in shelf.kinds} == {"soap_bar": 1, "ring": 2}
+    solid = with_parts(next(kind for kind in shelf.kinds if kind.noun == "ring").shape(0))
+    assert solid.mass_properties()[0] == pytest.approx(ring.volume, rel=1e-3)
+    parts = [trimesh.convex.convex_hull(solid.points[part]) for part in solid.parts]
+    assert len(parts) > 1
+    assert not any(part.contains(np.zeros((1, 3)))[0] for part in parts)
+    info = episode(task="pick_anything", objects=(f"{tmp_path}/",)).info
+    assert {body.name.split("_", 1)[1] for body in info.scene.movable} <= {"soap_bar", "ring"}
+    _, outcome = run(episode(task="pick_anything", objects=(f"{tmp_path}/",)))
+    assert outcome.success, outcome.failure_reason
+
+
+@pytest.mark.parametrize(
+    ("mesh", "wrong"),
+    [
+        (trimesh.creation.box(extents=(30.0, 50.0, 30.0)), "is it in millimetres"),
+        (trimesh.creation.box(extents=(0.09, 0.08, 0.08)), "a gripper takes 0.07"),
+        (trimesh.creation.icosphere(subdivisions=5, radius=0.03), "simplify it"),
+        (trimesh.Trimesh([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05]], [[0, 2, 1], [0, 1, 3]]), "is open"),
+    ],
+)
+def test_a_mesh_that_cannot_be_handled_is_refused_in_one_sentence(
+    tmp_path: Path, mesh: trimesh.Trimesh, wrong: str
+) -> None:
+    export(mesh, tmp_path / "thing.stl")
+    with pytest.raises(ConfigError, match=wrong) as error:
+        load_shelf(f"{tmp_path}/")
+    assert "thing.stl" in str(error.value)
+
+
+def test_a_folder_without_meshes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no \.obj or \.stl"):
+        load_shelf(f"{tmp_path}/")
+    with pytest.raises(ConfigError, match="was not found"):
+        load_shelf(f"{tmp_path}/missing/")
+    (tmp_path / "broken.stl").write_bytes(b"no mesh")
+    with pytest.raises(ConfigError, match="no triangles"):
+        load_shelf(f"{tmp_path}//")
 
 
 def test_list_shows_the_shelves(capsys: pytest.CaptureFixture[str]) -> None:
