@@ -59,8 +59,10 @@ def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
     for link in read_links(text, scale=scale):
         target = ET.SubElement(robot, "link", name=link.name)
         # Collision shapes are simpler to begin with; their pose may differ from the image's.
-        shapes = link.collisions if len(link.collisions) == len(link.visuals) else link.visuals
-        for visual, shape in zip(link.visuals, shapes, strict=True):
+        is_fitted = bool(link.visuals and link.collisions) and all(shape.kind in _KINDS for shape in link.collisions)
+        shapes = link.collisions if is_fitted or len(link.collisions) == len(link.visuals) else link.visuals
+        for index, shape in enumerate(shapes):
+            visual = link.visuals[min(index, len(link.visuals) - 1)]
             for primitive in _primitives(shape, folder):
                 _add_visual(target, primitive, shape.link_from_shape, visual.rgba or _WHITE)
     for joint in source.findall("joint"):

@@ -44,6 +44,7 @@ class ParallelGripper:
     """How far each joint after the first one moves for each unit of the first."""
     min_width: ClassVar[float] = 0.0
     """Opening, metres, when closed on nothing."""
+    rotor_inertia: ClassVar[float] = 0.0
 
     def joint_position(self, width: Array | float) -> Array:
         """Positions (..., n_joints), m, of the finger joints at openings (...), metres."""
@@ -100,6 +101,8 @@ class JawGripper:
         finger_depth: How far a finger reaches beyond the TCP, the jaw wherever it turns, metres.
         palm_clearance: From the TCP back to the palm, metres: what fits between the fingers above the grasp.
         play: Air between the fixed finger and an object before the jaw pushes it there, metres.
+        rotor_inertia: Of the motor, seen through its gears, kg m^2: a bare jaw is so light that the simulator's solver
+            gets neither its force nor its contacts right.
     """
 
     joints: tuple[str, ...]
@@ -109,6 +112,7 @@ class JawGripper:
     finger_depth: float
     palm_clearance: float
     play: float = 0.003
+    rotor_inertia: float = 0.0
 
     joint_kind: ClassVar[str] = "revolute"
     joint_speed: ClassVar[float] = 1.0

@@ -81,6 +81,10 @@ class Arm:
                 contactStiffness=stiffness,
                 contactDamping=FINGER_DAMPING,
             )
+        if rotor := self.spec.gripper.rotor_inertia:
+            jaw = self.finger_links[-1]
+            inertia = [axis + rotor for axis in self._client.getDynamicsInfo(self.body, jaw)[2]]
+            self._client.changeDynamics(self.body, jaw, localInertiaDiagonal=inertia)
         # PyBullet ignores the URDF's mimic joint; without a gear the fingers do not centre the object.
         leader, *followers = self._fingers
         for joint, ratio in zip(followers, self.spec.gripper.gear_ratios, strict=True):

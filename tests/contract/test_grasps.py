@@ -46,7 +46,9 @@ def with_cube(made: Episode, *, side: float, mass: float, friction: float) -> Ep
 )
 def test_fingers_stand_as_far_apart_as_the_cube_is_wide(robot: str, side: float, mass: float, friction: float) -> None:
     """Small, light, slippery cubes: with fingers of one corner each they rock, and the fingers go in by up to 13 mm."""
+    scale = ROBOTS.load(robot).task_scale
     made = episode(957, robot=robot, seed=2718, split="train")
+    side, mass = scale * side, scale * mass
     assert smallest_opening(with_cube(made, side=side, mass=mass, friction=friction)) > side - 2 * SINKING
 
 
