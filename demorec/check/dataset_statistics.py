@@ -39,8 +39,11 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
         return
     stats = read_statistics(dataset)
     for name in _numeric(dataset):
-        episodes = [_flat(rows[name]) for rows in dataset.rows]
-        true = statistics_of(np.concatenate(episodes))
+        episodes = [_vectors(dataset, name, rows[name]) for rows in dataset.rows]
+        true = {
+            **statistics_of(np.concatenate(episodes)),
+            "count": np.array([float(sum(len(rows[name]) for rows in dataset.rows))]),
+        }
         weights = [len(values) for values in episodes]
         own = [_quantile_ranges(values) for values in episodes]
         # (2, D) of each quantile: lowest and highest that it may be.
@@ -65,8 +68,9 @@ def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
     for number, (row, rows) in enumerate(zip(told, dataset.rows, strict=False)):
         for name in names:
             said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
-            values = _flat(rows[name])
-            yield _off(said, statistics_of(values), (_quantile_ranges(values),), detail=f"episode {number}, {name}")
+            values = _vectors(dataset, name, rows[name])
+            true = {**statistics_of(values), "count": np.array([float(len(rows[name]))])}
+            yield _off(said, true, (_quantile_ranges(values),), detail=f"episode {number}, {name}")
 
 
 def episode_column(dataset: Dataset, name: str) -> list[Any]:
@@ -126,8 +130,9 @@ def _numeric(dataset: Dataset) -> list[str]:
     return [name for name, feature in features.items() if feature.is_numeric and name not in _NUMBERING]
 
 
-def _flat(rows: Any) -> Array:
-    return np.asarray(rows, dtype=np.float64).reshape(len(rows), -1)
+def _vectors(dataset: Dataset, name: str, rows: Any) -> Array:
+    """(N, D) what LeRobot has statistics of: the rows, of arrays of several dimensions their last one."""
+    return np.asarray(rows, dtype=np.float64).reshape(-1, dataset.info.features[name].shape[-1])
 
 
 def _off(

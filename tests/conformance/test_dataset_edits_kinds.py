@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -11,11 +12,16 @@ import av
 import numpy as np
 import pytest
 from av.video.stream import VideoStream
+from support.check import checked
 from support.datasets import TOP, items, same, write_with_lerobot
+from support.training import DEPTH, write_by_lerobot
 
 from demorec.cli import main
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+pytestmark = [
+    pytest.mark.usefixtures("hf_datasets_cache"),
+    pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning"),
+]
 LENGTHS = [12 + number for number in range(6)]
 
 
@@ -57,7 +63,16 @@ def in_small_files(root: Path) -> Path:
     return root
 
 
-MADE: dict[str, Callable[[Path], Path]] = {"reordered": reordered, "small files": in_small_files}
+def of_all_types(root: Path) -> Path:
+    """A dataset with depth, arrays of two dimensions, texts and several files."""
+    return write_by_lerobot(root, LENGTHS, depth=True)
+
+
+MADE: dict[str, Callable[[Path], Path]] = {
+    "reordered": reordered,
+    "small files": in_small_files,
+    "all types": of_all_types,
+}
 
 
 @pytest.fixture(scope="module", params=MADE)
@@ -84,3 +99,28 @@ def test_in_another_order_and_in_parts(made: tuple[Path, Any], tmp_path: Path) -
     found = {len(episode): episode for episode in items(tmp_path / "d")}
     assert sorted(found) == [12, 13, 15, 16, 17]
     assert all(same(found[len(was)], was) for was in before if len(was) != 14)
+
+
+def test_statistics_of_arrays_are_those_of_their_last_dimension(tmp_path: Path) -> None:
+    """As LeRobot has them, whose own dataset is the model; with depth, whose mean is that of what LeRobot decodes."""
+    root = of_all_types(tmp_path / "d")
+    edit("trim", root, "--head", 1, "--out", tmp_path / "t")
+    shapes = [
+        {name: [np.shape(value) for value in entry.values()] for name, entry in statistics(path).items()}
+        for path in (root, tmp_path / "t")
+    ]
+    assert shapes[0] == shapes[1]
+    found, shown = statistics(tmp_path / "t"), [item for episode in items(tmp_path / "t") for item in episode]
+    grids = np.stack([item["observation.grid"] for item in shown]).reshape(-1, 3).astype(np.float64)
+    assert found["observation.grid"]["count"] == [len(shown)]
+    for quantity, value in {"mean": grids.mean(0), "max": grids.max(0), "q90": np.quantile(grids, 0.9, 0)}.items():
+        assert np.allclose(found["observation.grid"][quantity], value, rtol=1e-9), quantity
+    depth = np.stack([item[DEPTH] for item in shown]).astype(np.float64)
+    assert depth.mean() / 1000 == pytest.approx(np.ravel(found[DEPTH]["mean"])[0], rel=1e-5)  # LeRobot decodes to mm
+    results = {result.check: result.level for result in checked(tmp_path / "t", "dataset", pictures=False).results}
+    assert results["dataset_statistics"] == results["dataset_episode_statistics"] == "pass"
+
+
+def statistics(root: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((root / "meta/stats.json").read_text())
+    return found

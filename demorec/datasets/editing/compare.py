@@ -68,8 +68,8 @@ class EpisodeComparer:
     ) -> None:
         self._sources, self._readers, self._shared = sources, readers, shared
         self._stored = [
-            {name: StoredImages(source.root, source.info, name) for name in shared.cameras
-             if not source.info.features[name].is_video} for source in sources
+            {name: StoredImages(source.root, source.info, own) for name in shared.cameras
+             if not source.info.features[own := shared.own(side, name)].is_video} for side, source in enumerate(sources)
         ]  # fmt: skip
 
     def differences(self, a: int, b: int, images_equal: Mapping[str, bool]) -> Iterator[Difference]:
@@ -130,7 +130,9 @@ class EpisodeComparer:
 
     def _images(self, name: str, episodes: tuple[int, int], starts: tuple[int, int], count: int) -> Difference | None:
         """Between images, decoded; those of a cut episode are aligned by `starts`."""
-        is_depth = [source.info.features[name].is_depth for source in self._sources]
+        is_depth = [
+            source.info.features[self._shared.own(side, name)].is_depth for side, source in enumerate(self._sources)
+        ]
         if is_depth[0] != is_depth[1]:
             return None  # which the level of features says
         one, other = (self._decoded(side, name, episodes[side], starts[side]) for side in (0, 1))
@@ -159,11 +161,11 @@ class EpisodeComparer:
         )
 
     def _decoded(self, side: int, name: str, number: int, start: int) -> Iterator[NDArray[Any]]:
-        source = self._sources[side]
-        place, feature = source.places[number], source.info.features[name]
+        source, own = self._sources[side], self._shared.own(side, name)
+        place, feature = source.places[number], source.info.features[own]
         if not feature.is_video:
             return islice(self._stored[side][name].read(place), start, None)
-        video = EpisodeVideo(source.root, source.info, name, place)
+        video = EpisodeVideo(source.root, source.info, own, place)
         return video.codes(start) if feature.is_depth else video.images(start)
 
 

@@ -43,16 +43,22 @@ class Shared:
     Attributes:
         columns: Of the data table, less images; feature -> whether both have it in one type.
         cameras: Feature -> whether both store its images in one way, so that equal bytes are equal images.
+        names: Feature -> what the second one calls it, where that is something else.
     """
 
     columns: Mapping[str, bool]
     cameras: Mapping[str, bool]
+    names: Mapping[str, str]
+
+    def own(self, side: int, name: str) -> str:
+        """What the first (0) or second (1) dataset calls a feature."""
+        return self.names.get(name, name) if side else name
 
     @classmethod
-    def of(cls, a: Source, b: Source) -> Shared:
+    def of(cls, a: Source, b: Source, names: Mapping[str, str]) -> Shared:
         """Of two datasets."""
-        pairs = {name: (item, b.info.features[name]) for name, item in a.info.features.items()
-                 if name in b.info.features}  # fmt: skip
+        pairs = {name: (item, b.info.features[own]) for name, item in a.info.features.items()
+                 if (own := names.get(name, name)) in b.info.features}  # fmt: skip
         columns, cameras = {}, {}
         for name, (one, other) in pairs.items():
             if one.is_camera and other.is_camera:
@@ -60,7 +66,7 @@ class Shared:
                     cameras[name] = one.dtype == other.dtype
             elif one.shape == other.shape and (one.dtype == other.dtype or (one.is_numeric and other.is_numeric)):
                 columns[name] = one.dtype == other.dtype
-        return cls(columns=columns, cameras=cameras)
+        return cls(columns=columns, cameras=cameras, names=names)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,15 +101,19 @@ class ContentReader:
         shared: What of it is compared.
         order: Numbers of the episodes that will be asked for.
         aside: File for rows that are not asked for in their order.
+        side: Whether it is the first (0) or the second (1) dataset.
     """
 
-    def __init__(self, source: Source, shared: Shared, order: Iterable[int], aside: Path) -> None:
+    def __init__(self, source: Source, shared: Shared, order: Iterable[int], aside: Path, *, side: int) -> None:
         self._source, self._shared = source, shared
+        self._own = {name: shared.own(side, name) for name in (*shared.columns, *shared.cameras)}
         features = source.info.features
-        self._stored = [name for name in shared.cameras if not features[name].is_video]
-        self._rows = Rows(source, [*shared.columns, *self._stored], list(order), aside)
+        self._stored = [name for name in shared.cameras if not features[self._own[name]].is_video]
+        self._rows = Rows(source, [self._own[name] for name in (*shared.columns, *self._stored)], list(order), aside)
         self._cutters = {
-            name: PacketCutter(source.root, source.info, name) for name in shared.cameras if features[name].is_video
+            name: PacketCutter(source.root, source.info, self._own[name])
+            for name in shared.cameras
+            if features[self._own[name]].is_video
         }
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
@@ -111,7 +121,8 @@ class ContentReader:
         place, table = self._source.places[number], self._rows.read(number)
         features, found = self._source.info.features, {}
         for name in (*self._shared.columns, *self._stored):
-            values = _values(table.column(name).combine_chunks(), features[name], self._source.root)
+            own = self._own[name]
+            values = _values(table.column(own).combine_chunks(), features[own], self._source.root)
             if name == "index":
                 values = values - place.from_index
             elif name == "episode_index":

@@ -12,23 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from demorec.core.errors import ExportError, in_words
 from demorec.datasets.editing.compare import LEVELS, Difference, EpisodeComparer
 from demorec.datasets.editing.content import TASK, ContentReader, EpisodeContent, Shared, matched
 from demorec.datasets.editing.plan import Source
-from demorec.datasets.lerobot.files import read_json
-from demorec.datasets.lerobot.layout import STATS_PATH, DatasetFeature
+from demorec.datasets.editing.statistics import episode_statistics_differences, renamed, statistics_differences
+from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera, StoredBoxes
+from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.options import ProgressCallback
 
 _STORAGE = ("version", "chunks_size", "data_files_size_in_mb", "video_files_size_in_mb", "data_path", "video_path")
 _OLD_TOTALS = ("total_chunks", "total_videos")
 _FOLLOWS = frozenset(("episode_index", "num_frames", "length", "task", "tasks"))
 """Of the columns of episodes, what is compared elsewhere."""
-_PLACES = ("index", "episode_index", "task_index")
-_TOLERANCE = 1e-6
-"""Relative to the larger value or the feature's range: some writers sum in float32, and in the order of episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +76,7 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
         ExportError: One is damaged.
     """
     sources = (Source(a), Source(b))
-    shared = Shared.of(*sources)
+    shared = Shared.of(*sources, renamed(*sources))
     with tempfile.TemporaryDirectory(prefix="demorec-diff-") as folder:
         contents = _contents(sources, shared, Path(folder), progress)
         pairs = matched(*contents)
@@ -91,8 +86,8 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
     others = set(pairs.values())
     extra = [(None, m) for m in range(len(contents[1])) if m not in others]
     found += [_one_sided(sources, episode) for episode in (*unmatched, *extra)]
-    found = [*_tasks(sources, found, [*unmatched, *extra]), *_info(sources), *_features(sources),
-             *_facts(sources, pairs, contents)]  # fmt: skip
+    found = [*_tasks(sources, found, [*unmatched, *extra]), *_info(sources), *_features(sources, shared),
+             *_facts(sources, pairs, contents), *_boxes(sources, shared, pairs)]  # fmt: skip
     result = DatasetDiff(
         pairs=pairs,
         num_episodes=(len(contents[0]), len(contents[1])),
@@ -101,7 +96,8 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
         differences=(),
         notes=(),
     )  # fmt: skip
-    found += _statistics(sources, found, is_reordered=result.is_reordered)
+    found += [*statistics_differences(sources, shared, found, is_reordered=result.is_reordered),
+              *episode_statistics_differences(sources, shared, found, pairs)]  # fmt: skip
     found.sort(key=lambda item: LEVELS.index(item.level))
     return DatasetDiff(pairs=pairs, num_episodes=result.num_episodes, num_same=result.num_same,
                        differences=tuple(found), notes=tuple(_notes(sources, result)))  # fmt: skip
@@ -113,7 +109,7 @@ def _contents(
     total, done = sum(len(source.places) for source in sources), 0
     found: list[list[EpisodeContent]] = []
     for source in sources:
-        reader = ContentReader(source, shared, range(len(source.places)), folder / "none")
+        reader = ContentReader(source, shared, range(len(source.places)), folder / "none", side=len(found))
         found.append([])
         for number in range(len(source.places)):
             found[-1].append(reader.read(number))
@@ -131,8 +127,8 @@ def _compared(
     folder: Path,
 ) -> Iterator[Difference]:
     readers = (
-        ContentReader(sources[0], shared, changed.keys(), folder / "a"),
-        ContentReader(sources[1], shared, changed.values(), folder / "b"),
+        ContentReader(sources[0], shared, changed.keys(), folder / "a", side=0),
+        ContentReader(sources[1], shared, changed.values(), folder / "b", side=1),
     )
     comparer = EpisodeComparer(sources, readers, shared)
     for n, m in changed.items():
@@ -218,14 +214,17 @@ def _is_equal(a: Any, b: Any) -> bool:
     return bool(a == b) or (a != a and b != b)
 
 
-def _features(sources: tuple[Source, Source]) -> Iterator[Difference]:
+def _features(sources: tuple[Source, Source], shared: Shared) -> Iterator[Difference]:
     a, b = (source.info.features for source in sources)
-    for name in dict.fromkeys((*a, *b)):
-        if name not in a or name not in b:
+    for name, other in shared.names.items():
+        yield Difference(level="features", name=name, text=f"{name} is called {other} in B", details={"b": other})
+    for name in dict.fromkeys((*a, *(other for other in b if other not in shared.names.values()))):
+        own = shared.own(1, name)
+        if name not in a or own not in b:
             yield Difference(level="features", name=name, text=f"{name} is not in {'A' if name not in a else 'B'}")
             continue
-        is_same_type = a[name].dtype == b[name].dtype
-        yield from _fields("features", f"{name}: ", [_described(entry[name], is_same_type) for entry in (a, b)])
+        is_same_type = a[name].dtype == b[own].dtype
+        yield from _fields("features", f"{name}: ", [_described(item, is_same_type) for item in (a[name], b[own])])
 
 
 def _described(feature: DatasetFeature, with_encoding: bool) -> dict[str, Any]:
@@ -258,64 +257,32 @@ def _facts(
                 yield Difference(level="episodes", name=name, text=text, episodes=(n, m))
 
 
-def _statistics(
-    sources: tuple[Source, Source], found: Sequence[Difference], *, is_reordered: bool
-) -> Iterator[Difference]:
-    """Of features whose rows and images are all the same: else statistics differ as they should."""
-    tables = [_stats(source) for source in sources]
-    if any(not table and source.info.is_old for table, source in zip(tables, sources, strict=True)):
-        return  # v2.1 has those of each episode only
-    episodes = [item for item in found if item.level in ("episodes", "rows", "images") and item.episodes is not None]
-    if any(item.name in ("missing", "extra", "length") and item.level == "episodes" for item in episodes):
-        return
-    differing = {item.name for item in episodes if item.level in ("rows", "images")}
-    differing |= {item.name.partition(": ")[0] for item in found if item.level == "features"}
-    tasks = [source.tasks for source in sources]
-    if is_reordered:
-        differing |= set(_PLACES)
-    if tasks[0] != tasks[1] or TASK in differing:
-        differing.add("task_index")
-    for name in sources[0].info.features:
-        entries = [table.get(name) for table in tables]
-        if name in differing or name not in sources[1].info.features or entries == [None, None]:
+def _boxes(sources: tuple[Source, Source], shared: Shared, pairs: Mapping[int, int]) -> Iterator[Difference]:
+    """What stands in the files of boxes about episodes of one length."""
+    for name in shared.cameras:
+        paths = [source.root / BOXES_DIR / f"{shared.own(side, name)}.json" for side, source in enumerate(sources)]
+        there = [path.is_file() for path in paths]
+        if there[0] != there[1]:
+            text = f"boxes of {name} are not in {'BA'[there[1]]}"
+            yield Difference(level="features", name=f"boxes of {name}", text=text)
+        if not all(there):
             continue
-        a, b = (entry if isinstance(entry, dict) else {} for entry in entries)
-        wrong = [key for key in dict.fromkeys((*a, *b)) if not _is_close(a, b, key)]
-        if wrong:
-            shown = f"{_numbers(a, wrong[0])} and {_numbers(b, wrong[0])}"
-            yield Difference(level="statistics", name=name, details={"of": wrong},
-                             text=f"{name} differs in {', '.join(wrong)}: {shown}")  # fmt: skip
+        files = [
+            StoredBoxes(path, [place.from_index for place in source.places])
+            for path, source in zip(paths, sources, strict=True)
+        ]
+        for n, m in pairs.items():
+            lengths = [source.places[number].length for source, number in zip(sources, (n, m), strict=True)]
+            seen = [file.read(number, 0, lengths[0]) for file, number in zip(files, (n, m), strict=True)]
+            if lengths[0] == lengths[1] and seen[0] != seen[1]:
+                frames = [frame for frame in range(lengths[0]) if _seen_at(seen[0], frame) != _seen_at(seen[1], frame)]
+                where = f" in {len(frames)} of {lengths[0]} frames, first in frame {frames[0]}" if frames else ""
+                yield Difference(level="rows", name=f"boxes of {name}", episodes=(n, m), details={"frames": frames},
+                                 text=f"boxes of {name} differ{where}")  # fmt: skip
 
 
-def _stats(source: Source) -> dict[str, Any]:
-    path = source.root / STATS_PATH
-    if not path.exists():
-        return {}
-    try:
-        found = read_json(path)
-        if not isinstance(found, dict):
-            raise ValueError("it is no object")
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
-    return found
-
-
-def _is_close(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:
-    try:
-        x, y = (np.asarray(entry[key], dtype=np.float64).ravel() for entry in (a, b))
-        low, high = (np.asarray(a.get(name, 0.0), dtype=np.float64).ravel() for name in ("min", "max"))
-        scale = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(high - low))
-        near = (np.abs(x - y) <= _TOLERANCE * scale) | (np.isnan(x) & np.isnan(y)) | (x == y)
-        return x.shape == y.shape and bool(near.all())
-    except (KeyError, ValueError, TypeError):
-        return False
-
-
-def _numbers(entry: Mapping[str, Any], key: str) -> str:
-    if key not in entry:
-        return "nothing"
-    text = str(np.asarray(entry[key]).ravel().tolist())
-    return text if len(text) <= 80 else f"{text[:80]}..."
+def _seen_at(seen: SeenByCamera | None, frame: int) -> list[Any]:
+    return [] if seen is None else [(noun, values) for row, noun, values in seen[2] if row == frame]
 
 
 def _notes(sources: tuple[Source, Source], result: DatasetDiff) -> Iterator[str]:

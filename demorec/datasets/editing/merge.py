@@ -117,8 +117,8 @@ def _converted(
         return there[origin], Take(feature=origin)
     target = model if model is not None else there[origin]
     width = target.shape[0]
-    if not target.is_numeric or (origin and not there[origin].is_numeric):
-        raise ValueError("only numbers are converted")
+    if not _is_vector(target, *([there[origin]] if origin else ())):
+        raise ValueError("only vectors of numbers are converted")
     elements: tuple[int, ...] | None = None if origin else (-1,) * width
     if "elements" in item:
         names = list(there[origin].names or map(str, range(there[origin].shape[0])))
@@ -174,13 +174,13 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
 
 def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
     """Lines of a mapping under which the datasets would fit, as far as any does."""
-    numeric = [{n: f for n, f in plan.info.features.items() if f.is_numeric} for plan in plans]
+    numeric = [{n: f for n, f in plan.info.features.items() if _is_vector(f)} for plan in plans]
     common = {
         name
         for name, feature in plans[0].info.features.items()
         if all(
             name in plan.info.features
-            and (feature.is_numeric or _fits(feature, plan.info.features[name]))
+            and (_is_vector(feature, plan.info.features[name]) or _fits(feature, plan.info.features[name]))
             and (feature.dtype == plan.info.features[name].dtype)
             for plan in plans
         )
@@ -200,6 +200,10 @@ def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
                 yield from (f"[dataset.feature.{json.dumps(name)}]", f"elements = {json.dumps(elements)}")
                 yield from ["fill = 0.0"] if "" in elements else []
         yield ""
+
+
+def _is_vector(*features: DatasetFeature) -> bool:
+    return all(feature.is_numeric and len(feature.shape) == 1 for feature in features)
 
 
 def _fits(a: DatasetFeature, b: DatasetFeature) -> bool:

@@ -45,8 +45,6 @@ class Source:
         self.places = tuple(episode_places(root, self.info))
         if missing := [name for name in ("timestamp", "task_index") if name not in self.info.features]:
             raise ExportError(f"The dataset has no {', '.join(missing)}: {root}")
-        if any(len(feature.shape) > 1 and feature.is_numeric for feature in self.info.features.values()):
-            raise ExportError(f"Features that are arrays of several dimensions are not edited yet: {root}")
 
     @cached_property
     def tasks(self) -> list[str]:

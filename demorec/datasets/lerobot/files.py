@@ -138,11 +138,18 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.S
 
 
 def column_numbers(column: pa.Array) -> NDArray[Any]:
-    """(T, D) numbers of a data column, D = 1 for a scalar one."""
-    if pa.types.is_fixed_size_list(column.type) or pa.types.is_list(column.type):
-        flat = column.flatten().to_numpy(zero_copy_only=False)
-        return np.asarray(flat).reshape(len(column), -1)
-    return np.asarray(column.to_numpy(zero_copy_only=False)).reshape(-1, 1)
+    """(T, D) numbers of a data column, D = 1 for a scalar one; those of arrays of several dimensions row by row."""
+    flat = plain_column(column)
+    if not pa.types.is_list(flat.type) and not pa.types.is_fixed_size_list(flat.type):
+        return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(-1, 1)
+    while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
+        flat = flat.flatten()
+    return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(len(column), -1)
+
+
+def plain_column(column: pa.Array) -> pa.Array:
+    """A column as lists, where HF datasets, once it is loaded, makes it one of its own types of arrays."""
+    return column.storage if isinstance(column, pa.ExtensionArray) else column
 
 
 @contextmanager

@@ -56,6 +56,8 @@ _ARROW_TYPES = {
     "string": pa.string(),
     **{str(kind): kind for kind in (pa.int8(), pa.int16(), pa.int32(), pa.uint8(), pa.uint16(), pa.uint32())},
 }
+_MOST_DIMENSIONS = 5
+"""Of arrays that HF datasets has types for."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 """A file of an image in a row, as HF datasets has it."""
 
@@ -349,7 +351,7 @@ def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
             fields.append(pa.field(name, _IMAGE))
             described[name] = {"_type": "Image"}
             continue
-        if feature.dtype not in _ARROW_TYPES or len(feature.shape) != 1:
+        if feature.dtype not in _ARROW_TYPES or len(feature.shape) > _MOST_DIMENSIONS:
             raise ExportError(
                 f"The feature {name!r} has dtype {feature.dtype} and shape {feature.shape}, which demorec cannot "
                 "write: export into a new folder."
@@ -359,6 +361,12 @@ def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
         if feature.shape == (1,):
             fields.append(pa.field(name, arrow_type))
             described[name] = value
+        elif len(feature.shape) > 1:
+            for _ in feature.shape:
+                arrow_type = pa.list_(arrow_type)
+            fields.append(pa.field(name, arrow_type))
+            kind = f"Array{len(feature.shape)}D"
+            described[name] = {"shape": list(feature.shape), "dtype": feature.dtype, "_type": kind}
         else:
             length = feature.shape[0]
             fields.append(pa.field(name, pa.list_(pa.field("element", arrow_type), length)))

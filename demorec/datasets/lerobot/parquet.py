@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from demorec.datasets.lerobot.files import plain_column
 from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition, next_position
 from demorec.datasets.staging import sync_file
 
@@ -132,6 +133,7 @@ class RollingParquet:
 def vector_array(values: NDArray[Any] | pa.Array, arrow_type: pa.DataType) -> pa.Array:
     """A column of scalars (T,) or fixed-size vectors (T, D); a column that is one already keeps every bit."""
     if isinstance(values, pa.Array):
+        values = plain_column(values)
         return values if values.type == arrow_type else values.cast(arrow_type)
     if pa.types.is_fixed_size_list(arrow_type):
         flat = pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type.value_type)

@@ -173,7 +173,7 @@ _BATCH_ROWS = 2048
 
 
 def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature]) -> dict[str, Statistics]:
-    """Feature -> statistics over all rows.
+    """Feature -> statistics over all rows; of arrays of several dimensions, as LeRobot has them, along the last one.
 
     Args:
         files: Parquet files with the columns of `features`.
@@ -183,22 +183,33 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature
         ExportError: A column holds what is no number, or no rows at all.
     """
     paths = list(files)
-    names = [name for name, feature in features.items() if feature.is_numeric]
+    groups: dict[int, dict[str, int]] = {}
+    for name, feature in features.items():
+        if feature.is_numeric:
+            groups.setdefault(math.prod(feature.shape[:-1]), {})[name] = feature.shape[-1]
+    found: dict[str, Statistics] = {}
+    for times, widths in groups.items():
+        found |= _group_statistics(paths, widths, times)
+    return found
+
+
+def _group_statistics(paths: Sequence[Path], widths: Mapping[str, int], times: int) -> dict[str, Statistics]:
+    """Of features whose frames have that many vectors each; name -> D."""
     moments = _Moments()
-    for arrays in _batches(paths, names):
+    for arrays in _batches(paths, list(widths)):
         if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of several lengths
             raise ExportError("A column of the dataset holds values that are no numbers, so it has no statistics.")
-        moments.add(np.concatenate(arrays, axis=1, dtype=np.float64))
+        vectors = [array.reshape(times * len(array), -1) for array in arrays]
+        moments.add(np.concatenate(vectors, axis=1, dtype=np.float64))
     if not moments.count:
         raise ExportError("The dataset has no rows, so it has no statistics.")
     values = moments.values()
     result = {}
     start = 0
-    for name in names:
-        width = features[name].shape[0]
+    for name, width in widths.items():
         part = {key: value[start : start + width] for key, value in values.items()}
         part |= _quantiles(paths, name, (width, moments.count))
-        result[name] = Statistics(values=part, count=moments.count)
+        result[name] = Statistics(values=part, count=moments.count // times)
         start += width
     return result
 
@@ -211,7 +222,8 @@ def _quantiles(paths: Sequence[Path], name: str, shape: tuple[int, int]) -> dict
     # One component after another, in a file beside the data: /tmp may be memory.
     with tempfile.TemporaryFile(dir=paths[0].parent, buffering=0) as file:
         start = 0
-        for (array,) in _batches(paths, [name]):
+        for (rows,) in _batches(paths, [name]):
+            array = rows.reshape(-1, shape[0])
             for index, part in enumerate(array.T):
                 file.seek((index * shape[1] + start) * array.itemsize)
                 file.write(part.tobytes())

@@ -139,6 +139,8 @@ class DatasetWriter:
         self._start = start or WriterStart()
         self._schema = data_schema(info.features)
         self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
+        arrays = [name for name in self._numeric if len(info.features[name].shape) > 1]
+        self._arrays = {name: info.features[name].shape[-1] for name in arrays}
         self._language = [name for name in self._schema.names if info.features[name].dtype == "language"]
         self._tasks = {task: index for index, task in enumerate(self._start.tasks)}
         self.num_episodes = self._start.num_episodes
@@ -207,7 +209,10 @@ class DatasetWriter:
             **{name: episode.facts.get(name) for name in self._facts},
         }
         values = {name: values_of(column) for name, column in columns.items() if name not in self._cameras}
-        statistics = vector_statistics({name: values[name] for name in self._numeric})
+        statistics = vector_statistics({name: values[name] for name in self._numeric if name not in self._arrays})
+        for name, width in self._arrays.items():
+            vectors = vector_statistics({name: values[name].reshape(-1, width)})[name]
+            statistics[name] = replace(vectors, count=frames)
         digests = {}
         for key in self._info.video_keys:
             row.update(self._add_video(key, episode.videos[key], frames))

@@ -1,0 +1,148 @@
+"""In what the statistics of two datasets differ: of the whole, of each episode; what is one feature under two names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from demorec.core.errors import ExportError, in_words
+from demorec.datasets.editing.compare import Difference
+from demorec.datasets.editing.content import TASK, Shared
+from demorec.datasets.editing.plan import Source
+from demorec.datasets.lerobot.files import open_table, read_json, table_batches
+from demorec.datasets.lerobot.layout import STATS_PATH
+from demorec.datasets.lerobot.stats import NAMES
+
+_PLACES = ("index", "episode_index", "task_index")
+_SAME = ("min", "max", "mean", "count")
+"""By which a feature is known under another name."""
+_TOLERANCE = 1e-6
+"""Relative to the larger value or the feature's range: some writers sum in float32, and in the order of episodes."""
+
+
+def renamed(a: Source, b: Source) -> dict[str, str]:
+    """Features of A that B has under another name: of the same type, shape and elements, with the same statistics."""
+    gone = [name for name in a.info.features if name not in b.info.features]
+    new = [name for name in b.info.features if name not in a.info.features]
+    if not gone or not new:
+        return {}
+    tables = [_stats(source) for source in (a, b)]
+    found: dict[str, str] = {}
+    for name in gone:
+        item, mine = a.info.features[name], tables[0].get(name)
+        for other in new:
+            theirs, there = tables[1].get(other), b.info.features[other]
+            is_alike = (item.dtype, item.shape, item.names) == (there.dtype, there.shape, there.names)
+            if other in found.values() or not is_alike or not isinstance(mine, dict) or not isinstance(theirs, dict):
+                continue
+            if all(_is_close(mine, theirs, key) for key in _SAME):
+                found[name] = other
+                break
+    return found
+
+
+def statistics_differences(
+    sources: tuple[Source, Source], shared: Shared, found: Sequence[Difference], *, is_reordered: bool
+) -> Iterator[Difference]:
+    """Of features whose rows and images are all the same: else statistics differ as they should."""
+    tables = [_stats(source) for source in sources]
+    if any(not table and source.info.is_old for table, source in zip(tables, sources, strict=True)):
+        return  # v2.1 has those of each episode only
+    episodes = [item for item in found if item.level in ("episodes", "rows", "images") and item.episodes is not None]
+    if any(item.name in ("missing", "extra", "length") and item.level == "episodes" for item in episodes):
+        return
+    differing = {item.name for item in episodes if item.level in ("rows", "images")}
+    differing |= {item.name.partition(": ")[0] for item in found if item.level == "features"} - set(shared.names)
+    tasks = [source.tasks for source in sources]
+    if is_reordered:
+        differing |= set(_PLACES)
+    if tasks[0] != tasks[1] or TASK in differing:
+        differing.add("task_index")
+    for name in sources[0].info.features:
+        other = shared.own(1, name)
+        entries = [tables[0].get(name), tables[1].get(other)]
+        if name in differing or other not in sources[1].info.features or entries == [None, None]:
+            continue
+        a, b = (entry if isinstance(entry, dict) else {} for entry in entries)
+        wrong = [key for key in dict.fromkeys((*a, *b)) if not _is_close(a, b, key)]
+        if wrong:
+            shown = f"{_numbers(a, wrong[0])} and {_numbers(b, wrong[0])}"
+            yield Difference(level="statistics", name=name, details={"of": wrong},
+                             text=f"{name} differs in {', '.join(wrong)}: {shown}")  # fmt: skip
+
+
+def episode_statistics_differences(
+    sources: tuple[Source, Source], shared: Shared, found: Sequence[Difference], pairs: Mapping[int, int]
+) -> Iterator[Difference]:
+    """Of each episode, as the table of episodes has them, where the rows or images of the feature are the same."""
+    if any(source.info.is_old for source in sources):
+        return
+    differing = {(item.name, item.episodes) for item in found if item.level in ("rows", "images")}
+    cut = {item.episodes for item in found if item.level == "episodes" and item.name == "length"}
+    for name in (*shared.columns, *shared.cameras):
+        if name in _PLACES:
+            continue
+        tables = [_of_episodes(source, shared.own(side, name)) for side, source in enumerate(sources)]
+        if not tables[0] or not tables[1]:
+            if tables[0] or tables[1]:
+                text = f"{name} has statistics of its episodes only in {'B' if tables[1] else 'A'}"
+                yield Difference(level="statistics", name=name, text=text)
+            continue
+        wrong = [
+            (n, m, keys)
+            for n, m in pairs.items()
+            if (name, (n, m)) not in differing and (n, m) not in cut
+            if (keys := [key for key in NAMES if not _is_close(tables[0][n], tables[1][m], key)])
+        ]
+        if wrong:
+            n, m, keys = wrong[0]
+            shown = f"{_numbers(tables[0][n], keys[0])} and {_numbers(tables[1][m], keys[0])}"
+            text = f"{name} of {len(wrong)} of {len(pairs)} episodes, in episode {n} {', '.join(keys)}: {shown}"
+            yield Difference(level="statistics", name=name, text=text,
+                             details={"episodes": [[n, m] for n, m, _ in wrong]})  # fmt: skip
+
+
+def _of_episodes(source: Source, name: str) -> list[dict[str, Any]]:
+    """The statistics of a feature by episode in order; empty where the table has not all of them."""
+    columns = {f"stats/{name}/{key}": key for key in NAMES}
+    found: list[dict[str, Any]] = []
+    for path in source.episode_tables:
+        if not set(columns) <= set(open_table(path).schema_arrow.names):
+            return []
+        for batch in table_batches(path, list(columns)):
+            rows = batch.to_pylist()
+            found += [{key: row[column] for column, key in columns.items()} for row in rows]
+    return found
+
+
+def _stats(source: Source) -> dict[str, Any]:
+    path = source.root / STATS_PATH
+    if not path.exists():
+        return {}
+    try:
+        found = read_json(path)
+        if not isinstance(found, dict):
+            raise ValueError("it is no object")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
+    return found
+
+
+def _is_close(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:
+    try:
+        x, y = (np.asarray(entry[key], dtype=np.float64).ravel() for entry in (a, b))
+        low, high = (np.asarray(a.get(name, 0.0), dtype=np.float64).ravel() for name in ("min", "max"))
+        scale = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(high - low))
+        near = (np.abs(x - y) <= _TOLERANCE * scale) | (np.isnan(x) & np.isnan(y)) | (x == y)
+        return x.shape == y.shape and bool(near.all())
+    except (KeyError, ValueError, TypeError):
+        return False
+
+
+def _numbers(entry: Mapping[str, Any], key: str) -> str:
+    if key not in entry:
+        return "nothing"
+    text = str(np.asarray(entry[key]).ravel().tolist())
+    return text if len(text) <= 80 else f"{text[:80]}..."
