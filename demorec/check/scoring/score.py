@@ -26,7 +26,7 @@ from demorec.core.geometry import Array
 from demorec.core.processes import in_turn
 
 SOUND = 0.8
-"""Score from which a demonstration is taken as sound: of the benchmark's sound ones 95 in 100 have it."""
+"""Score from which a demonstration is sound: of the sound ones of `benchmarks/curation.py` 92 in 100 or more."""
 _HALF, _STEEPNESS = 7.0, 4
 """Usual spreads at which about two thirds are taken off, and how sudden that is."""
 _SHOWN = 0.05
