@@ -83,6 +83,7 @@ class CheckedEpisode(ExitStack):
         self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
         self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
         self._full_sizes: dict[str, FullSize] = {}
+        self._bodies: dict[str, Array] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
 
     def shared[T](self, compute: Callable[[CheckedEpisode], T]) -> T:
@@ -290,7 +291,9 @@ class CheckedEpisode(ExitStack):
 
     def world_from_object(self, name: str) -> Array:
         """(T, 4, 4) of a movable body as recorded."""
-        return matrices(self.columns.object_poses[name])
+        if name not in self._bodies:
+            self._bodies[name] = matrices(self.columns.object_poses[name])
+        return self._bodies[name]
 
     def is_carried(self, name: str, height: float) -> NDArray[np.bool_]:
         """(T,) whether a closed hand has a movable body so many metres above its start."""

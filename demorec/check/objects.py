@@ -162,13 +162,21 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
             near = np.flatnonzero(np.linalg.norm(pose[:, :3, 3] - other_pose[:, :3, 3], axis=1) < reach)
             if not len(near):
                 continue
-            depth = np.maximum(
-                _depth_inside(body.shape, pose[near], other.shape, _rows(other_pose, near)),
-                _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near]),
-            )
+            depth = _depth_inside(body.shape, pose[near], other.shape, _rows(other_pose, near))
+            if other.movable or _is_at_surface(pose[near, :3, 3], body, other):
+                theirs = _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near])
+                depth = np.maximum(depth, theirs)
             yield worst_frame(depth, f"{body.name} in {other.name}", frames=near)
     if movable:
         yield Measurement(value=0.0, detail="nothing comes near anything")
+
+
+def _is_at_surface(centres: Array, body: Body, other: Body) -> bool:
+    """Whether any surface point of a fixed body comes as near to a body as the body's own corners are."""
+    pose = other.world_from_body.matrix()
+    points = _surface_points(other.shape) @ pose[:3, :3].T + pose[:3, 3]
+    least = np.linalg.norm(np.clip(points, centres.min(axis=0), centres.max(axis=0)) - points, axis=1).min()
+    return bool(least <= math.hypot(*body.shape.extents) / 2)
 
 
 def _rows(transforms: Array, rows: NDArray[np.intp]) -> Array:
@@ -271,8 +279,7 @@ def falls_unheld(episode: CheckedEpisode) -> Iterator[Found]:
 def _is_borne(episode: CheckedEpisode, body: Body, pose: Array) -> NDArray[np.bool_]:
     """(T,) whether anything is within reach below a body that may bear it, or beside it."""
     half = math.hypot(*body.shape.extents) / 2
-    points = np.einsum("tij,pj->tpi", pose[:, :3, :3], _surface_points(body.shape))
-    bottom = pose[:, 2, 3] + points[:, :, 2].min(axis=1)
+    bottom = pose[:, 2, 3] - np.abs(pose[:, 2, :3]) @ (np.array(body.shape.extents) / 2)
     borne = np.zeros(len(pose), dtype=np.bool_)
     for other in episode.info.scene.bodies:
         if other.name == body.name or not other.collides:

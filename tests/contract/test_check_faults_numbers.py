@@ -117,13 +117,6 @@ def fingers_in_the_cube(c: Changed) -> Changed:
     return with_fingers(c, plus(np.s_[held(c), -2:], -0.0025)(c.columns.joint_position))
 
 
-def low_pass(rows: Rows) -> Rows:
-    out = rows.copy()
-    for t in range(1, len(out)):
-        out[t] = 0.8 * out[t - 1] + 0.2 * rows[t]
-    return out
-
-
 def force_late(rows: Rows) -> Rows:
     """The torque stays where it was."""
     return np.column_stack([late(late(rows[:, :3])), rows[:, 3:]])
@@ -262,7 +255,6 @@ CASES: list[tuple[str, Fault, str]] = [
     ("torque of the wrench inverted", wrench(lambda r: r * [1, 1, 1, -1, -1, -1]), "wrench_turns_the_wrist"),
     ("torque of the wrench in N mm", wrench(lambda r: r * [1, 1, 1, *[1000] * 3]), "wrench_turns_the_wrist"),
     ("wrench two frames late", wrench(lambda r: late(late(r))), "wrench_turns_the_wrist"),
-    ("wrench filtered", wrench(low_pass), "wrench_turns_the_wrist"),
     ("force of the wrench two frames late", wrench(force_late), "wrench_lag"),
     ("wrench not tared", wrench(plus(np.s_[:, 2], 3.0)), "wrench_bears_the_hand"),
     ("torque of the wrench not tared", wrench(plus(np.s_[:, 4], 0.5)), "wrench_bears_the_hand"),

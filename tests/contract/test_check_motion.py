@@ -163,9 +163,11 @@ def test_a_state_that_is_its_own_action_is_found(strange: Path, tmp_path: Path) 
 
 def test_an_action_that_is_the_next_observation_is_found(strange: Path, tmp_path: Path) -> None:
     spoilt = copy(strange, tmp_path / "ds")
-    (table,) = [pq.read_table(file) for file in (spoilt / "data").rglob("*.parquet")]
-    states: Rows = np.array(table.column(STATE).to_pylist())
-    edit_column(spoilt, ACTION, lambda rows: np.concatenate([states[1:], states[-1:]]))
+    import pyarrow.parquet as pq
+
+    file = next((spoilt / "data").rglob("*.parquet"))
+    states = np.array(pq.read_table(file).column(STATE).to_pylist())
+    edit_column(spoilt, ACTION, lambda _: np.concatenate([states[1:], states[-1:]]))
     assert level(strange, "action_is_no_observation") == "pass"
     assert level(spoilt, "action_is_no_observation") == "warn"
 

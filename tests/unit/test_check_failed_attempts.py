@@ -55,7 +55,7 @@ def test_what_a_failed_attempt_recorded_is_told_and_does_not_fail_the_run(
     failed = [result for result in report.results if result.level == "fail" and result.value is not None]
     assert any(result.warn < result.fail for result in failed)
     for result in failed:  # with the limit that it broke
-        (line,) = [line for line in out.splitlines() if f" {result.check} " in line]
+        line = next(line for line in out.splitlines() if line.lstrip().startswith(f"fail  {result.check} "))
         assert f"(allowed {result.fail:g}" in line
     assert "0 failed" in out
     assert "Not counted, since what they recorded fails checks: 1 failed attempt." in out
