@@ -89,10 +89,10 @@ def dataset_frozen(dataset: Dataset) -> Iterator[Found]:
     needs_pictures=True,
 )
 def images_follow_state(dataset: Dataset) -> Iterator[Found]:
-    """Images move when the robot does: catches those of another episode, or that are late from somewhere on.
+    """Images move when the robot does: catches those of another episode, late, backwards or frozen ones.
 
-    How much an image changes is correlated with the speed of the state, over an episode and each of its halves. What
-    counts is how far that is below the camera's usual correlation, and below that at another lag, both added.
+    How much an image changes is correlated with the speed of the state. What counts is how far that is below the
+    camera's usual correlation and below that at another lag, added.
     """
     if STATE not in dataset.info.features or len(dataset.rows) < _FEWEST_EPISODES:
         return
@@ -100,21 +100,19 @@ def images_follow_state(dataset: Dataset) -> Iterator[Found]:
     scale = np.concatenate(states).std(axis=0) + 1e-3
     reach = max(2, round(_REACH_S * dataset.info.fps))
     for key in dataset.colour_keys:
-        parts: list[tuple[int, str, Array]] = []
+        tables: list[tuple[int, Array]] = []
         for number, (state, pictures) in enumerate(zip(states, dataset.pictures(key), strict=True)):
             steps = np.abs(np.diff(pictures.cells.astype(np.float32), axis=0)).mean(axis=(1, 2, 3), dtype=np.float64)
             speed = np.linalg.norm(np.diff(state / scale, axis=0), axis=1)
-            half = len(speed) // 2
-            for words, part in (("", slice(None)), (", first half", slice(half)), (", second half", slice(half, None))):
-                if len(speed[part]) >= 4 * reach:
-                    parts.append((number, words, _correlations(steps[part], speed[part], reach)))
-        whole = [table for _, words, table in parts if not words]
-        if len(whole) < _FEWEST_EPISODES or (usual := float(np.median([_near(table) for table in whole]))) < _SHOWN:
+            if len(speed) >= 4 * reach:
+                tables.append((number, _correlations(steps, speed, reach)))
+        usual = float(np.median([_near(table) for _, table in tables])) if tables else 0.0
+        if len(tables) < _FEWEST_EPISODES or usual < _SHOWN:
             yield NotMeasured(why=f"{key} hardly shows when the robot moves")
             continue
-        for number, words, table in parts:
+        for number, table in tables:
             off = max(usual - _near(table), 0.0) + float(table.max()) - _near(table)
-            yield Measurement(value=off, detail=f"{key}, episode {number}{words}")
+            yield Measurement(value=off, detail=f"{key}, episode {number}")
 
 
 def _correlations(steps: Array, speed: Array, reach: int) -> Array:

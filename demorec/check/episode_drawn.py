@@ -100,16 +100,14 @@ def draw_full_size(
     found: dict[tuple[str, ImageKind], dict[int, NDArray[Any]]] = {
         (name, kind): {} for name in kinds for kind in kinds[name]
     }
-    for frame in sorted({int(frame) for of_camera in frames.values() for frame in of_camera}):
-        cameras = tuple(camera for camera in scene.cameras if frame in frames[camera.name])
-        painter = Painter(warm_renderer(), cameras, depth="depth" in wanted, segmentation="labels" in wanted)
-        world.frame = frame
-        painter.setup(world)
+    painter = Painter(warm_renderer(), scene.cameras, depth="depth" in wanted, segmentation="labels" in wanted)
+    painter.setup(world)
+    for world.frame in sorted({int(frame) for of_camera in frames.values() for frame in of_camera}):
         for name, image in painter.images().items():
             for kind in kinds[name]:
                 drawn = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
                 assert drawn is not None
-                found[name, kind][frame] = drawn.copy()
+                found[name, kind][world.frame] = drawn.copy()
     return found
 
 

@@ -30,6 +30,8 @@ _LEAST_PIXELS, _MANY_PIXELS = 64, 512
 """Of a colour in an image: one of fewer is not judged, one of many fully."""
 _LEVELS = 2.0
 """By which a block may be off beside its encoder's error: what rounding does."""
+_LATER_WEIGHT = 0.7
+"""Of the errors after the first keyframe's, where the encoder's quality may be a little another one."""
 _WORST_SHARE = 0.3
 """Of its worst block's error an encoder may leave in any: at low quality a small thing's colour is lost, or is not."""
 _DEPTH_METRES = 0.004
@@ -46,7 +48,8 @@ class FullSize:
         sharpness: Pixels squared: half the variance of the blur that would make the difference; negative if sharpened.
         color: The mean difference of a colour, in units of its encoder's error (one level at least), the largest.
         color_frame: Where that is.
-        errors: (N,) the image's error, of its worst block or of nine tenths of them, in units of the encoder's own.
+        errors: (N,) the image's error, of its worst block or of nine tenths of them, in units of the encoder's own;
+            later ones weigh less.
     """
 
     frames: NDArray[np.int64]
@@ -138,7 +141,8 @@ def compare_full_size(
         sharpness=float(moved[6]),
         color=color,
         color_frame=int(frames[frame]),
-        errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)]),
+        errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)])
+        * np.where(frames < frames[0] + _PAIR, 1.0, _LATER_WEIGHT),
     )
 
 

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.check import checked, copy, edit_column, edit_json, simulate_run
+from support.export import rewrite_video
 
+from demorec.check.dataset import Dataset
 from demorec.cli import main
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
@@ -333,3 +335,11 @@ def test_an_old_name_of_a_check_names_the_new_one(strange: Path, capsys: pytest.
         main(["check", str(strange), "--only", "collected_gaps"])
     assert ended.value.code == 2
     assert "names collected_gaps, which is now gaps" in capsys.readouterr().err
+
+
+def test_images_of_an_episode_that_run_backwards(strange: Path, tmp_path: Path) -> None:
+    spoilt = copy(strange, tmp_path / "spoilt")
+    length = Dataset(spoilt).places[0].length
+    rewrite_video(spoilt, FRONT, lambda images: [*images[:length][::-1], *images[length:]])
+    assert level(strange, "images_follow_state", pictures=True) == "pass"
+    assert level(spoilt, "images_follow_state", pictures=True) == "fail"
