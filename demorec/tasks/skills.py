@@ -46,6 +46,8 @@ LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
 LEAST_ABOVE_GOAL = 0.10
 """Metres of the TCP above the goal on its way there; it stays at `lift_height` where that is higher."""
+ANY_YAW = 24
+"""Yaws that are tried where any will do."""
 CARRIED_ABOVE_M = 0.04
 """As `ABOVE_M` for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
 
@@ -399,7 +401,9 @@ class Expert:
             GaveUp: Out of reach at every allowed yaw.
         """
         body, pose = self.world.body(goal.object), self.world.pose(goal.object)
-        symmetry = 0 if keep_yaw else goal.yaw_symmetry
+        # A shape of pick_shapes only goes down at the present yaw: recordings are made again byte for byte.
+        any_yaw = ANY_YAW if body.shape.mesh else 0
+        symmetry = 0 if keep_yaw else goal.yaw_symmetry or any_yaw
         places = places_of(body, pose, goal_pose(self.world, goal), hand=self.tcp(), yaw_symmetry=symmetry)
         for place in places:
             if self.reaches(place) and self.reaches(raised(place, self._transport_height(place) - place.position[2])):

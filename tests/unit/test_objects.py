@@ -168,6 +168,11 @@ def test_scenes_name_one_thing_without_doubt_and_take_from_the_shelves_asked_for
     assert targets == {"", "blue_tray"}
 
 
+def test_a_thing_goes_down_at_another_yaw_where_the_present_one_is_out_of_reach() -> None:
+    _, outcome = run(episode(2077, task="pick_anything"))
+    assert outcome.success, outcome.failure_reason
+
+
 def test_tasks_with_things_of_their_own_refuse_shelves() -> None:
     with pytest.raises(ConfigError, match="--objects was given"):
         episode(task="stack", objects=("blocks",))
