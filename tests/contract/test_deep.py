@@ -172,7 +172,7 @@ def test_one_bit_of_one_number(blind: Path, tmp_path: Path, simulators: Simulato
     report = deep_check(spoilt, simulators)
     assert found(report) == {("/ee_pose", "pose.position.x", (5,))}
     assert report.level == "fail"
-    assert "to the bit" in report.replay  # the commands and joint states are sound
+    assert "from frame 5 on (the EE pose)" in report.replay  # the commands and joint states are sound
 
 
 def test_messages_that_are_missing_or_too_many(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
