@@ -301,6 +301,11 @@ def compare_beginning(
         return NotMeasured(why=f"colours of the renderer {renderer!r} are others than those that are drawn here")
     if not seen:
         return {}
+    sizes = {camera.name: (camera.width, camera.height) for camera in info.scene.cameras}
+    if uneven := [
+        name for name, cells in seen.items() if sizes[name][0] * cells.shape[1] != sizes[name][1] * cells.shape[2]
+    ]:
+        return NotMeasured(why=f"no square parts cover the images of the camera {uneven[0]}")
     num_arm = len(info.robot.arm_joints)
     opening = state[:, num_arm]
     closing = np.flatnonzero(np.diff(opening) < -_CLOSING)

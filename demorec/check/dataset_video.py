@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -22,7 +23,9 @@ _FLAT_LEVELS = 1.0
 _ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
 """A picture from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
 _PARTS = 16
-"""Parts a side, whose mean colours stand for a picture."""
+"""Parts along the shorter side, about, whose mean colours stand for a picture."""
+_FEWEST_PARTS, _MOST_PARTS = 8, 32
+"""Where no square part of as many divides both sides, there are `_PARTS` by `_PARTS` that are not square."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,7 +37,7 @@ class EpisodePictures:
         mean: (3,) mean red, green and blue, of 1.
         flat: Frames whose picture is of one colour.
         alien: Frames whose picture is unlike both of its neighbours, which are like each other.
-        cells: (count, 16, 16, 3) mean colours of the parts of each picture, 0 to 255.
+        cells: (count, rows, columns, 3) mean colours of the parts of each picture, 0 to 255.
     """
 
     count: int
@@ -69,24 +72,35 @@ def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlac
 
 
 def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
-    """(16, 16, 3) mean colours of the parts of every picture, 0 to 255."""
+    """(rows, columns, 3) mean colours of the parts of every picture, 0 to 255."""
     import av
 
     check_video(path)
+    height, width = shape[:2]
+    columns, rows = part_counts(width, height)
     try:
         with av.open(str(path), format="mp4") as container:
-            height, width = shape[:2]
             for stream in container.streams.video:  # a few bytes can announce pictures of gigabytes
                 stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
             for frame in container.decode(video=0):
-                small = frame.reformat(width=_PARTS, height=_PARTS, format="rgb24", interpolation="AREA")
+                small = frame.reformat(width=columns, height=rows, format="rgb24", interpolation="AREA")
                 yield cast("NDArray[np.uint8]", small.to_ndarray())
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({in_words(error)}): {path}") from error
 
 
+def part_counts(width: int, height: int) -> tuple[int, int]:
+    """(columns, rows) of square parts that cover a picture of a size; (16, 16) where there are none."""
+    shorter, common = min(width, height), math.gcd(width, height)
+    sides = [side for side in range(1, common + 1) if common % side == 0]
+    side = min(sides, key=lambda side: abs(math.log(shorter / side / _PARTS)))
+    if not _FEWEST_PARTS <= shorter // side <= _MOST_PARTS:
+        return _PARTS, _PARTS
+    return width // side, height // side
+
+
 def _summary(cells: NDArray[np.uint8]) -> EpisodePictures:
-    """Of the parts (T, 16, 16, 3) of an episode's pictures."""
+    """Of the parts (T, rows, columns, 3) of an episode's pictures."""
     parts = cells.astype(np.float64)
     flat = parts.std(axis=(1, 2)).max(axis=1) < _FLAT_LEVELS
     alien = np.zeros(len(parts), dtype=np.bool_)
