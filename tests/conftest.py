@@ -1,4 +1,4 @@
-"""Shared by all tests: no network, one thread per process, compiled bytecode is kept."""
+"""Shared by all tests: no network, one thread per process, no deadlines, compiled bytecode is kept."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 
+import hypothesis
 import pytest
 
 # Heavy libraries read these once, at import; tests run in several processes on few cores.
@@ -18,6 +19,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 from demorec.mcap.video import ordinary_scheduling
 
 sys.dont_write_bytecode = False
+hypothesis.settings.register_profile("untimed", deadline=None)  # machines are busy at times
+hypothesis.settings.load_profile("untimed")
 
 
 @pytest.fixture(autouse=True)

@@ -43,6 +43,14 @@ def test_good_ones_pass(filmed: Path) -> None:
     assert levels(filmed) == ["pass", "pass"]
 
 
+@pytest.mark.parametrize(("width", "height"), [(96, 72), (64, 80), (126, 94)])
+def test_good_ones_pass_whatever_their_shape(width: int, height: int, tmp_path: Path) -> None:
+    simulate_run(tmp_path / "run", 1, seed=3, fps=10, cameras=("wrist",), width=width, height=height)
+    export_lerobot([tmp_path / "run"], tmp_path / "dataset", ExportOptions(verify=False))
+    assert not {"warn", "fail"} & set(levels(tmp_path / "dataset"))
+    assert ("pass" in levels(tmp_path / "dataset")) == (width != 126)  # 63 by 47 parts of two pixels are too many
+
+
 def test_a_dataset_of_somebody_else_has_nothing_to_compare_with(dataset: Path) -> None:
     shutil.rmtree(dataset / "demorec")
     assert levels(dataset) == ["skip", "skip"]

@@ -195,7 +195,6 @@ def reported(capsys: pytest.CaptureFixture[str], fuzz: Fuzz, title: str) -> Iter
 def run_fuzz(fuzz: Fuzz, examples: int) -> None:
     @settings(
         max_examples=examples,
-        deadline=None,
         database=None,
         derandomize=True,
         phases=[Phase.generate, Phase.shrink],

@@ -31,7 +31,7 @@ ROUNDINGS: dict[str, Callable[[Fraction], int]] = {
     "microseconds": lambda time: 1000 * round(time / 1000),
     "microseconds down": lambda time: 1000 * floor(time / 1000),
 }
-PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+PATIENT: dict[str, Any] = {"suppress_health_check": [HealthCheck.too_slow]}
 """On a busy machine."""
 SOURCE = Source(topic="/joints", field="position")
 

@@ -20,7 +20,7 @@ LIMITS = MotionLimits(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     x=st.floats(0.32, 0.62),
     y=st.floats(-0.3, 0.3),

@@ -46,7 +46,7 @@ def hits(corners: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 
 # Coarse steps put many corners and edges exactly on sample centres, where a wrong fill rule shows.
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.integers(-4, 200), st.integers(-4, 200)), min_size=4, max_size=14, unique=True),
     st.sampled_from([128, 64, 37]),

@@ -29,7 +29,7 @@ from demorec.robots.assets import asset_path
 pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     hnp.arrays(
         np.uint16, pictures, elements=st.one_of(st.just(0), st.integers(1, 12), st.integers(0, 65535)), fill=st.just(0)
@@ -57,7 +57,7 @@ def test_depth_is_rvl_of_the_paper() -> None:
     assert data[20:] == struct.pack("<I", 0x02A13200)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     hnp.arrays(np.int32, pictures, elements=st.integers(0, 254)),
     hnp.arrays(np.int32, (24, 24), elements=st.integers(-1, 254)),
@@ -77,7 +77,7 @@ def test_too_many_bodies_for_labels() -> None:
 finite = st.floats(allow_nan=False, width=64)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.lists(st.text(max_size=9).filter(lambda text: "\0" not in text), max_size=5), st.data())
 def test_layouts_give_what_another_decoder_reads(names: list[str], data: st.DataObject) -> None:
     """Joint states with names of any length, through the ROS 2 decoder of mcap-ros2-support."""
@@ -109,7 +109,7 @@ def test_a_layout_refuses_another_message() -> None:
         joints.decode([message, message + b"\0"])
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.binary(max_size=40))
 def test_reading_junk_raises_nothing_but_value_errors(junk: bytes) -> None:
     for data in (junk, b"\0\1\0\0" + junk):

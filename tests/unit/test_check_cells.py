@@ -27,7 +27,7 @@ def parts(picture: NDArray[Any], width: int, height: int) -> list[list[NDArray[A
 
 
 @given(width=st.integers(4, 90), height=st.integers(4, 90), seed=st.integers(0, 9))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_colours_are_means_of_the_cells_and_of_all(width: int, height: int, seed: int) -> None:
     picture = np.random.default_rng(seed).choice([0, 11, 12, 90, 250, 251, 255], (height, width, 3)).astype(np.uint8)
     read = CellGrid(width, height).read("color", picture)

@@ -8,12 +8,11 @@ import av
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 
-@settings(deadline=None)  # the first example loads PyTorch
 @given(
     lengths=st.lists(st.integers(1, 5), min_size=1, max_size=6),
     rows=st.lists(st.integers(0, 10**6), max_size=12),
