@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -28,10 +28,13 @@ class Report:
       demorec report recordings/cubes --out cubes.html
       demorec report datasets/cubes --out cubes.html --camera wrist
       demorec report recordings/cubes --out cubes.html --pictures --workers 4
+      demorec report datasets/cubes --against datasets/sorted --out sorted.html
     """
 
     path: Positional[Path]
     """A run, a recording, an evaluation, a LeRobot dataset, an HDF5 file, a bag, or a folder of recordings or bags."""
+    against: Path | None = None
+    """A LeRobot dataset that the dataset is compared with, as by demorec dataset diff."""
     mapping: Path | None = None
     """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
     that leaves nothing to decide)."""
@@ -57,12 +60,19 @@ class Report:
         check_option("workers", self.workers, 1, 1024)
         if self.pictures and not self.checks:
             raise ConfigError("--pictures chooses checks, and --no-checks runs none: leave one of them out.")
-        expect(self.path, "recording", "dataset", "hdf5", "rosbag", *EPISODE_FOLDERS)
+        read = [self.path]
+        if self.against is None:
+            expect(self.path, "recording", "dataset", "hdf5", "rosbag", *EPISODE_FOLDERS)
+        else:
+            read.append(self.against)
+            for path in read:
+                expect(path, "dataset")
         if not self.out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
-        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
+        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read(read))
         refuse_inside([self.out])
         from demorec.check.report import CheckOptions
+        from demorec.report.differences import differences
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
@@ -72,6 +82,9 @@ class Report:
             ProgressBar("reading", unit="item") as bar,
         ):
             report = gather(path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
+        if self.against is not None:
+            with ProgressBar("comparing") as bar:
+                report = replace(report, differences=differences(self.path, self.against, bar.set))
         size = write_page(report, self.out)
         say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")
         return 0
