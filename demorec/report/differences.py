@@ -13,7 +13,6 @@ from demorec.datasets.editing.compare import LEVELS, Difference, Level
 from demorec.datasets.editing.diff import DatasetDiff, diff
 from demorec.datasets.editing.plan import Source
 from demorec.datasets.editing.statistics import renamed
-from demorec.datasets.lerobot.depth import LARGEST_CODE
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.datasets.options import ProgressCallback
 from demorec.report.filmstrip import Filmstrip, filmstrip
@@ -82,7 +81,7 @@ def _shown(sources: tuple[Source, Source], names: dict[str, str], item: Differen
     one = _image(sources[0], item.name, n, frame)
     other = _image(sources[1], names.get(item.name, item.name), m, frame + later)
     apart = np.abs(one.astype(np.int32) - other)
-    apart, largest = (apart, LARGEST_CODE) if one.ndim == 2 else (apart.max(axis=2), 255)
+    apart, largest = (apart, max(one.max(), other.max())) if one.ndim == 2 else (apart.max(axis=2), 255)
     images = _visible(one, largest), _visible(other, largest), _visible(apart, apart.max())
     strip = filmstrip(item.name, len(images), lambda _: images, max_bytes=_STRIP_BYTES, height=240)
     return ShownDifference(difference=item, frame=frame, strip=strip)
