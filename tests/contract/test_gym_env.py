@@ -31,7 +31,7 @@ from demorec.loop.actions import ACTION_KINDS
 from demorec.mcap import Recording
 
 FRAMES = 45
-VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes")
+VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes", "pick_anything")
 """Tasks whose scenes differ in the number of objects, so that no vector can hold their poses."""
 KEYS = {
     "observation.state": "agent_pos",

@@ -39,6 +39,28 @@ NOUNS: dict[str, Callable[[Body], bool]] = {
     "cylinder": lambda body: body.shape.kind == "cylinder",
     "duck": lambda body: body.name == "duck",
     "mug": lambda body: "mug" in body.name,
+    **{
+        noun: lambda body, noun=noun: body.name.endswith(f"_{noun}")  # type: ignore[misc]
+        for noun in (
+            "glass",
+            "bowl",
+            "bottle",
+            "can",
+            "jar",
+            "box",
+            "apple",
+            "pear",
+            "lemon",
+            "banana",
+            "brick",
+            "wedge",
+            "corner",
+            "tee",
+            "cross",
+            "arch",
+            "hexagon",
+        )
+    },
     "wooden plank": lambda body: body.name == "jenga",
     "toy brick": lambda body: "lego" in body.name,
     "tray": lambda body: "tray" in body.name,
