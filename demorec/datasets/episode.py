@@ -114,6 +114,8 @@ class ExportEpisode:
         else:
             _check_external(recording, options)
             self.fps = info.fps
+            if getattr(options, "motor_units", False):
+                self.scalars = ()
             self.names = {feature.name: feature.names for feature in info.features}
             if options.depth:
                 depth_cameras = recording.depth_cameras

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 
+from demorec.robots.motors import Motor, RealArm
 from demorec.robots.robot import JawGripper, RobotSpec
 
 STALL_TORQUE = 19.5e-2 * 9.80665
@@ -51,3 +52,18 @@ SO101 = RobotSpec(
     # The mount of LeRobot's users: beside the gripper's motor, looking at the finger tips.
     wrist_camera=((0.0552, 0.0079, -0.0531), (0.0, 0.0079, 0.033), (1.0, 0.0, 0.0)),
 )
+
+SO101_FOLLOWER = RealArm(
+    robot_type="so101_follower",
+    motors=(
+        Motor(joint="shoulder_pan", zero=2047, range_min=795, range_max=3299),
+        Motor(joint="shoulder_lift", zero=2047, range_min=909, range_max=3185),
+        Motor(joint="elbow_flex", zero=2047, range_min=945, range_max=3149),
+        Motor(joint="wrist_flex", zero=2047, range_min=966, range_max=3128),
+        Motor(joint="wrist_roll", zero=2047, range_min=0, range_max=4095),
+        Motor(joint="gripper", zero=1535, range_min=1421, range_max=2673, unit="%"),
+    ),
+)
+"""The calibration of an arm that is built as the URDF says, as `lerobot-calibrate` (0.6.1) would find it: in the middle
+of their ranges, where the URDF has the arm's zeros (0.785 rad of the jaw), all servos are set to 2047; ranges are the
+URDF's limits, but a whole turn of the roll. LeRobot's own kinematics take such degrees for angles of this URDF."""

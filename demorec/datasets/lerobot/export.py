@@ -24,6 +24,7 @@ from demorec.datasets.lerobot.existing import Existing, features_to_append, link
 from demorec.datasets.lerobot.facts import STAGE_COLUMNS, EpisodeProgress, fact_types, read_progress, write_progress
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetInfo, combined_digest
+from demorec.datasets.lerobot.motor_units import NO_PLACE, recording_of
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import dataset_features, episode_boxes, prepare_episode, reasons_to_transcode
@@ -34,7 +35,6 @@ from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
 from demorec.datasets.staging import CODED, staged_folder
 from demorec.episode.episode import Outcome
-from demorec.mcap import open_recording
 
 
 def export_lerobot(
@@ -139,7 +139,7 @@ class _Export:
             skipped_unknown=self._intake.skipped_unknown,
             skipped_unwanted=self._intake.skipped_unwanted,
             transcoded=tuple(self._transcoded),
-            left_out=self._left_out,
+            left_out=(*self._left_out, *(NO_PLACE if self._options.motor_units else ())),
             depth_left_out=begun[-1].depth_left_out,
             silent=tuple(self._silent),
             digest=combined_digest(finished, [*self._before, *self._digests]),
@@ -235,6 +235,7 @@ class _Export:
             "fps": options.fps,
             "depth": options.depth,
             **({} if options.state == "joint" else {"state": options.state}),
+            **({"motor_units": True} if options.motor_units else {}),
             **({"boxes": True} if options.boxes else {}),
             **({"progress": True} if options.progress else {}),
             **({} if options.language is None else {"language": options.spoken}),
@@ -324,7 +325,7 @@ def read(path: Path, options: ExportOptions) -> Reading | None:
         RecordingError: It is damaged.
         ExportError: It has no frames, or its fps is no multiple of the wanted one.
     """
-    with open_recording(path) as recording:
+    with recording_of(path, options) as recording:
         if not is_wanted(recording, options):
             return None
         attempt = attempt_row(recording)

@@ -20,6 +20,9 @@ class ExportOptions(CommonOptions):
     state: StateKind = "joint"
     """What observation.state holds: joint (joint positions, gripper opening), joint_ee (behind them the TCP's pose, for
     policies that look at this vector alone, such as LeRobot's ACT)."""
+    motor_units: bool = False
+    """Of the SO-101: what LeRobot records of the real arm (robot type so101_follower), and nothing else: images, joints
+    in degrees and the gripper from 0 to 100 as state and action (docs/robots.md)."""
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
     (subtask plan memory motion task_aug vqa trace interjection), or all that the recordings support."""

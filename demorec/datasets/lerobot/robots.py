@@ -26,6 +26,7 @@ from demorec.episode.features import STATE
 from demorec.mcap.description import robot_description
 from demorec.robots.assets import asset_path
 from demorec.robots.robot import RobotSpec
+from demorec.robots.so101 import SO101_FOLLOWER
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml, read_links
 
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
@@ -33,8 +34,8 @@ ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
 """What of the name of an element is not that of its joint."""
 _DIGEST = re.compile(r"[0-9a-f]{16}")
-IN_MOTOR_UNITS = frozenset({"so101"})
-"""Rows of `ROBOTS` whose joints LeRobot itself has, in other units."""
+IN_MOTOR_UNITS = {"so101": SO101_FOLLOWER}
+"""Rows of `ROBOTS` whose joints LeRobot itself has, in other units -> the arm as LeRobot drives it."""
 _KEPT = ("material", "link", "joint")
 """What of a URDF places and draws links; the rest is for simulators and controllers, and full of paths."""
 _IN_PACKAGE = re.compile(r"^(?:file:/*)?/.*/share/([^/]+/.+)$")

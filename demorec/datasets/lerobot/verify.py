@@ -27,9 +27,10 @@ from demorec.core.processes import SPAWN
 from demorec.datasets.episode import ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.depth import code_values, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
+from demorec.datasets.lerobot.motor_units import recording_of
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.prepare import prepare_episode, reason_to_transcode
-from demorec.mcap import Recording, open_recording
+from demorec.mcap import Recording
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
 """What pip has to install for a verification; a test compares it with pyproject.toml."""
@@ -131,7 +132,7 @@ def _verify(root: Path, samples: Sequence[tuple[int, Path]], options: ExportOpti
         ) from error
     frames = 0
     for number, (episode_index, path) in enumerate(samples):
-        with open_recording(path) as recording:
+        with recording_of(path, options) as recording:
             frames += _compare_episode(dataset, episode_index, recording, options, number)
     return frames
 

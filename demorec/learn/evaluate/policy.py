@@ -75,13 +75,16 @@ def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
 
 
 def trained_action(checkpoint: Path) -> ActionKind | None:
-    """What the policy's actions mean, from the names in the dataset that it was trained on; None if that is gone."""
+    """What the policy's actions mean, from the names in the dataset that it was trained on; None if that is gone or in
+    motor units."""
     try:
         root = read_json_object(checkpoint / TRAIN_CONFIG_NAME)["dataset"]["root"]
         info = read_json_object(Path(root) / INFO_PATH)
         names = info["features"]["action"]["names"]
-        first = str(names[0] if isinstance(names, list) else next(iter(names.values()))[0])
+        first, *_, last = map(str, names if isinstance(names, list) else next(iter(names.values())))
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, StopIteration):
+        return None
+    if last == "gripper.pos":  # motor units, which no environment of ours takes
         return None
     if first.endswith(".delta"):
         return "joint_increment"

@@ -156,8 +156,8 @@ def settings_for(
     action = action or trained_action(checkpoint)
     if action is None:
         raise ConfigError(
-            "What the policy's actions mean is unknown, since the dataset it was trained on is gone: give --action "
-            "joint, joint_increment, ee or ee_delta."
+            "What the policy's actions mean is unknown, since the dataset it was trained on is gone or in motor units: "
+            "give --action joint, joint_increment, ee or ee_delta (none is in motor units)."
         )
     config.validate()
     return Settings(
