@@ -11,7 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import find_peaks
 
 from demorec.check.evidence import Flags, Motion
 from demorec.check.rows import finest_lag, longest_run
@@ -159,6 +158,8 @@ def _length(way: Array) -> float:
 
 def _strokes(guide: Array, fps: float) -> int:
     """How often the arm gets faster and slower again: the movements that a motion is made of."""
+    from scipy.signal import find_peaks  # takes a while to load
+
     speed = np.linalg.norm(np.diff(guide, axis=0), axis=1)
     width = max(1, round(_SMOOTHED_S * fps))
     smooth = np.convolve(speed, np.ones(width) / width, mode="same")
