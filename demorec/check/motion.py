@@ -309,7 +309,7 @@ def interpolated_frames(subject: Moving) -> Iterator[Found]:
     needs=GRIPPER,
 )
 def gripper_follows(subject: Moving) -> Iterator[Found]:
-    """The fingers stand where they were told to, or further apart where something is between them.
+    """The fingers stand where they were told to, or on the way there where something is between or beside them.
 
     Catches openings and commands that are inverted, halved or frozen. Whether something is between the fingers says
     the force on them; where nobody measures it, they may be kept open by it whenever they were told to close.
@@ -341,7 +341,8 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     gap = opening - command
     is_open = command > command.min() + 0.5 * reach
     holds = ~is_open if motion.contact is None else motion.contact > 0
-    off = np.where(holds, np.maximum(-gap, 0.0), np.abs(gap)) / reach
+    beyond = np.where(is_open, gap, -gap)  # things keep fingers from closing between them, and from opening beside them
+    off = np.where(holds, np.maximum(beyond, 0.0), np.abs(gap)) / reach
     where = f", {motion.where}" if motion.where else ""
     return worst_frame(np.where(steady, off, 0.0), f"{int(steady.sum())} frames after the motion{where}")
 

@@ -15,7 +15,7 @@ from demorec.core.geometry import Array
 
 _LEVER = 0.2
 """Metres at which a torque counts as much as a force."""
-_LEAST_TORQUE = 1e-4
+_LEAST_TORQUE = 0.01
 """N m below which nothing is said."""
 _MOST_LAG = 3
 """Frames up to which wrench and motors are shifted against each other."""
