@@ -210,29 +210,8 @@ def slips(c: Changed, poses: Rows) -> Rows:
     return poses
 
 
-def cut(first: int, last: int | None, out_of: tuple[int, int] | None = None) -> Fault:
-    """Frames cut off at head or tail, or out of the middle."""
-
-    def fault(c: Changed) -> Changed:
-        count = c.columns.num_frames
-        rows = np.arange(count)[first:last]
-        if out_of is not None:
-            rows = np.delete(rows, np.s_[count // 2 : count // 2 + out_of[1]])
-        values: dict[str, Any] = {}
-        for name, value in vars(c.columns).items():
-            if isinstance(value, Mapping):
-                values[name] = {key: table[rows] for key, table in value.items()}
-            else:
-                values[name] = tuple(value[t] for t in rows) if isinstance(value, tuple) else value[rows]
-        values["time_ns"] = np.array([frame_time_ns(t, c.info.fps) for t in range(len(rows))])
-        return replace(c, columns=replace(c.columns, **values)).with_outcome(num_frames=len(rows))
-
-    return fault
-
-
-def repeated_start(c: Changed) -> Changed:
-    """The first frame ten times."""
-    rows = np.concatenate([np.zeros(9, dtype=int), np.arange(c.columns.num_frames)])
+def of_rows(c: Changed, rows: Rows) -> Changed:
+    """The same recording of other frames, with the times that these have then."""
     values: dict[str, Any] = {}
     for name, value in vars(c.columns).items():
         if isinstance(value, Mapping):
@@ -241,6 +220,24 @@ def repeated_start(c: Changed) -> Changed:
             values[name] = tuple(value[t] for t in rows) if isinstance(value, tuple) else value[rows]
     values["time_ns"] = np.array([frame_time_ns(t, c.info.fps) for t in range(len(rows))])
     return replace(c, columns=replace(c.columns, **values)).with_outcome(num_frames=len(rows))
+
+
+def cut(first: int, last: int | None, out_of: tuple[int, int] | None = None) -> Fault:
+    """Frames cut off at head or tail, or out of the middle."""
+
+    def fault(c: Changed) -> Changed:
+        count = c.columns.num_frames
+        rows = np.arange(count)[first:last]
+        if out_of is not None:
+            rows = np.delete(rows, np.s_[count // 2 : count // 2 + out_of[1]])
+        return of_rows(c, rows)
+
+    return fault
+
+
+def repeated_start(c: Changed) -> Changed:
+    """The first frame ten times."""
+    return of_rows(c, np.concatenate([np.zeros(9, dtype=int), np.arange(c.columns.num_frames)]))
 
 
 def condition(part: str, **fields: Any) -> Fault:
