@@ -31,7 +31,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.core.errors import SceneError
 from demorec.core.tables import ROBOTS, TASKS
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 
 SIZES = ((128, 128), (224, 224), (96, 96), (64, 64), (320, 240), (640, 480))
 RATES = (30, 30, 60, 10, 20)
@@ -89,7 +89,7 @@ def record(config: GenerateConfig, index: int, path: Path) -> bool:
     with (
         make_world(episode.info) as world,
         make_renderer(episode.info) as renderer,
-        SimulatedWriter(path, episode.info, video=config.video, overwrite=True) as writer,
+        EpisodeWriter(path, episode.info, video=config.video, overwrite=True) as writer,
     ):
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):

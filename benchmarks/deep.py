@@ -18,7 +18,7 @@ from pathlib import Path
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.replay.deep import deep_check
 
 
@@ -26,7 +26,7 @@ def generate(path: Path, config: GenerateConfig, index: int, simulators: Simulat
     episode = prepare(EpisodePlan(config=config, episode_index=index))
     world, renderer = simulators.acquire(episode.info)
     session = Session.of_episode(world, episode, renderer)
-    with SimulatedWriter(path, episode.info, video=config.video) as writer:
+    with EpisodeWriter(path, episode.info, video=config.video) as writer:
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
         writer.finish(session.outcome)

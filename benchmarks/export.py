@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -111,7 +111,7 @@ def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame],
 
 def record(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
     info, frames, outcome = episode
-    with SimulatedWriter(path, info) as writer:
+    with EpisodeWriter(path, info) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

@@ -3,7 +3,7 @@
     python benchmarks/recording.py [--episodes 3] [--size 224] [--renderer raster]
 
 Every stage of every episode is measured in the same run, in CPU time of this process; the recorder's share is what
-`SimulatedWriter` takes less its video encoders. Bytes are those of the same episode recorded in several ways, against
+`EpisodeWriter` takes less its video encoders. Bytes are those of the same episode recorded in several ways, against
 raw pictures and float64 numbers.
 """
 
@@ -23,7 +23,7 @@ from demorec.core.geometry import Array
 from demorec.episode.episode import CameraImages, Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.mcap import SimulatedWriter, video
+from demorec.mcap import EpisodeWriter, video
 from demorec.render import Renderer, RenderSetup
 
 WAYS = [VideoConfig(codec=codec, gop=gop) for codec in ("h264", "av1") for gop in (2, 10, 30)]
@@ -98,7 +98,7 @@ def measure(
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
         session = Session.of_episode(world, episode, TimedRenderer(renderer, clock) if renderer else None)
         path = folder / f"{plan.episode_index}.mcap"
-        with SimulatedWriter(path, episode.info, video=plan.config.video) as writer:
+        with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
             iterator = session.run(ScriptAgent(episode))
             while True:
                 with clock.stage("simulation"):
@@ -167,7 +167,7 @@ def main() -> None:
         )
         for way in [*WAYS, VideoConfig(codec="jpeg")] if frames[0].images else [VideoConfig()]:
             clock.seconds.clear()
-            with SimulatedWriter(folder / f"{way.codec}-{way.gop}.mcap", info, video=way) as writer:
+            with EpisodeWriter(folder / f"{way.codec}-{way.gop}.mcap", info, video=way) as writer:
                 for frame in frames:
                     writer.write(frame)
                 stats = writer.finish(outcome)

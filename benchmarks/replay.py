@@ -20,7 +20,7 @@ from pathlib import Path
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.render.painter import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
@@ -29,7 +29,7 @@ from demorec.replay.rerender import RerenderOptions, rerender
 def generate(path: Path, config: GenerateConfig, index: int, simulators: SimulatorCache) -> None:
     episode = prepare(EpisodePlan(config=config, episode_index=index))
     world, renderer = simulators.acquire(episode.info)
-    with SimulatedWriter(path, episode.info, video=config.video) as writer:
+    with EpisodeWriter(path, episode.info, video=config.video) as writer:
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)

@@ -29,7 +29,7 @@ from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.robots.assets import allow_models, asset_path
 from demorec.robots.robot import JawGripper, RobotSpec
@@ -154,7 +154,7 @@ class TaskContract:
         """`demorec check` finds no fault, and the recorded commands do the task again."""
         frames, outcome = run_expert(self.task, self.robot, self.seed, 0)
         path, allowed = tmp_path / "episode_000000.mcap", modules_of([self.task, self.robot])
-        with SimulatedWriter(path, self._episode(0).info) as writer:
+        with EpisodeWriter(path, self._episode(0).info) as writer:
             for frame in frames:
                 writer.write(frame)
             writer.finish(outcome)

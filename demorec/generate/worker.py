@@ -21,7 +21,7 @@ from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.runs.run_file import (
     EPISODES,
     FAILED,
@@ -73,7 +73,7 @@ def _record(plan: EpisodePlan, path: Path, began: float, seconds: dict[str, floa
     world, renderer = _simulators.acquire(episode.info)
     timed: Any = _Timed(renderer, seconds, RENDERING) if renderer else None
     session = Session.of_episode(world, episode, timed)
-    with SimulatedWriter(path, episode.info, video=plan.config.video) as writer:
+    with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
         recording = _Timed(writer, seconds, RECORDING)
         for frame in session.run(ScriptAgent(episode)):
             if starts:  # the first frame's images included: a worker's first drawing compiles

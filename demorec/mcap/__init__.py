@@ -5,20 +5,17 @@ with open_recording(path) as recording:
     recording.images("front")      # decoded images
 """
 
-from demorec.mcap.external_writer import EpisodeWriter
-from demorec.mcap.file_writer import WriteStats
 from demorec.mcap.pictures import PixelStatistics
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.recover import Recovered, is_whole, recover
 from demorec.mcap.video import VideoPacket, VideoSettings
-from demorec.mcap.writer import SimulatedWriter
+from demorec.mcap.writer import EpisodeWriter, WriteStats
 
 __all__ = [
     "EpisodeWriter",
     "PixelStatistics",
     "Recording",
     "Recovered",
-    "SimulatedWriter",
     "VideoPacket",
     "VideoSettings",
     "WriteStats",

@@ -28,6 +28,9 @@ LABELS = "/labels"
 TF = "/tf"
 TF_STATIC = "/tf_static"
 
+Message = tuple[str, str, bytes]
+"""Topic, type, bytes."""
+
 _BACKDROP_METRES = 3.0
 """Larger bodies (floors, walls) are not described: a viewer would stand so far off that the robot is a dot."""
 
@@ -47,18 +50,27 @@ def camera_topic(camera: str, stream: str) -> str:
     return f"/camera/{camera}/{stream}"
 
 
-def latched_messages(info: EpisodeInfo, frames: FrameTree, *, has_labels: bool) -> Iterator[tuple[str, str, bytes]]:
-    """(topic, type, message) of what is said once, before the first frame."""
-    yield TF_STATIC, messages.TRANSFORMS, messages.transforms(frames.static)
-    robot = robot_description(info.robot.urdf, info.scene.robot.scale)
-    yield description_topic(), messages.STRING, encode(messages.STRING, robot)
-    for body in info.scene.bodies:
-        if max(body.shape.extents) > _BACKDROP_METRES:
-            continue
-        yield description_topic(body.name), messages.STRING, encode(messages.STRING, body_description(body))
-    for camera in info.scene.cameras:
-        data = messages.camera_info(camera_frame(camera.name), (camera.height, camera.width), camera.intrinsics)
-        yield camera_topic(camera.name, "camera_info"), messages.CAMERA_INFO, data
+def latched_messages(info: EpisodeInfo, tree: FrameTree | None, *, has_labels: bool) -> Iterator[Message]:
+    """What is said once, before the first frame.
+
+    Args:
+        info: Of the episode.
+        tree: Of the robot; None where it is not described.
+        has_labels: Whether there are segmentation images.
+    """
+    if tree is not None:
+        yield TF_STATIC, messages.TRANSFORMS, messages.transforms(tree.static)
+        urdf = info.urdf or robot_description(info.robot.urdf, info.scene.robot.scale)
+        yield description_topic(), messages.STRING, encode(messages.STRING, urdf)
+    for body in () if info.simulation is None else info.scene.bodies:
+        if max(body.shape.extents) <= _BACKDROP_METRES:
+            yield description_topic(body.name), messages.STRING, encode(messages.STRING, body_description(body))
+    for camera in info.cameras:
+        if camera.intrinsics is not None:
+            size, intrinsics = (camera.height, camera.width), np.array(camera.intrinsics).reshape(3, 3)
+            distortion = camera.distortion or (0.0,) * 5
+            data = messages.camera_info(camera_frame(camera.name), size, intrinsics, distortion)
+            yield camera_topic(camera.name, "camera_info"), messages.CAMERA_INFO, data
     if has_labels:
         values, names = zip(*segment_names(info), strict=True)
         numbers = to_labels(np.array([values], dtype=np.int32))[0].tolist()

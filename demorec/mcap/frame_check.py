@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
 from demorec.core.registry import nearest_match
-from demorec.episode.episode import Frame, SampledFrame
+from demorec.episode.episode import CameraImages, Frame, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
 from demorec.episode.sensed import STREAMS
 from demorec.mcap.lossless import DEPTH_TYPES
+from demorec.mcap.metadata import CameraStreams
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 
@@ -131,6 +132,26 @@ def _is_finite(value: Any) -> bool:
         return all(_is_finite(item) for item in value.values())
     is_number = isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype == np.float64)
     return not is_number or bool(np.isfinite(value).all())
+
+
+def check_images(frame: Frame, camera: Camera, streams: CameraStreams) -> CameraImages:
+    """A frame's images of a camera; RecordingError unless they are those that are recorded, all of its size."""
+    images = frame.images.get(camera.name)
+    if images is None:
+        raise RecordingError(f"Frame {frame.frame_index} has no image of the camera {camera.name!r}.")
+    size = (camera.height, camera.width)
+    for kind, pixels, is_recorded in (
+        ("colour", images.color, True),
+        ("depth", images.depth, streams.depth),
+        ("segmentation", images.segmentation, streams.segmentation),
+    ):
+        if (pixels is not None) != is_recorded or (pixels is not None and pixels.shape[:2] != size):
+            found = "is missing" if pixels is None else f"has shape {pixels.shape}"
+            raise RecordingError(
+                f"The {kind} image of the camera {camera.name!r} at frame {frame.frame_index} {found}: every frame has "
+                f"the same images of {camera.width}x{camera.height} pixels."
+            )
+    return images
 
 
 MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1

@@ -5,7 +5,9 @@ Pixels are counted while recording, so that the export of a dataset decodes noth
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +16,11 @@ from demorec.core.config import VideoConfig
 from demorec.episode.info import Camera
 from demorec.mcap import messages
 from demorec.mcap.cdr import CdrReader, encode
-from demorec.mcap.channels import camera_topic, video_topic
-from demorec.mcap.lossless import DEPTH_FORMAT
+from demorec.mcap.channels import Message, camera_topic, video_topic
+from demorec.mcap.lossless import DEPTH_FORMAT, LABELS_FORMAT, encode_depth, encode_distances, encode_labels
+from demorec.mcap.metadata import CameraStreams
 from demorec.mcap.transforms import camera_frame
-from demorec.mcap.video import Rgb, make_encoder, settings_of_coded
+from demorec.mcap.video import make_encoder, settings_of_coded
 
 _MOST_PIXELS = 1 << 50
 """Of one value in a histogram: sums of them stay exact in float64."""
@@ -77,10 +80,6 @@ def _count_values(
         row_of_counts += np.bincount(channel[first_row::row_step, ::column_step].ravel(), minlength=256)
 
 
-Message = tuple[str, str, bytes]
-"""Topic, type, bytes."""
-
-
 def pixel_statistics(statistics: PixelStatistics) -> bytes:
     """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many images were counted."""
     dimensions = (("red, green, blue", 3, 3 * 256), ("value", 256, 256))
@@ -127,39 +126,67 @@ class PictureTopics:
         return result
 
 
-class PictureCoder:
-    """Codes the images of one camera and keeps the packets until they are written.
+_BESIDE: Mapping[str, tuple[str, Callable[[Any], bytes]]] = {
+    "depth": (DEPTH_FORMAT, encode_depth),
+    "segmentation": (LABELS_FORMAT, encode_labels),
+}
+"""Images beside colour: stream -> its format, and how one is encoded."""
+
+
+class CameraWriter:
+    """Encodes the images of one camera, and keeps their messages until they are written.
 
     Args:
         camera: The camera.
         video: How colours are encoded, where they do not come so.
         fps: Of the episode.
+        beside: Streams of images that come with each one of colours: "depth", "segmentation".
         compiled: Whether pixels are counted by a compiled function.
 
     Attributes:
-        settings: How the images are encoded.
-        topics: Where they go.
-        num_ready: Packets so far.
+        camera: As given.
+        streams: What is recorded, and how the images are encoded.
+        num_ready: Images that have left the encoder, so far.
         num_video_bytes: Of them.
         last_ns: Stamp of the last image.
     """
 
-    def __init__(self, camera: Camera, video: VideoConfig, fps: int, *, compiled: bool = False) -> None:
+    def __init__(
+        self, camera: Camera, video: VideoConfig, fps: int, *, beside: Sequence[str] = (), compiled: bool = False
+    ) -> None:
+        self.camera = camera
         self._encoder, self._pixels = None, PixelCounter(compiled=compiled)
         if camera.kept:
-            self.settings = settings_of_coded(camera.kept, camera.width, camera.height, fps)
+            settings = settings_of_coded(camera.kept, camera.width, camera.height, fps)
         else:
             self._encoder = make_encoder(video, camera.width, camera.height, fps)
-            self.settings = self._encoder.settings
-        self.topics = PictureTopics(camera, self.settings.codec)
-        self._name = camera.name
+            settings = self._encoder.settings
+        self.streams = CameraStreams(video=settings, **dict.fromkeys(beside, True))
+        self._topics = PictureTopics(camera, settings.codec)
+        self._layouts = {
+            kind: messages.PictureMessages(camera_frame(camera.name), form) for kind, (form, _) in _BESIDE.items()
+        }
+        self._waiting: list[tuple[int, list[Message]]] = []
         self._packets: list[bytes] = []
-        self.num_ready = self.num_video_bytes = self.last_ns = 0
+        self._num_images = self.num_ready = self.num_video_bytes = self.last_ns = 0
 
-    def _code(self, picture: Rgb) -> None:
-        assert self._encoder is not None
-        self._pixels.add(picture)
-        self._keep(self._encoder.encode(picture))
+    def add(self, stamp_ns: int, data: NDArray[Any] | bytes, **beside: NDArray[Any] | None) -> int:
+        """Take the next image: pixels, distances, or the packet of one that came encoded; return its number."""
+        if self._encoder is None:
+            self._keep([data if isinstance(data, bytes) else encode_distances(data)])
+        else:
+            picture = np.asarray(data)
+            self._pixels.add(picture)
+            self._keep(self._encoder.encode(picture))
+        others: list[Message] = []
+        for kind, pixels in beside.items():
+            if pixels is not None:
+                packed = self._layouts[kind].compressed_image(stamp_ns, _BESIDE[kind][1](pixels))
+                others.append((camera_topic(self.camera.name, kind), messages.COMPRESSED_IMAGE, packed))
+        self._waiting.append((stamp_ns, others))
+        self.last_ns = stamp_ns
+        self._num_images += 1
+        return self._num_images - 1
 
     def _keep(self, packets: list[bytes]) -> None:
         self._packets += packets
@@ -171,9 +198,17 @@ class PictureCoder:
         if self._encoder is not None:
             self._keep(self._encoder.finish())
 
+    def take(self, until: int) -> list[tuple[int, list[Message]]]:
+        """Stamp and messages of the images before that number that have left the encoder, each once."""
+        count = max(0, until - (self.num_ready - len(self._packets)))
+        pairs = zip(self._waiting, self._packets[:count], strict=False)
+        taken = [(stamp, self._topics.of(stamp, packet) + others) for (stamp, others), packet in pairs]
+        del self._packets[:count], self._waiting[: len(taken)]
+        return taken
+
     def statistics(self) -> Message | None:
         """What was counted of all images; None where nothing was."""
         if self._encoder is None or not self.num_ready:
             return None
         data = pixel_statistics(self._pixels.statistics())
-        return camera_topic(self._name, "histogram"), messages.INT64_ARRAY, data
+        return camera_topic(self.camera.name, "histogram"), messages.INT64_ARRAY, data

@@ -19,7 +19,7 @@ from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.episode_file import EpisodeFile
 from demorec.mcap.lossless import LabelDecoder, from_labels
-from demorec.mcap.numbers import external_columns, frame_times, simulated_columns
+from demorec.mcap.numbers import Said, frame_times, read_columns
 from demorec.mcap.streams import SUBTASK, frame_streams
 from demorec.mcap.video import Rgb
 from demorec.robots.urdf import check_primitives
@@ -39,7 +39,7 @@ class RecordingReader(EpisodeFile):
         NotSimulatedError: A method was asked for what only a simulated episode has.
     """
 
-    _said: Block | None = None
+    _said: Said | None = None
     """Messages of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
     """topic -> segmentation images and the names in them, once `coded_pictures` has come by them."""
@@ -51,10 +51,8 @@ class RecordingReader(EpisodeFile):
     @cached_property
     def _columns(self) -> Columns:
         """Read once: an export and a check look at them from several sides."""
-        if self.info.simulation is None:
-            topics = {camera.name: self._picture_topic(camera.name) for camera in self.info.cameras}
-            return external_columns(self._container, self.info, topics)
-        columns, self._said = simulated_columns(self._container, self.info, self.num_frames, self.cameras)
+        topics = {name: self._picture_topic(name) for name, _ in self._cameras_in_order}
+        columns, self._said = read_columns(self._container, self.info, self.num_frames, topics)
         return columns
 
     @cached_property
@@ -89,12 +87,7 @@ class RecordingReader(EpisodeFile):
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
-        read: Iterator[tuple[int, bytes]]
-        if self._said is None:
-            read = ((message.time_ns, message.data) for message in self._container.messages((channels.EVENTS,)))
-        else:
-            read = zip(self._said.time_ns.tolist(), self._said.messages(), strict=True)
-        for time_ns, data in read:
+        for time_ns, data in self._read(channels.EVENTS, bytes) if self._said is None else self._said:
             with damage_as_recording_error(self.path):
                 event = messages.read_log(data)
             if event.name != channels.PHASE_EVENT:

@@ -23,7 +23,7 @@ from demorec.mcap.container import SalvagedMessage, salvage
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
-from demorec.mcap.streams import FRAMES, feature_streams, frame_streams
+from demorec.mcap.streams import frame_streams
 
 _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
@@ -202,7 +202,7 @@ def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames
 def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
     """Images come before the frames that hold them, so what is there of the frames has its images."""
     info, _, _ = metadata.read_episode_metadata(metadata.EXTERNAL, episode)
-    topics = {FRAMES, *(stream.topic for stream in feature_streams(info).values())}
+    topics = {stream.topic for stream in frame_streams(info)}
     num_frames = min(counts[topic] for topic in topics)
 
     def keeps(message: SalvagedMessage, count: int) -> bool:

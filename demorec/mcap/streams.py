@@ -1,13 +1,14 @@
 """The streams with one message a frame, one row each: topic, ROS 2 type, layout, encoding and decoding.
 
-`frame_streams` is the table of a simulated episode. A row says which values of a frame its message holds (`parts`) and
-which columns of `Columns` they become when a recording is read (`columns`); the writer, the reader, recovery
-and the checks go through the rows and know no topic by name. `since` is the format version that brought a stream: in
-older recordings it is neither expected nor written, and what it would hold is None.
+`frame_streams` is the table of an episode. A row says which values of frames its messages hold (`rows`) and which
+columns of `Columns` they become when a recording is read (`columns`); the writer, the reader, recovery and the checks
+go through the rows and know no topic by name. `since` is the format version that brought a stream: in older recordings
+it is neither expected nor written, and what it would hold is None.
 
-Any other episode has a topic for each feature (`feature_streams`), and `/frames`, which says which sample of every
-feature and which image of every camera a frame holds: the features' stamps, then the cameras' image numbers. Messages
-of features are stored with the frame's time; those that begin with a header have the sample's stamp there.
+A simulated episode has a fixed set of streams. Any other has a topic for each feature, and `/frames`, which says which
+sample of every feature and which image of every camera a frame holds: the features' stamps, then the cameras' image
+numbers. Messages of features are stored with the frame's time; those that begin with a header have the sample's stamp
+there.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Action, Columns, Frame, Observation
+from demorec.episode.episode import NO_PICTURE, Action, Columns, Frame, Observation, SampledFrame
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.episode.sensed import STREAMS, Sensed, Stream
 from demorec.mcap import messages
@@ -43,7 +44,7 @@ from demorec.robots.robot import RobotSpec
 GRIPPER_JOINT = "gripper"
 """Name of the gripper's opening beside the joints' names."""
 
-ColumnArrays = dict[str, Array | dict[str, Array]]
+ColumnArrays = dict[str, NDArray[Any] | dict[str, NDArray[Any]]]
 """Field of `Columns` -> its rows, or name -> rows where the field is a mapping."""
 
 
@@ -70,50 +71,48 @@ class FrameStream:
         topic: Where.
         schema: ROS 2 type.
         layout: Of its messages, which hold K values.
-        parts: The values of a frame, in pieces.
+        rows: Of N frames (`FrameValues`, or `SampledFrame` where demorec did not simulate) the values, (N, K).
         columns: The K values of T messages, (T, K), as columns.
-        arrange: All pieces of N frames, (N, ...), to the layout's values (N, K); None when they are these already.
+        stamp_ns: What the header of a frame's message says; None: the frame's time.
         since: The first format version that has it.
     """
 
     topic: str
     schema: str
     layout: Layout
-    parts: Callable[[FrameValues], Sequence[Array]]
-    columns: Callable[[Array], ColumnArrays]
-    arrange: Callable[[Array], Array] | None = None
+    rows: Callable[[Sequence[Any]], NDArray[Any]]
+    columns: Callable[[NDArray[Any]], ColumnArrays]
+    stamp_ns: Callable[[Any], int] | None = None
     since: int = 1
 
-    def rows(self, frames: Sequence[FrameValues]) -> Array:
-        """All pieces of N frames, (N, ...)."""
-        pieces = [piece for frame in frames for piece in self.parts(frame)]
-        return np.concatenate(pieces).reshape(len(frames), -1)
-
-    def encode(self, time_ns: Sequence[int], values: Array) -> list[bytes]:
-        """One message for each row of all pieces (N, ...)."""
-        if self.arrange is not None:
-            values = self.arrange(values)
-        return self.layout.encode(np.array(time_ns, dtype=np.int64), values)
+    def encode(self, frames: Sequence[Any], time_ns: Sequence[int]) -> list[bytes]:
+        """One message for each frame, at its time."""
+        stamps = time_ns if self.stamp_ns is None else list(map(self.stamp_ns, frames))
+        return self.layout.encode(np.array(stamps, dtype=np.int64), self.rows(frames))
 
 
-def frame_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
-    """The streams of a recording of the version that `info` names.
+def frame_streams(info: EpisodeInfo, tree: FrameTree | None = None) -> tuple[FrameStream, ...]:
+    """The streams of a recording of the version that `info` names, with a tree also that of its moving frames.
 
-    `/joint_states` comes first; it may have more messages between the frames.
+    `/joint_states` of a simulated episode comes first; it may have more messages between the frames.
     """
-    return tuple(stream for stream in _every_stream(info) if stream.since <= info.format_version)
+    if info.simulation is None:
+        features = (_feature(feature) for feature in info.features)
+        return (*features, *_moving_frames(tree, is_simulated=False), _held(info))
+    streams = (stream for stream in _simulated_streams(info) if stream.since <= info.format_version)
+    return (*streams, *_moving_frames(tree, is_simulated=True))
 
 
-def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
+def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
     """The table of all versions' streams."""
     robot, scene = info.robot, info.scene
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
     base = robot.base_link
     joint_state = attrgetter(*(f"observation.{name}" for name in _JOINT_STATE))
-    yield _joints(JOINT_STATES, robot.joint_names, joint_state, _joint_state_columns)
-    yield _joints(GRIPPER, (GRIPPER_JOINT,), partial(_gripper_parts, robot), _gripper_columns)
+    yield _joints(JOINT_STATES, robot.joint_names, _gathered(joint_state), _joint_state_columns)
+    yield _joints(GRIPPER, (GRIPPER_JOINT,), _gathered(partial(_gripper_parts, robot)), _gripper_columns)
     for topic, kind in ((ACTION, "action"), (COMMAND, "command")):
-        yield _joints(topic, arm_and_gripper, partial(_targets, kind), partial(_target_columns, kind), _with_zeros)
+        yield _joints(topic, arm_and_gripper, partial(_targets, kind), partial(_target_columns, kind))
     yield _pose(EE_POSE, base, "observation.base_from_tcp", "base_from_tcp")
     yield _pose(ACTION + EE_POSE, base, "action.base_from_tcp_target", "action_base_from_tcp")
     yield _pose(COMMAND + EE_POSE, base, "command.base_from_tcp_target", "command_base_from_tcp")
@@ -125,21 +124,24 @@ def _every_stream(info: EpisodeInfo) -> Iterator[FrameStream]:
         yield _pose(topic, WORLD, "world_from_camera", "world_from_camera", camera.name)
 
 
-def tf_stream(frames: FrameTree) -> FrameStream:
-    """The moving coordinate frames; they follow from other streams, so they become no column."""
-    return FrameStream(
-        topic=TF,
-        schema=messages.TRANSFORMS,
-        layout=transforms_layout(frames.moving),
-        parts=lambda values: frames.parts(values.observation),
-        columns=lambda values: {},
-        arrange=frames.arrange,
-    )
+def _moving_frames(tree: FrameTree | None, *, is_simulated: bool) -> Iterator[FrameStream]:
+    """The coordinate frames that move; they follow from other streams, so they become no column."""
+    if tree is not None and tree.moving:
+        gathered = _gathered(lambda values: tree.parts(values.observation))
+        yield FrameStream(
+            topic=TF,
+            schema=messages.TRANSFORMS,
+            layout=transforms_layout(tree.moving),
+            rows=lambda frames: tree.arrange(gathered(frames) if is_simulated else tree.parts_of_samples(frames)),
+            columns=lambda values: {},
+        )
 
 
 def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
     """The columns of several streams as arguments of `Columns`; the mappings are there even when empty."""
-    merged: dict[str, Any] = {"sensed": {}, "object_poses": {}, "world_from_camera": {}}
+    merged: dict[str, Any] = {
+        name: {} for name in ("sensed", "object_poses", "world_from_camera", "features", "stamps", "pictures")
+    }
     for columns in found:
         for name, rows in columns.items():
             if isinstance(rows, Mapping):
@@ -183,6 +185,16 @@ def pose_of(row: Array) -> Pose:
 # ------------------------------------------------------------------------------------ what the rows are made of
 
 
+def _gathered(parts: Callable[[Any], Sequence[Array]]) -> Callable[[Sequence[Any]], Array]:
+    """The `rows` of a stream whose messages hold these pieces of a frame, one behind the other."""
+
+    def rows(frames: Sequence[Any]) -> Array:
+        pieces = [piece for frame in frames for piece in parts(frame)]
+        return np.concatenate(pieces).reshape(len(frames), -1)
+
+    return rows
+
+
 _JOINT_STATE = ("joint_position", "joint_velocity", "joint_effort")
 
 
@@ -201,17 +213,15 @@ def _gripper_columns(values: Array) -> ColumnArrays:
     return {"gripper_width": values[:, 0].copy(), "contact_force": values[:, 2].copy()}
 
 
-def _targets(kind: str, values: FrameValues) -> Sequence[Array]:
-    action: Action = getattr(values, kind)
-    return action.joint_target, np.array((action.gripper_target,))
-
-
-def _with_zeros(targets: Array) -> Array:
+def _targets(kind: str, frames: Sequence[FrameValues]) -> Array:
     # No velocity or effort is commanded; zeros, since a viewer makes an empty plot of an empty array.
-    return np.concatenate((targets, np.zeros((len(targets), 2 * targets.shape[1]))), axis=1)
+    actions: list[Action] = [getattr(values, kind) for values in frames]
+    targets = [part for action in actions for part in (action.joint_target, (action.gripper_target,))]
+    rows = np.concatenate(targets).reshape(len(frames), -1)
+    return np.concatenate((rows, np.zeros((len(rows), 2 * rows.shape[1]))), axis=1)
 
 
-def _target_columns(kind: str, values: Array) -> ColumnArrays:
+def _target_columns(kind: str, values: NDArray[Any]) -> ColumnArrays:
     num_arm = values.shape[1] // 3 - 1
     return {f"{kind}_joint_target": values[:, :num_arm].copy(), f"{kind}_gripper": values[:, num_arm].copy()}
 
@@ -219,18 +229,16 @@ def _target_columns(kind: str, values: Array) -> ColumnArrays:
 def _joints(
     topic: str,
     names: Sequence[str],
-    parts: Callable[[FrameValues], Sequence[Array]],
-    columns: Callable[[Array], ColumnArrays],
-    arrange: Callable[[Array], Array] | None = None,
+    rows: Callable[[Sequence[Any]], Array],
+    columns: Callable[[NDArray[Any]], ColumnArrays],
 ) -> FrameStream:
     slots = (Slot.VALUE,) * len(names)  # position, velocity, effort
     return FrameStream(
         topic=topic,
         schema=messages.JOINT_STATE,
         layout=layout(messages.JOINT_STATE, (Slot.TIME, ""), tuple(names), slots, slots, slots),
-        parts=parts,
+        rows=rows,
         columns=columns,
-        arrange=arrange,
     )
 
 
@@ -245,7 +253,7 @@ def _sensed(row: Sensed, stream: Stream, robot: RobotSpec) -> FrameStream:
         topic=stream.topic,
         schema=schema,
         layout=messages_layout,
-        parts=lambda values: (values.observation.sensed[row.quantity],),
+        rows=_gathered(lambda values: (values.observation.sensed[row.quantity],)),
         columns=lambda values: {"sensed": {row.quantity: values}},
         since=stream.since,
     )
@@ -263,7 +271,7 @@ def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> F
         topic=topic,
         schema=messages.POSE,
         layout=layout(messages.POSE, (Slot.TIME, frame_id), POSE_SLOTS),
-        parts=parts,
+        rows=_gathered(parts),
         columns=lambda values: {column: {key: values}} if key else {column: values},
     )
 
@@ -273,49 +281,44 @@ SUBTASK = "/language/subtask"
 """What is begun at a frame, where somebody said it: std_msgs/String."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FeatureStream:
-    """The messages of a feature, one a frame.
-
-    Attributes:
-        topic: Where: "/observation/state".
-        schema: ROS 2 type.
-        layout: Of its messages, which hold D values.
-        dtype: Of the feature.
-    """
-
-    topic: str
-    schema: str
-    layout: Layout
-    dtype: str
-
-    def encode(self, stamps: Sequence[int], vectors: Sequence[NDArray[Any]]) -> list[bytes]:
-        """One message for each sample; float64 holds every bit of a float32."""
-        return self.layout.encode(np.array(stamps, dtype=np.int64), np.array(vectors, dtype=np.float64))
-
-    def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
-        """(T, D) in the feature's dtype, of T messages; ValueError for messages of another layout."""
-        return self.layout.decode_rows(rows).astype(self.dtype)
+def _feature(feature: Feature) -> FrameStream:
+    """The messages of a feature: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
+    name, has_joints = feature.name, any(feature.joints)
+    schema = messages.JOINT_STATE if has_joints else messages.FLOAT64_ARRAY
+    return FrameStream(
+        topic="/" + name.replace(".", "/"),
+        schema=schema,
+        layout=_joints_layout(feature) if has_joints else _array_layout(schema, feature.names),
+        rows=_gathered(lambda frame: (frame.samples[name].vector,)),  # float64 holds every bit of a float32
+        columns=lambda values: {"features": {name: values.astype(feature.dtype)}},
+        stamp_ns=lambda frame: int(frame.samples[name].stamp_ns),
+    )
 
 
-def feature_streams(info: EpisodeInfo) -> dict[str, FeatureStream]:
-    """Feature -> its messages: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
-    streams = {}
-    for feature in info.features:
-        schema = messages.JOINT_STATE if any(feature.joints) else messages.FLOAT64_ARRAY
-        streams[feature.name] = FeatureStream(
-            topic="/" + feature.name.replace(".", "/"),
-            schema=schema,
-            layout=_joints_layout(feature) if any(feature.joints) else _array_layout(schema, feature.names),
-            dtype=feature.dtype,
-        )
-    return streams
+def _held(info: EpisodeInfo) -> FrameStream:
+    """`/frames`: std_msgs/Int64MultiArray, whose label names the columns."""
+    features, cameras = [feature.name for feature in info.features], [camera.name for camera in info.cameras]
 
+    def rows(frames: Sequence[SampledFrame]) -> NDArray[np.int64]:
+        table = [
+            [int(frame.samples[name].stamp_ns) for name in features]
+            + [int(frame.pictures.get(name, NO_PICTURE)) for name in cameras]
+            for frame in frames
+        ]
+        return np.array(table, dtype=np.int64)
 
-def frames_layout(info: EpisodeInfo) -> Layout:
-    """Of `/frames`: std_msgs/Int64MultiArray, whose label names the columns."""
-    columns = [feature.name for feature in info.features] + [camera.name for camera in info.cameras]
-    return _array_layout(messages.INT64_ARRAY, columns)
+    def columns(values: NDArray[Any]) -> ColumnArrays:
+        names = {"stamps": features, "pictures": cameras}
+        taken = iter(values.T.copy())
+        return {column: {name: next(taken) for name in of} for column, of in names.items()}
+
+    return FrameStream(
+        topic=FRAMES,
+        schema=messages.INT64_ARRAY,
+        layout=_array_layout(messages.INT64_ARRAY, [*features, *cameras]),
+        rows=rows,
+        columns=columns,
+    )
 
 
 def _joints_layout(feature: Feature) -> Layout:

@@ -1,14 +1,20 @@
 """Writes an episode as it happens into NAME.mcap.part, which becomes NAME.mcap when it is complete.
 
-Frames are gathered for one simulated second and then written at once, each stream as a batch, the numbers and the
-images in chunks of their own: so a reader of the numbers never decompresses an image, the recorder costs little,
-and a crash loses at most the last second.
+Frames are gathered for one second and then written at once, each stream as a batch, the numbers and the images in
+chunks of their own: so a reader of the numbers never decompresses an image, the recorder costs little, and a crash
+loses at most the last second.
+
+A simulated episode has its images with its frames, which are written behind the numbers of the same second. Of any
+other, images come when they come, and one may be held by several frames: they are written in front of the frames that
+hold them, so that whatever a crash leaves of the frames has its images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from itertools import islice
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from heapq import merge
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,82 +22,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.core.errors import RecordingError
-from demorec.episode.episode import CameraImages, Event, Frame, JointSample, frame_time_ns
-from demorec.episode.info import Camera, EpisodeInfo
+from demorec.core.errors import ConfigError, RecordingError
+from demorec.core.files import Closing
+from demorec.episode.episode import Event, Frame, JointSample, Outcome, SampledFrame, frame_time_ns
+from demorec.episode.info import EpisodeInfo
+from demorec.episode.validity import find_problems
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.cdr import encode
-from demorec.mcap.channels import camera_topic
-from demorec.mcap.file_writer import FileWriter
-from demorec.mcap.frame_check import FrameCheck, check_joint_names
-from demorec.mcap.lossless import DEPTH_FORMAT, LABELS_FORMAT, encode_depth, encode_labels
-from demorec.mcap.metadata import CameraStreams
-from demorec.mcap.pictures import Message, PictureCoder
-from demorec.mcap.streams import FrameValues, frame_streams, tf_stream
-from demorec.mcap.transforms import FrameTree, camera_frame
+from demorec.mcap.channels import Message
+from demorec.mcap.frame_check import FrameCheck, SampledFrameCheck, check_images, check_joint_names
+from demorec.mcap.part_file import PartFile
+from demorec.mcap.pictures import CameraWriter
+from demorec.mcap.recover import can_be_made_again
+from demorec.mcap.streams import SUBTASK, FrameValues, frame_streams
+from demorec.mcap.transforms import FrameTree
 
-_OTHERS: dict[str, tuple[str, Callable[[Any], bytes]]] = {
-    "depth": (DEPTH_FORMAT, encode_depth),
-    "segmentation": (LABELS_FORMAT, encode_labels),
-}
-"""Images beside colour: stream -> its format, and how one is encoded."""
+_SECOND_NS = 1_000_000_000
 
 
-class CameraRecorder(PictureCoder):
-    """Codes what a camera sees and keeps it until it is written.
+@dataclass(frozen=True, kw_only=True)
+class WriteStats:
+    """What was written.
 
     Attributes:
-        streams: What is recorded; depth and segmentation when the first frame has them.
+        path: The finished file.
+        num_frames: Frames in it.
+        num_bytes: Its size.
+        video_bytes: camera -> bytes of its encoded images.
     """
 
-    def __init__(self, camera: Camera, first: CameraImages, *, video: VideoConfig, fps: int) -> None:
-        self._camera = camera
-        super().__init__(camera, video, fps, compiled=True)
-        self.streams = CameraStreams(
-            video=self.settings, depth=first.depth is not None, segmentation=first.segmentation is not None
-        )
-        frame_id = camera_frame(camera.name)
-        self._layouts = {kind: messages.PictureMessages(frame_id, form) for kind, (form, _) in _OTHERS.items()}
-        self._others: list[list[Message]] = []
-
-    def add(self, frame: Frame) -> None:
-        """Take the camera's images of the next frame.
-
-        Raises:
-            RecordingError: An image is missing or of another size.
-        """
-        name = self._camera.name
-        images = frame.images.get(name)
-        if images is None:
-            raise RecordingError(f"Frame {frame.frame_index} has no image of the camera {name!r}.")
-        self._check(frame.frame_index, "colour", images.color, True)
-        for kind in _OTHERS:
-            self._check(frame.frame_index, kind, getattr(images, kind), getattr(self.streams, kind))
-        self._code(images.color)
-        self.last_ns = frame.time_ns
-        others: list[Message] = []
-        for kind, (_, pack) in _OTHERS.items():
-            if (pixels := getattr(images, kind)) is not None:
-                data = self._layouts[kind].compressed_image(frame.time_ns, pack(pixels))
-                others.append((camera_topic(name, kind), messages.COMPRESSED_IMAGE, data))
-        self._others.append(others)
-
-    def _check(self, frame_index: int, kind: str, pixels: NDArray[Any] | None, is_recorded: bool) -> None:
-        size = (self._camera.height, self._camera.width)
-        if (pixels is not None) != is_recorded or (pixels is not None and pixels.shape[:2] != size):
-            found = "is missing" if pixels is None else f"has shape {pixels.shape}"
-            raise RecordingError(
-                f"The {kind} image of the camera {self._camera.name!r} at frame {frame_index} {found}: every frame "
-                f"has the same images of {size[1]}x{size[0]} pixels."
-            )
-
-    def take_messages(self, time_ns: list[int]) -> Iterator[list[Message]]:
-        """The messages of the oldest frames that are not yet written, one list a frame."""
-        count = len(time_ns)
-        for time, packet, others in zip(time_ns, self._packets[:count], self._others[:count], strict=True):
-            yield self.topics.of(time, packet) + others
-        del self._packets[:count]
-        del self._others[:count]
+    path: Path
+    num_frames: int
+    num_bytes: int
+    video_bytes: Mapping[str, int]
 
 
 class _Pending(NamedTuple):
@@ -100,134 +63,165 @@ class _Pending(NamedTuple):
     Attributes:
         time_ns: When.
         values: What the streams that have one message a frame are made of.
+        pictures: Camera -> number of the image that it holds.
+        changes: Messages of what is written only when it changes.
         joint_samples: Joint states since the frame before.
-        changes: (topic, type, message) of events and of what is written only when it changes.
     """
 
     time_ns: int
-    values: FrameValues
-    joint_samples: tuple[JointSample, ...]
-    changes: list[tuple[str, str, bytes]]
+    values: FrameValues | SampledFrame
+    pictures: Mapping[str, int]
+    changes: list[Message]
+    joint_samples: tuple[JointSample, ...] = ()
 
 
-class SimulatedWriter(FileWriter[CameraRecorder]):
-    """Context manager that writes one episode; leaving it without `finish` leaves NAME.mcap.part for `recover`.
+class EpisodeWriter(Closing):
+    """Context manager that writes one episode; left without `finish`, NAME.mcap.part stays for `recover`.
 
-    Depth and segmentation are recorded when the first frame has them.
+    Frames must not be changed after they were given. Depth and segmentation of simulated cameras are recorded when the
+    first frame has them.
 
     Args:
         path: The file to be made; its folder must exist.
         info: Written first.
-        video: How colour images are encoded.
+        video: How images are encoded that come as pixels.
         overwrite: Whether a recording of that name may be replaced.
+        begins: Whether all of `info` is known. Else only file and encoders are opened, and `begin` must follow.
+
+    Attributes:
+        num_frames: So far.
 
     Raises:
-        ConfigError: The file, or an unfinished one of that name, is there already and not to be replaced. What a killed
-            replay or rendering of the same recording left is replaced.
+        ConfigError: The description is impossible, or the file, or an unfinished one of that name, is there already and
+            not to be replaced. What a killed import, replay or rendering of the same origin left is replaced.
         RecordingError: It cannot be written, or the robot's joints are not those of its URDF.
     """
 
     def __init__(
-        self, path: Path, info: EpisodeInfo, *, video: VideoConfig | None = None, overwrite: bool = False
+        self,
+        path: Path,
+        info: EpisodeInfo,
+        *,
+        video: VideoConfig | None = None,
+        overwrite: bool = False,
+        begins: bool = True,
     ) -> None:
-        check_joint_names(info)
-        self._info = info
-        self._check = FrameCheck(info)
-        self._video = video or VideoConfig()
-        self._tree = FrameTree(info)
-        self._streams = [*frame_streams(info), tf_stream(self._tree)]
-        self._cameras: dict[str, CameraRecorder] = {}
+        self.num_frames = 0
+        self._info, self._video = info, video or VideoConfig()
         self._pending: list[_Pending] = []
-        self._num_written = 0
+        self._is_begun = False
         self._phase: str | None = None
         self._is_miss: bool | None = None
-        super().__init__(path, info, overwrite=overwrite)
+        if begins:
+            self._describe(info)
+        # Which images a simulation gives, its first frame says.
+        cameras = () if info.simulation is not None else info.cameras
+        self._cameras = {camera.name: CameraWriter(camera, self._video, info.fps) for camera in cameras}
+        self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(can_be_made_again, origin=info.origin))
+        if begins and info.simulation is None:
+            self._write_description()
 
-    def write(self, frame: Frame) -> None:
-        """Add the next frame.
+    def begin(self, info: EpisodeInfo) -> None:
+        """Say what the episode is, of which only the cameras were known; before its first image and frame.
 
         Raises:
-            RecordingError: Frames out of order, vectors of another length, other objects or cameras than the scene's,
-                numbers that are not finite, images missing or of another size, or a full disk.
+            ConfigError: The description is impossible.
+            RecordingError: The disk is full; nothing of the episode is left then.
         """
+        self._describe(info)
+        self._write_description()
+
+    def _describe(self, info: EpisodeInfo) -> None:
+        self._info = info
+        self._gather: Callable[[Any], _Pending]
+        if info.simulation is not None:
+            check_joint_names(info)
+            self._gather = partial(self._of_simulation, FrameCheck(info))
+        elif wrong := find_problems(info):
+            raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
+        else:
+            self._check = SampledFrameCheck(info)
+            self._gather = self._of_samples
+        self._tree = FrameTree(info) if info.simulation is not None or info.urdf else None
+        self._streams = frame_streams(info, self._tree)
+
+    def _write_description(self) -> None:
+        """Write what is said once, or leave nothing."""
+        self._is_begun = True
+        try:
+            streams = {name: camera.streams for name, camera in self._cameras.items()}
+            self._file.metadata(metadata.record_of(self._info), metadata.episode_metadata(self._info, streams))
+            has_labels = any(camera.segmentation for camera in streams.values())
+            for topic, schema, data in channels.latched_messages(self._info, self._tree, has_labels=has_labels):
+                self._file.log(topic, schema, data, 0, latched=True)
+            self._file.flush()
+        except BaseException:
+            self._file.discard()
+            raise
+
+    def picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
+        """Add the next image of a camera, and return its number, by which frames hold it; not of a simulated episode.
+
+        Args:
+            camera: One of the episode's.
+            stamp_ns: When it was taken, by the camera's clock; later than the one before.
+            data: (H, W, 3) uint8 RGB; for a camera whose images are kept an access unit (H.264 and H.265 with start
+                codes), a temporal unit (AV1) or a JPEG file, which stays as it is; for a depth camera (H, W) uint16
+                millimetres or float32 metres.
+
+        Raises:
+            RecordingError: An unknown camera, another size or type, or a stamp that goes backwards.
+        """
+        self._check.check_picture(camera, stamp_ns, data)
+        self._check.note_picture(camera, stamp_ns)
+        return self._cameras[camera].add(int(stamp_ns), data)
+
+    def write(self, frame: Frame | SampledFrame) -> None:
+        """Add the next frame: a `Frame` with its images of a simulated episode, a `SampledFrame` of any other.
+
+        Raises:
+            RecordingError: Frames out of order; vectors, objects, features or cameras that are missing, unknown, of
+                another length or type; numbers that are not finite; images missing or of another size; a full disk.
+        """
+        self._pending.append(self._gather(frame))
+        self.num_frames += 1
+        if len(self._pending) >= self._info.fps or frame.time_ns - self._pending[0].time_ns >= _SECOND_NS:
+            self.flush()
+
+    def _of_samples(self, frame: SampledFrame) -> _Pending:
+        self._check.check_frame(frame)
+        self._check.note_frame(frame)
+        text = frame.subtask
+        changes = [(SUBTASK, messages.STRING, encode(messages.STRING, text))] if text else []
+        return _Pending(frame.time_ns, frame, frame.pictures, changes)
+
+    def _of_simulation(self, check: FrameCheck, frame: Frame) -> _Pending:
         due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
             raise RecordingError(
                 f"Frame {frame.frame_index} at {frame.time_ns} ns came where frame {due[0]} at {due[1]} ns was due: "
                 "frames are written in order, one each."
             )
-        self._check(frame)
-        if self.num_frames == 0:
-            self._begin(frame)
-        for camera in self._cameras.values():
-            camera.add(frame)
-        self._pending.append(
-            _Pending(
-                time_ns=frame.time_ns,
-                values=FrameValues.of(frame),
-                joint_samples=frame.joint_samples,
-                changes=self._changes(frame),
+        check(frame)
+        if not self._is_begun:
+            self._open_cameras(frame)
+            self._write_description()
+        pictures = {}
+        for name, camera in self._cameras.items():
+            images = check_images(frame, camera.camera, camera.streams)
+            pictures[name] = camera.add(
+                frame.time_ns, images.color, depth=images.depth, segmentation=images.segmentation
             )
-        )
-        self.num_frames += 1
-        if len(self._pending) >= self._info.fps:
-            self._write_pending()
+        return _Pending(frame.time_ns, FrameValues.of(frame), pictures, self._changes(frame), frame.joint_samples)
 
-    def _begin(self, first: Frame | None) -> None:
-        """Write what is said once, as soon as it is known which images there are."""
-        for camera in self._info.cameras if first is not None else ():
-            assert first is not None
-            if camera.name not in first.images:
+    def _open_cameras(self, first: Frame) -> None:
+        for camera in self._info.cameras:
+            if (images := first.images.get(camera.name)) is None:
                 raise RecordingError(f"Frame 0 has no image of the camera {camera.name!r}.")
-            self._cameras[camera.name] = CameraRecorder(
-                camera, first.images[camera.name], video=self._video, fps=self._info.fps
-            )
-        streams = {name: camera.streams for name, camera in self._cameras.items()}
-        self._file.metadata(metadata.EPISODE, metadata.episode_metadata(self._info, streams))
-        has_labels = any(camera.segmentation for camera in streams.values())
-        for topic, schema, data in channels.latched_messages(self._info, self._tree, has_labels=has_labels):
-            self._file.log(topic, schema, data, 0, latched=True)
-        self._file.flush()
+            beside = [kind for kind in ("depth", "segmentation") if getattr(images, kind) is not None]
+            self._cameras[camera.name] = CameraWriter(camera, self._video, self._info.fps, beside=beside, compiled=True)
 
-    def _write_pending(self) -> None:
-        """Write the frames whose images have all left the encoders: numbers first, then images."""
-        num_ready = min((camera.num_ready for camera in self._cameras.values()), default=self.num_frames)
-        frames = self._pending[: num_ready - self._num_written]
-        if not frames:
-            return
-        time_ns = [frame.time_ns for frame in frames]
-        values = [frame.values for frame in frames]
-        logs = [self._file.logger(stream.topic, stream.schema) for stream in self._streams]
-        encoded = [stream.encode(time_ns, stream.rows(values)) for stream in self._streams]
-        samples = iter(self._sample_messages(frames))
-        for time, frame, *rows in zip(time_ns, frames, *encoded, strict=True):
-            for sample, data in islice(samples, len(frame.joint_samples)):
-                logs[0](data, log_time=sample)
-            for log, data in zip(logs, rows, strict=True):
-                log(data, log_time=time)
-            for topic, schema, data in frame.changes:
-                self._file.log(topic, schema, data, time)
-        self._file.flush()
-        if self._cameras:
-            pictures = (camera.take_messages(time_ns) for camera in self._cameras.values())
-            for time, *cameras in zip(time_ns, *pictures, strict=True):
-                for topic, schema, data in (message for camera in cameras for message in camera):
-                    self._file.log(topic, schema, data, time)
-            self._file.flush()
-        del self._pending[: len(frames)]
-        self._num_written += len(frames)
-
-    def _sample_messages(self, frames: list[_Pending]) -> list[tuple[int, bytes]]:
-        """Joint states between the frames: when, and the message."""
-        samples = [sample for frame in frames for sample in frame.joint_samples]
-        if not samples:
-            return []
-        times = [sample.time_ns for sample in samples]
-        values = np.array([(s.joint_position, s.joint_velocity, s.joint_effort) for s in samples])
-        data = self._streams[0].encode(times, values.reshape(len(samples), -1))
-        return list(zip(times, data, strict=True))
-
-    def _changes(self, frame: Frame) -> list[tuple[str, str, bytes]]:
+    def _changes(self, frame: Frame) -> list[Message]:
         if frame.phase == self._phase and frame.is_deliberate_miss == self._is_miss and not frame.events:
             return []  # nearly always
         result = []
@@ -244,9 +238,97 @@ class SimulatedWriter(FileWriter[CameraRecorder]):
             result.append((channels.DELIBERATE_MISS, messages.BOOL, data))
         return result + [(channels.EVENTS, messages.LOG, messages.log(frame.time_ns, event)) for event in events]
 
-    def _write_rest(self) -> None:
-        if self.num_frames == 0:
-            self._begin(None)
-        self._write_pending()
+    def flush(self) -> None:
+        """Write what is complete: when this returns, it survives the end of this process.
+
+        Raises:
+            RecordingError: The disk is full or gone.
+        """
+        is_simulated = self._info.simulation is not None
+        if not is_simulated:
+            self._write_images({name: camera.num_ready for name, camera in self._cameras.items()})
+        frames = self._pending[: self._count_ready()]
+        if not frames:
+            return
+        self._write_numbers(frames)
+        if is_simulated:
+            self._write_images({name: number + 1 for name, number in frames[-1].pictures.items()})
+        del self._pending[: len(frames)]
+
+    def _count_ready(self) -> int:
+        """Of the pending frames, how many have images that have all left the encoders."""
+        for index, frame in enumerate(self._pending):
+            if any(number >= self._cameras[name].num_ready for name, number in frame.pictures.items()):
+                return index
+        return len(self._pending)
+
+    def _write_images(self, until: Mapping[str, int]) -> None:
+        """Write the images of each camera before that number, in the order of their stamps."""
+        taken = [self._cameras[name].take(number) for name, number in until.items()]
+        for stamp_ns, found in merge(*taken, key=lambda image: image[0]):
+            for topic, schema, data in found:
+                self._file.log(topic, schema, data, stamp_ns)
+        if any(taken):
+            self._file.flush()
+
+    def _write_numbers(self, frames: list[_Pending]) -> None:
+        time_ns = [frame.time_ns for frame in frames]
+        values = [frame.values for frame in frames]
+        logs = [self._file.logger(stream.topic, stream.schema) for stream in self._streams]
+        encoded = [stream.encode(values, time_ns) for stream in self._streams]
+        samples = iter(self._sample_messages(frames))
+        for time, frame, *rows in zip(time_ns, frames, *encoded, strict=True):
+            for sample in frame.joint_samples:
+                logs[0](next(samples), log_time=sample.time_ns)
+            for log, data in zip(logs, rows, strict=True):
+                log(data, log_time=time)
+            for topic, schema, data in frame.changes:
+                self._file.log(topic, schema, data, time)
+        self._file.flush()
+
+    def _sample_messages(self, frames: list[_Pending]) -> list[bytes]:
+        """Joint states between the frames, in the layout of those at the frames."""
+        samples = [sample for frame in frames for sample in frame.joint_samples]
+        if not samples:
+            return []
+        values = np.array([(s.joint_position, s.joint_velocity, s.joint_effort) for s in samples])
+        times = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+        return self._streams[0].layout.encode(times, values.reshape(len(samples), -1))
+
+    def finish(self, outcome: Outcome) -> WriteStats:
+        """Write the rest, make the file durable and give it its name.
+
+        Raises:
+            ConfigError: A file of that name has appeared meanwhile.
+            RecordingError: The outcome speaks of another number of frames, an encoder keeps images to itself, or the
+                disk is full.
+        """
+        if outcome.num_frames != self.num_frames:
+            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self.num_frames}.")
+        for camera in self._cameras.values():
+            camera.end()
+        if not self._is_begun:
+            self._write_description()
+        self.flush()
         if self._pending:
-            raise RecordingError(f"The video encoder kept the last {len(self._pending)} images to itself.")
+            raise RecordingError(f"The video encoder kept images of the last {len(self._pending)} frames to itself.")
+        for camera in self._cameras.values():
+            if (statistics := camera.statistics()) is not None:
+                self._file.log(*statistics, camera.last_ns)
+        record = metadata.record_of(self._info)
+        self._file.metadata(metadata.OUTCOME, metadata.outcome_metadata(record, outcome))
+        self._file.publish()
+        return WriteStats(
+            path=self._file.path,
+            num_frames=self.num_frames,
+            num_bytes=self._file.path.stat().st_size,
+            video_bytes={name: camera.num_video_bytes for name, camera in self._cameras.items()},
+        )
+
+    def close(self) -> None:
+        """End it and leave NAME.mcap.part as it is; harmless when called twice, and after `finish`."""
+        self._file.close()
+
+    def discard(self) -> None:
+        """Give the episode up and remove what was written of it."""
+        self._file.discard()

@@ -20,7 +20,7 @@ from demorec.core.tables import TASKS
 from demorec.episode.episode import Action, Frame, Observation, Outcome, SuccessCheck
 from demorec.loop import Decision, Session, SimulatorCache
 from demorec.loop.actions import ActionDecoder
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.mcap.streams import pose_of
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions, sensed_now
@@ -331,7 +331,7 @@ def record_replay(
     video = from_plain(d.info.config.get("video", {}), VideoConfig)
     world, renderer = simulators.acquire(info)
     painter = view_painter(renderer, view, d.info.config) if renderer else None
-    with SimulatedWriter(path, info, video=video, overwrite=overwrite) as writer:
+    with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:
         report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
         writer.finish(outcome)
     return report, None if d.source is None else (d.source, path)

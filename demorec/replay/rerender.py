@@ -26,7 +26,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.loop import prepare
-from demorec.mcap import Recording, SimulatedWriter, open_recording
+from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.mcap.recording import frames_of
 from demorec.render import Renderer
 from demorec.render.painter import Painter, WarmRenderer
@@ -271,7 +271,7 @@ def rerender(
             make_folder(out.parent)
             with (
                 nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
-                SimulatedWriter(out, new_info, video=video, overwrite=overwrite) as writer,
+                EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
                 painter = view_painter(warm.of(str(config.get("renderer", "raster"))), view, config)
                 _write_drawn(writer, recording, columns, painter, view.scene)
@@ -287,9 +287,7 @@ def rerender(
     )
 
 
-def _write_drawn(
-    writer: SimulatedWriter, recording: Recording, columns: Columns, painter: Painter, scene: Scene
-) -> None:
+def _write_drawn(writer: EpisodeWriter, recording: Recording, columns: Columns, painter: Painter, scene: Scene) -> None:
     """All frames of a recording with new pictures of the scene, and its outcome."""
     world = RecordedWorld(
         recording.info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses

@@ -13,7 +13,7 @@ from support.export import export, files_of
 from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, main, run_command
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.runs.find import find
 
 
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_episode(folder / "a.mcap", num_frames=45, depth=True)
     write_episode(folder / "b.mcap", num_frames=30, success=False, episode_index=7, cameras=())
     info, frames, _ = make_episode(num_frames=70)
-    with SimulatedWriter(folder / "c.mcap", info) as writer:
+    with EpisodeWriter(folder / "c.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)
     part = folder / "c.mcap.part"

@@ -415,17 +415,17 @@ def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.Captur
     """What render, replay and evaluate write with."""
     from support.recording import make_episode
 
-    from demorec.mcap import SimulatedWriter
+    from demorec.mcap import EpisodeWriter
 
     info, _, _ = make_episode(num_frames=1, cameras=())
     before = files_of(place.parent)
     for target in ("thesis.tex", "thesis", "dataset", "link_to_thesis"):
         with pytest.raises(ConfigError, match="never replaced"):
-            SimulatedWriter(place / target, info, overwrite=True)
+            EpisodeWriter(place / target, info, overwrite=True)
     (place / "b.mcap.part").symlink_to(place / "thesis.tex")
     for overwrite in (False, True):
         with pytest.raises(DemorecError, match="in the way"):
-            SimulatedWriter(place / "b.mcap", info, overwrite=overwrite)
+            EpisodeWriter(place / "b.mcap", info, overwrite=overwrite)
     (place / "b.mcap.part").unlink()
     assert files_of(place.parent) == before
 

@@ -14,7 +14,7 @@ from support.commands import exit_code
 from support.export import files_of, make_run
 
 from demorec.episode.episode import Outcome
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 
 INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 """Whoever runs the tests in the background of a shell has switched it off."""
@@ -37,9 +37,9 @@ def test_the_same_command_keeps_what_is_drawn(
     out = tmp_path / "out"
     command = ("render", run, "--out", out, "--width", 32, "--height", 32, "--looks", 1, "--workers", 1)
     drawn: list[Path] = []
-    write = SimulatedWriter.finish
+    write = EpisodeWriter.finish
 
-    def until_the_second(writer: SimulatedWriter, outcome: Outcome) -> object:
+    def until_the_second(writer: EpisodeWriter, outcome: Outcome) -> object:
         if drawn:
             raise KeyboardInterrupt
         stats = write(writer, outcome)
@@ -47,7 +47,7 @@ def test_the_same_command_keeps_what_is_drawn(
         return stats
 
     with monkeypatch.context() as patch:
-        patch.setattr(SimulatedWriter, "finish", until_the_second)
+        patch.setattr(EpisodeWriter, "finish", until_the_second)
         assert exit_code(*command) == 130
     assert "Interrupted: 1 of 3 recordings are rendered; run the same command again" in capsys.readouterr().err
     before = recordings(out)

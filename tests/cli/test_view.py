@@ -15,7 +15,7 @@ from support.viewer import chromium, need_chromium, need_vulkan, num_colors, pix
 from demorec.cli import run_command
 from demorec.cli.view import View
 from demorec.core.config import VideoConfig
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.view import live as live_module
 from demorec.view.live import LiveViewer
 from demorec.view.save import save, save_each
@@ -169,7 +169,7 @@ def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "
     colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 40]], dtype=np.uint8)
     picture = np.repeat(np.repeat(colours[np.newaxis], 80, axis=1), 240, axis=0)
     info, frames, outcome = make_episode(num_frames=30, cameras=("front",), width=320, height=240)
-    with SimulatedWriter(tmp_path / "episode_000000.mcap", info, video=VideoConfig(codec=codec)) as writer:
+    with EpisodeWriter(tmp_path / "episode_000000.mcap", info, video=VideoConfig(codec=codec)) as writer:
         for frame in frames:
             writer.write(replace(frame, images={"front": replace(frame.images["front"], color=picture)}))
         writer.finish(outcome)

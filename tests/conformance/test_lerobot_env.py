@@ -20,7 +20,7 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.learn.evaluate.policy import find_checkpoint, trained_action
 from demorec.learn.evaluate.rollouts import evaluate, load_evaluation, settings_for
 from demorec.loop import ScriptAgent, Session, make_world
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # each command of LeRobot takes 15 s of CPU to start
 
@@ -52,7 +52,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     prepared = episode(0)
     with (
         make_world(prepared.info) as world,
-        SimulatedWriter(recordings / "episode_000000.mcap", prepared.info) as writer,
+        EpisodeWriter(recordings / "episode_000000.mcap", prepared.info) as writer,
     ):
         session = Session.of_episode(world, prepared)
         for frame in session.run(ScriptAgent(prepared)):

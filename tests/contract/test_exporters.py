@@ -17,7 +17,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.tables import EXPORTERS
 from demorec.episode.sensed import SENSED
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.recover import recover
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
@@ -74,7 +74,7 @@ def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run:
 def test_a_recovered_recording_is_no_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
     sources = [run / "episodes" / "episode_000000.mcap", tmp_path / "recovered.mcap"]
     info, frames, _ = make_episode(num_frames=70, episode_index=7)
-    with suppress(InterruptedError), SimulatedWriter(tmp_path / "cut.mcap", info) as writer:
+    with suppress(InterruptedError), EpisodeWriter(tmp_path / "cut.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)
         raise InterruptedError

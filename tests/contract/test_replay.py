@@ -19,7 +19,7 @@ from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.episode import Event
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
 
 
@@ -242,7 +242,7 @@ def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytes
     info = info.with_simulation(
         robot=replace(info.robot, gripper=replace(info.robot.gripper, joints=(), finger_links=()))
     )
-    with SimulatedWriter(tmp_path / "e.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:
             seen = frame.observation
             arm = {f"joint_{name}": getattr(seen, f"joint_{name}")[:7] for name in ("position", "velocity", "effort")}

@@ -116,7 +116,7 @@ def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
 
     from demorec.core.config import VideoConfig
     from demorec.episode.episode import frame_time_ns
-    from demorec.mcap import SimulatedWriter
+    from demorec.mcap import EpisodeWriter
 
     info, frames, outcome = make_episode(num_frames=1, cameras=("front", "wrist"), width=640, height=480)
     black = {
@@ -124,7 +124,7 @@ def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
         for name, image in frames[0].images.items()
     }
     path = tmp_path / "black.mcap"
-    with SimulatedWriter(path, info, video=VideoConfig(codec="jpeg")) as writer:
+    with EpisodeWriter(path, info, video=VideoConfig(codec="jpeg")) as writer:
         for index in range(60):
             writer.write(
                 replace(frames[0], frame_index=index, time_ns=frame_time_ns(index, 30), images=black, events=())

@@ -287,10 +287,10 @@ def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
 
     from support.recording import make_episode
 
-    from demorec.mcap import SimulatedWriter
+    from demorec.mcap import EpisodeWriter
 
     info, frames, outcome = make_episode(num_frames=2, cameras=())
-    with SimulatedWriter(tmp_path / "a.mcap", replace(info, format_version=99)) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", replace(info, format_version=99)) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

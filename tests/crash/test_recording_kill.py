@@ -23,7 +23,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Frame
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import Recording, SimulatedWriter, recover
+from demorec.mcap import EpisodeWriter, Recording, recover
 
 FPS = 30
 MOST_FRAMES = 300
@@ -32,7 +32,7 @@ MOST_FRAMES = 300
 def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
     """Write frames, each as soon as the one before is written, and note every one in the pipe."""
     os.write(notes, b"r")
-    with SimulatedWriter(path, info, video=video) as writer:
+    with EpisodeWriter(path, info, video=video) as writer:
         for frame in frames:
             writer.write(frame)
             os.write(notes, b"f")
@@ -113,7 +113,7 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
 
 def test_recover_exits_with_1_when_it_keeps_nothing(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=10)
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)
     part = tmp_path / "a.mcap.part"

@@ -22,7 +22,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.episode.episode import CameraImages, Columns, Event, Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.part_file import PartFile
@@ -42,7 +42,7 @@ def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
     with (
         make_world(episode.info) as world,
         make_renderer(episode.info) as renderer,
-        SimulatedWriter(path, episode.info, video=plan.config.video) as writer,
+        EpisodeWriter(path, episode.info, video=plan.config.video) as writer,
     ):
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):
@@ -133,7 +133,7 @@ class Spoilt:
         outcome = self.outcome
         assert outcome is not None
         # As a program that checks nothing would write it: our own writer refuses some of the faults.
-        with pytest.MonkeyPatch.context() as patch, SimulatedWriter(path, self.info) as writer:
+        with pytest.MonkeyPatch.context() as patch, EpisodeWriter(path, self.info) as writer:
             patch.setattr(FrameCheck, "__call__", lambda *_: None)
             for number, index in enumerate(self.frames):
                 writer.write(self._frame(frames[index], number, index))

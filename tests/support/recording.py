@@ -28,7 +28,7 @@ from demorec.episode.episode import (
 )
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, SceneCamera, Shape
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.robots.robot import ParallelGripper, RobotSpec
 
 Codec = Literal["h264", "av1", "jpeg"]
@@ -134,7 +134,7 @@ def frame_number(picture: NDArray[np.uint8]) -> int:
 def write_episode(path: Path, *, video: VideoConfig | None = None, **arguments: object) -> Path:
     """Record `make_episode(**arguments)` at `path`."""
     info, frames, outcome = make_episode(**arguments)  # type: ignore[arg-type]
-    with SimulatedWriter(path, info, video=video) as writer:
+    with EpisodeWriter(path, info, video=video) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

@@ -10,7 +10,7 @@ from support.check import checked
 from support.export import export
 from support.recording import PANDA, make_episode
 
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 
 
 @pytest.mark.parametrize(("width", "beyond"), [(0.104, 0.0), (0.120, 0.016)])
@@ -19,7 +19,7 @@ def test_the_opening_of_a_scaled_gripper_is_scaled_once(width: float, beyond: fl
     info, frames, outcome = make_episode(num_frames=5)
     placement = replace(info.scene.robot, scale=1.3)
     info = info.with_simulation(robot=PANDA.scaled(1.3), scene=replace(info.scene, robot=placement))
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         for frame in frames:
             home = replace(frame.observation, gripper_width=width)
             writer.write(replace(frame, observation=home))

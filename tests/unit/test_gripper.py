@@ -103,8 +103,8 @@ def test_whoever_has_joints_asks_the_gripper_for_the_opening() -> None:
     vectors = observation_vectors(ObservationRows.of_observation(seen), info.robot, info.scene)
     assert vectors[VELOCITY][0, -1] == pytest.approx(speed, rel=1e-6)
     (stream,) = (stream for stream in frame_streams(info) if stream.topic == "/gripper")
-    (parts,) = stream.parts(FrameValues.of(frames[1]))
-    assert parts.tolist() == [seen.gripper_width, pytest.approx(speed), seen.contact_force]
+    (row,) = stream.rows([FrameValues.of(frames[1])])
+    assert row.tolist() == [seen.gripper_width, pytest.approx(speed), seen.contact_force]
 
     positions = np.stack([frame.observation.joint_position for frame in frames])
     width = 0.08 * np.sin(positions[:, 7] / CRANK)

@@ -20,7 +20,7 @@ from demorec.datasets.lerobot import files
 from demorec.datasets.lerobot.language import EpisodeLanguage, language_arrays
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, RobotPlacement, Scene, Shape
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 
 
 def scene(*cubes: tuple[str, float, float, float], yaw: float = 0.0) -> Scene:
@@ -85,7 +85,7 @@ def told(folder: Path, script: list[tuple[str, str, str]], **arguments: object) 
     """(frame, kind, text) of an episode of two frames a phase; `script` has (phase, event, its message)."""
     info, frames, outcome = make_episode(num_frames=2 * len(script), cameras=(), **arguments)  # type: ignore[arg-type]
     path = folder / "episode.mcap"
-    with SimulatedWriter(path, info) as writer:
+    with EpisodeWriter(path, info) as writer:
         for number, frame in enumerate(frames):
             phase, name, message = script[number // 2]
             events = (Event(name=name, message=message),) if name and number % 2 == 0 else ()

@@ -15,7 +15,7 @@ from support.recording import make_episode, write_episode
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.view import bodies
@@ -133,7 +133,7 @@ def with_models(tmp_path: Path) -> Path:
     """A recording with a mesh and a URDF beside the table and the cube."""
     info, frames, outcome = make_episode(num_frames=3, cameras=())
     info = info.with_simulation(scene=replace(info.scene, bodies=(*info.scene.bodies, DUCK, BRICK)))
-    with SimulatedWriter(tmp_path / "e.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

@@ -13,7 +13,7 @@ from support.viewer import need_vulkan
 from demorec.cli import run_command
 from demorec.cli.view import View
 from demorec.core.errors import DemorecError, RecordingError
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.robots.urdf import Urdf
 from demorec.view.glyphs import DRAWABLE, drawable_source
 from demorec.view.layout import episode_layout
@@ -37,7 +37,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cameras=(replace(camera, name="前"),),
     )
     path = tmp_path_factory.mktemp("运行") / "episode_000000.mcap"
-    with SimulatedWriter(path, replace(info, instruction=INSTRUCTION).with_simulation(scene=scene)) as writer:
+    with EpisodeWriter(path, replace(info, instruction=INSTRUCTION).with_simulation(scene=scene)) as writer:
         for frame in frames:
             seen = frame.observation
             poses = {("方块" if name == cube else name): pose for name, pose in seen.object_poses.items()}

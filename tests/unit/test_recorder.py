@@ -22,8 +22,8 @@ from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_PICTURE
 from demorec.episode.info import Camera, Feature
 from demorec.mcap import Recording
-from demorec.mcap.external_writer import EpisodeWriter
 from demorec.mcap.recorder.encoder import Encoder
+from demorec.mcap.writer import EpisodeWriter
 from demorec.robots.panda import PANDA
 from demorec.runs.external import load_external_run
 

@@ -15,7 +15,7 @@ from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
 from demorec.episode.episode import Frame
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 
 NAN = float("nan")
 
@@ -116,7 +116,7 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
 def test_a_frame_that_does_not_fit_is_refused_at_once(fault: str, tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=4, cameras=("front",), physics_rate_joints=True)
     spoil, words = FAULTS[fault]
-    with SimulatedWriter(tmp_path / "e.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames[:2]:
             writer.write(frame)
         with pytest.raises(RecordingError, match=f"^Frame 2 has .*{words}"):
@@ -134,5 +134,5 @@ def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
 def test_joints_that_the_robot_does_not_have_are_refused(names: tuple[str, ...], words: str, tmp_path: Path) -> None:
     info, _, _ = make_episode(num_frames=1, cameras=())
     with pytest.raises(RecordingError, match=words):
-        SimulatedWriter(tmp_path / "e.mcap", renamed(info, *names))
+        EpisodeWriter(tmp_path / "e.mcap", renamed(info, *names))
     assert not list(tmp_path.iterdir())  # refused before anything is written

@@ -15,7 +15,7 @@ from support.external import TOP, make_external
 from support.recording import make_episode
 
 from demorec.episode.episode import frame_time_ns
-from demorec.mcap import EpisodeWriter, Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 
 READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
     "packets": lambda recording: recording.packets("front"),
@@ -32,7 +32,7 @@ def write_long(path: Path, num_frames: int) -> None:
     info, frames, outcome = make_episode(
         num_frames=60, width=64, height=64, cameras=("front",), depth=True, segmentation=True
     )
-    with SimulatedWriter(path, info) as writer:
+    with EpisodeWriter(path, info) as writer:
         for index in range(num_frames):
             writer.write(replace(frames[index % 60], frame_index=index, time_ns=frame_time_ns(index, info.fps)))
         writer.finish(replace(outcome, num_frames=num_frames))

@@ -15,7 +15,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Event, Frame, Outcome
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container
 
 CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), VideoConfig(gop=30, crf=30)]
@@ -24,7 +24,7 @@ CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), Vi
 def record(
     path: Path, frames: list[Frame], info: EpisodeInfo, outcome: Outcome, video: VideoConfig | None = None
 ) -> Path:
-    with SimulatedWriter(path, info, video=video) as writer:
+    with EpisodeWriter(path, info, video=video) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

@@ -12,7 +12,7 @@ from support.recording import make_episode, write_episode
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import FORMAT_VERSION, EpisodeInfo
-from demorec.mcap import Recording, SimulatedWriter, recover
+from demorec.mcap import EpisodeWriter, Recording, recover
 from demorec.mcap.streams import frame_streams
 
 LATER = {stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since > 1}
@@ -21,7 +21,7 @@ NEWEST = [stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]
 
 
 def record(path: Path, info: EpisodeInfo, frames: list[Frame], outcome: Outcome) -> Path:
-    with SimulatedWriter(path, info) as writer:
+    with EpisodeWriter(path, info) as writer:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)

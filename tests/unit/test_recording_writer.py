@@ -13,14 +13,14 @@ from support.recording import make_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import Frame, Outcome
-from demorec.mcap import Recording, SimulatedWriter, part_file, recover
+from demorec.mcap import EpisodeWriter, Recording, part_file, recover
 
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def write_all(writer: SimulatedWriter, frames: list[Frame], outcome: Outcome | None = None) -> None:
+def write_all(writer: EpisodeWriter, frames: list[Frame], outcome: Outcome | None = None) -> None:
     for frame in frames:
         writer.write(frame)
     if outcome is not None:
@@ -32,7 +32,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path.write_bytes(b"mine")
     info, _, _ = make_episode(num_frames=1)
     with pytest.raises(ConfigError, match="there already"):
-        SimulatedWriter(path, info)
+        EpisodeWriter(path, info)
     assert path.read_bytes() == b"mine"
     assert names(tmp_path) == ["a.mcap"]
 
@@ -42,14 +42,14 @@ def test_an_unfinished_recording_is_not_overwritten(tmp_path: Path) -> None:
     part.write_bytes(b"what a crash left")
     info, _, _ = make_episode(num_frames=1)
     with pytest.raises(ConfigError, match="unfinished"):
-        SimulatedWriter(tmp_path / "a.mcap", info)
+        EpisodeWriter(tmp_path / "a.mcap", info)
     assert part.read_bytes() == b"what a crash left"
 
 
 def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=3)
     path = tmp_path / "a.mcap"
-    with SimulatedWriter(path, info) as writer:
+    with EpisodeWriter(path, info) as writer:
         write_all(writer, frames)
         path.write_bytes(b"mine")
         with pytest.raises(ConfigError, match="there already"):
@@ -63,7 +63,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> Non
 def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=3)
     path = tmp_path / "a.mcap"
-    with SimulatedWriter(path, info) as writer:
+    with EpisodeWriter(path, info) as writer:
         write_all(writer, frames)
         assert names(tmp_path) == ["a.mcap.part"]
         stats = writer.finish(outcome)
@@ -76,7 +76,7 @@ def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
 
 def test_leaving_without_finish_leaves_a_part_that_can_be_recovered(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=70)
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         write_all(writer, frames)
     assert names(tmp_path) == ["a.mcap.part"]
     with pytest.raises(RecordingError, match="never finished"):
@@ -86,7 +86,7 @@ def test_leaving_without_finish_leaves_a_part_that_can_be_recovered(tmp_path: Pa
 
 def test_frames_come_in_order(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=3, cameras=())
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         writer.write(frames[0])
         with pytest.raises(RecordingError, match=r"Frame 2 at 66666667 ns came where frame 1 at 33333333 ns was due"):
             writer.write(frames[2])
@@ -96,16 +96,16 @@ def test_frames_come_in_order(tmp_path: Path) -> None:
 
 def test_pictures_are_complete(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=2, depth=True)
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         writer.write(frames[0])
         wrist = frames[1].images["wrist"]
         with pytest.raises(RecordingError, match="no image of the camera 'wrist'"):
             writer.write(replace(frames[1], images={"front": frames[1].images["front"]}))
-    with SimulatedWriter(tmp_path / "b.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "b.mcap", info) as writer:
         writer.write(frames[0])
         with pytest.raises(RecordingError, match="depth image of the camera 'wrist' at frame 1 is missing"):
             writer.write(replace(frames[1], images={**frames[1].images, "wrist": replace(wrist, depth=None)}))
-    with SimulatedWriter(tmp_path / "c.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "c.mcap", info) as writer:
         writer.write(frames[0])
         small = replace(wrist, color=np.zeros((24, 32, 3), dtype=np.uint8))
         with pytest.raises(RecordingError, match=r"colour image .* has shape \(24, 32, 3\).* of 64x48 pixels"):
@@ -115,7 +115,7 @@ def test_pictures_are_complete(tmp_path: Path) -> None:
 def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=1)
     with (
-        SimulatedWriter(tmp_path / "a.mcap", info, video=VideoConfig(preset="quickest")) as writer,
+        EpisodeWriter(tmp_path / "a.mcap", info, video=VideoConfig(preset="quickest")) as writer,
         pytest.raises(ConfigError, match=r"libx264 .* preset quickest") as caught,
     ):
         writer.write(frames[0])
@@ -127,7 +127,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info, frames, _ = make_episode(num_frames=31, cameras=())
     disk = part_file._Disk
     monkeypatch.setattr(part_file, "_Disk", lambda part: disk(Path("/dev/full")))
-    writer = SimulatedWriter(tmp_path / "a.mcap", info, overwrite=True)
+    writer = EpisodeWriter(tmp_path / "a.mcap", info, overwrite=True)
     with pytest.raises(RecordingError, match="cannot be written") as caught:
         write_all(writer, frames)
     assert "\n" not in str(caught.value)
@@ -136,7 +136,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     info, frames, outcome = make_episode(num_frames=60, width=320, height=240)
-    writer = SimulatedWriter(tmp_path / "a.mcap", info, video=VideoConfig(codec="jpeg"))
+    writer = EpisodeWriter(tmp_path / "a.mcap", info, video=VideoConfig(codec="jpeg"))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
     try:
@@ -152,7 +152,7 @@ def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path, capfd: pytest.Captur
 def leftover(folder: Path, origin: str) -> bytes:
     """What a kill leaves of a derived recording after its first second."""
     info, frames, _ = make_episode(num_frames=40, cameras=())
-    with SimulatedWriter(folder / "a.mcap", replace(info, origin=origin)) as writer:
+    with EpisodeWriter(folder / "a.mcap", replace(info, origin=origin)) as writer:
         write_all(writer, frames)
     return (folder / "a.mcap.part").read_bytes()
 
@@ -160,7 +160,7 @@ def leftover(folder: Path, origin: str) -> bytes:
 def test_what_a_killed_rendering_left_is_replaced_by_the_same_rendering(tmp_path: Path) -> None:
     leftover(tmp_path, "render of 0123")
     info, frames, outcome = make_episode(num_frames=5, cameras=())
-    with SimulatedWriter(tmp_path / "a.mcap", replace(info, origin="render of 0123")) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", replace(info, origin="render of 0123")) as writer:
         write_all(writer, frames, outcome)
     assert names(tmp_path) == ["a.mcap"]
     assert Recording(tmp_path / "a.mcap").num_frames == 5
@@ -171,27 +171,27 @@ def test_what_cannot_be_made_again_by_the_same_command_stays(tmp_path: Path, lef
     before = leftover(tmp_path, left)
     info, _, _ = make_episode(num_frames=5, cameras=())
     with pytest.raises(ConfigError, match="unfinished recording"):
-        SimulatedWriter(tmp_path / "a.mcap", replace(info, origin=new))
+        EpisodeWriter(tmp_path / "a.mcap", replace(info, origin=new))
     assert (tmp_path / "a.mcap.part").read_bytes() == before
 
 
 def test_what_another_process_is_writing_is_left_alone(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=40, cameras=())
     info = replace(info, origin="render of 0123")
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         write_all(writer, frames)
         for overwrite in (False, True):
             with pytest.raises(ConfigError, match="Another process is writing"):
-                SimulatedWriter(tmp_path / "a.mcap", info, overwrite=overwrite)
+                EpisodeWriter(tmp_path / "a.mcap", info, overwrite=overwrite)
         writer.finish(outcome)
     assert Recording(tmp_path / "a.mcap").num_frames == 40
 
 
 def test_a_writer_killed_before_its_first_frame_leaves_nothing_to_keep(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=5, cameras=())
-    SimulatedWriter(tmp_path / "a.mcap", info).__exit__(None, None, None)
+    EpisodeWriter(tmp_path / "a.mcap", info).__exit__(None, None, None)
     part = tmp_path / "a.mcap.part"
     part.write_bytes(part.read_bytes()[:8])  # MCAP's magic alone
-    with SimulatedWriter(tmp_path / "a.mcap", info) as writer:
+    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         write_all(writer, frames, outcome)
     assert names(tmp_path) == ["a.mcap"]

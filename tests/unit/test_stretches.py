@@ -12,12 +12,12 @@ from support.export import export
 from support.recording import make_episode
 
 from demorec.core.errors import ConfigError
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 
 
 def write(path: Path, episode_index: int, phases: Sequence[str]) -> None:
     info, frames, outcome = make_episode(num_frames=len(phases), cameras=(), episode_index=episode_index)
-    with SimulatedWriter(path, info) as writer:
+    with EpisodeWriter(path, info) as writer:
         for frame, phase in zip(frames, phases, strict=True):
             writer.write(replace(frame, phase=phase))
         writer.finish(outcome)

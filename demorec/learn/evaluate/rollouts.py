@@ -47,7 +47,7 @@ from demorec.learn.evaluate.statistics import Rate, factors_of
 from demorec.learn.evaluate.turns import Turns
 from demorec.learn.evaluate.watch import correcting_behaviour
 from demorec.loop import make_world, prepare
-from demorec.mcap import SimulatedWriter
+from demorec.mcap import EpisodeWriter
 from demorec.robots.robot import RobotSpec
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
@@ -244,7 +244,7 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     turns = Turns(env, policy, observation, seed=plan.episode_index, rules=settings.takeover, rehearsal_world=world)
     name = f"episode_{plan.episode_index:06d}.mcap"
     path = folder / name
-    with SimulatedWriter(path, info, video=plan.config.video, overwrite=True) as recording:
+    with EpisodeWriter(path, info, video=plan.config.video, overwrite=True) as recording:
         for frame in turns.frames():
             recording.write(frame)
         after = env.situation

@@ -12,7 +12,7 @@ from demorec.core.plain import digest, from_plain
 from demorec.core.tables import RENDERERS
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import Recording, SimulatedWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
@@ -63,7 +63,7 @@ def generate_again(recorded: EpisodeInfo, path: Path, simulators: SimulatorCache
     info = replace(episode.info, format_version=recorded.format_version)
     world, renderer = simulators.acquire(info)
     session = Session.of_episode(world, episode, renderer)
-    with SimulatedWriter(path, info, video=config.video) as writer:
+    with EpisodeWriter(path, info, video=config.video) as writer:
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
         writer.finish(session.outcome)
@@ -77,7 +77,7 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
     painter = recorded_painter(info, renderer, allowed)
-    with SimulatedWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
+    with EpisodeWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
             told = recording.outcome
