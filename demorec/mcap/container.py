@@ -11,13 +11,9 @@ import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -35,11 +31,9 @@ from demorec.core.errors import DemorecError, RecordingError, ResourceError, in_
 from demorec.core.files import open_regular
 from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content
 from demorec.mcap.limits import LimitError, Limits
+from demorec.mcap.scan import MAX_METADATA_BYTES, MESSAGE_HEAD, read_channel, read_record, read_schema
 
-MAX_METADATA_BYTES = 4 << 20
-"""Of a metadata record: ours have some 20 kB."""
 MAGIC = b"\x89MCAP0\r\n"
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 
 
@@ -133,23 +127,23 @@ class Container:
         self._metadata: dict[str, MetadataIndex] = {}
         self._attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
-        for opcode, content in _records_of(summary, "the file's index"):
+        for opcode, content in _records_of(summary):
             if opcode == Opcode.CHANNEL:
-                channel = _read_channel(content)
+                channel = read_channel(content)
                 channels[channel.id] = channel
             elif opcode == Opcode.SCHEMA:
-                schema = _read_schema(content)
+                schema = read_schema(content)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHUNK_INDEX:
                 self._chunks.append(ChunkPlace.read(content))
             elif opcode == Opcode.METADATA_INDEX:
-                metadata = _read(content, MetadataIndex)
+                metadata = read_record(content, MetadataIndex)
                 self._metadata[metadata.name] = metadata
             elif opcode == Opcode.ATTACHMENT_INDEX:
-                attachment = _read(content, AttachmentIndex)
+                attachment = read_record(content, AttachmentIndex)
                 self._attachments[attachment.name] = attachment
             elif opcode == Opcode.STATISTICS:
-                counts = dict(_read(content, Statistics).channel_message_counts)
+                counts = dict(read_record(content, Statistics).channel_message_counts)
         self._chunks.sort(key=lambda chunk: chunk.start)
         self._limits.check_total(sum(chunk.uncompressed_size for chunk in self._chunks))
         self._limits.check_records(sum(counts.values()))
@@ -180,7 +174,7 @@ class Container:
         return memoryview(data)[RECORD_HEAD.size :]
 
     def _record_at[R: McapRecord](self, offset: int, length: int, opcode: Opcode, kind: type[R]) -> R:
-        return _read(self._content_at(offset, length, opcode), kind)
+        return read_record(self._content_at(offset, length, opcode), kind)
 
     @property
     def metadata_names(self) -> tuple[str, ...]:
@@ -246,30 +240,14 @@ class Container:
             yield chunk_content(record, self._limits, place.uncompressed_size)
 
 
-def _read[R: McapRecord](content: bytes | memoryview, kind: type[R]) -> R:
-    record: R = kind.read(ReadDataStream(BytesIO(content)))
-    return record
-
-
-# These are the same bytes in every recording of a run, and an export opens many.
-@lru_cache(maxsize=1024)
-def _read_channel(content: bytes) -> Channel:
-    return _read(content, Channel)
-
-
-@lru_cache(maxsize=256)
-def _read_schema(content: bytes) -> Schema:
-    return _read(content, Schema)
-
-
-def _records_of(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, bytes]]:
-    """(opcode, content) of the records in a chunk, or in what `where` says."""
+def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """(opcode, content) of the records in the file's index."""
     position = 0
     while position < len(content):
         opcode, length = RECORD_HEAD.unpack_from(content, position)
         position += RECORD_HEAD.size
         if position + length > len(content):
-            raise ValueError(f"a record that reaches beyond {where}")
+            raise ValueError("a record that reaches beyond the file's index")
         yield opcode, content[position : position + length]
         position += length
 
@@ -287,99 +265,8 @@ def _messages_of(contents: Iterable[bytes], wanted: dict[int, str], limits: Limi
                 raise ValueError("a record that reaches beyond its chunk")
             count += 1
             if opcode == Opcode.MESSAGE:
-                channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content, start)
+                channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(content, start)
                 topic = wanted.get(channel_id)
                 if topic is not None:
-                    yield Message(topic, log_time, content[start + _MESSAGE_HEAD.size : position])
+                    yield Message(topic, log_time, content[start + MESSAGE_HEAD.size : position])
         limits.check_records(count)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SalvagedMessage:
-    """A message of a file without an index; attributes as in the file."""
-
-    topic: str
-    schema: str
-    time_ns: int
-    data: bytes
-    is_latched: bool
-
-
-def salvage(path: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
-    """Everything whole from the front of a file: messages and metadata, None at the end of each chunk.
-
-    Ends with a string that says why reading stopped, or without one where the data ends as it should. Raises OSError.
-    """
-    with open_regular(path) as file:
-        size = file.seek(0, 2)
-        file.seek(0)
-        if file.read(len(MAGIC)) != MAGIC:
-            yield "the file is empty" if size == 0 else "the file is no MCAP file"
-            return
-        reader = _Salvage(Limits.of_file(size))
-        while True:
-            head = file.read(RECORD_HEAD.size)
-            if len(head) < RECORD_HEAD.size:
-                yield "the end is missing"
-                return
-            opcode, length = RECORD_HEAD.unpack(head)
-            if length > min(size - file.tell(), MAX_RECORD_BYTES):
-                yield "a record is cut off"
-                return
-            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                return
-            if opcode not in _SALVAGED or (opcode == Opcode.METADATA and length > MAX_METADATA_BYTES):
-                file.seek(length, 1)
-                continue
-            try:
-                with damage_as_recording_error(path):
-                    yield from reader.read(opcode, file.read(length))
-            except RecordingError as error:
-                limited = isinstance(error.__cause__, LimitError)
-                yield f"the rest is not read, {error.__cause__}" if limited else "a record is damaged"
-                return
-            if opcode == Opcode.CHUNK:
-                yield None
-
-
-_SALVAGED = frozenset((Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE))
-
-
-class _Salvage:
-    """What has been learnt from the records so far: schemas, channels, how much they unpacked to."""
-
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-        self._num_bytes = self._num_records = 0
-        self._schemas: dict[int, str] = {}
-        self._channels: dict[int, Channel] = {}
-
-    def read(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage | Metadata]:
-        """What a record holds."""
-        if opcode == Opcode.CHUNK:
-            unpacked = chunk_content(content, self._limits)
-            self._num_bytes += len(unpacked)
-            self._limits.check_total(self._num_bytes)
-            for inner, record_content in _records_of(unpacked):
-                self._num_records += 1
-                self._limits.check_records(self._num_records)
-                if inner in _SALVAGED and inner != Opcode.CHUNK:
-                    yield from self.read(inner, record_content)
-        elif opcode == Opcode.MESSAGE:
-            channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
-            channel = self._channels[channel_id]
-            yield SalvagedMessage(
-                topic=channel.topic,
-                schema=self._schemas[channel.schema_id],
-                time_ns=log_time,
-                data=content[_MESSAGE_HEAD.size :],
-                is_latched="offered_qos_profiles" in channel.metadata,
-            )
-        elif opcode == Opcode.METADATA:
-            yield _read(content, Metadata)
-        elif opcode == Opcode.SCHEMA:
-            schema = _read_schema(content)
-            self._schemas[schema.id] = schema.name
-        elif opcode == Opcode.CHANNEL:
-            channel = _read_channel(content)
-            self._channels[channel.id] = channel

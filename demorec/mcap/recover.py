@@ -15,14 +15,16 @@ from typing import NamedTuple
 from mcap.records import Metadata
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
-from demorec.core.files import make_folder
+from demorec.core.files import make_folder, open_regular
 from demorec.episode.episode import frame_time_ns
 from demorec.episode.info import Origin
 from demorec.mcap import channels, messages, metadata
-from demorec.mcap.container import SalvagedMessage, salvage
+from demorec.mcap.container import MAGIC, damage_as_recording_error
+from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
+from demorec.mcap.scan import CutOffError, ScannedMessage, scan
 from demorec.mcap.streams import frame_streams
 
 _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
@@ -72,10 +74,11 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         for item in _items(source):
             if isinstance(item, str):
                 break
-            if isinstance(item, SalvagedMessage):
-                seen[item.topic] += 1
-                if frames.keeps(item, seen[item.topic]) and item.schema in _KNOWN_TYPES:
-                    file.log(item.topic, item.schema, item.data, item.time_ns, latched=item.is_latched)
+            if isinstance(item, ScannedMessage):
+                channel = item.channel
+                seen[channel.topic] += 1
+                if frames.keeps(item, seen[channel.topic]) and channel.type in _KNOWN_TYPES:
+                    file.log(channel.topic, channel.type, item.data, item.log_ns, latched=channel.has_qos)
                     num_messages += 1
             elif item is None:
                 file.flush()
@@ -135,7 +138,7 @@ class _Frames(NamedTuple):
     """
 
     num_frames: int
-    keeps: Callable[[SalvagedMessage, int], bool]
+    keeps: Callable[[ScannedMessage, int], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,12 +158,26 @@ class _Survey:
     reason: str
 
 
-def _items(source: Path) -> Iterator[SalvagedMessage | Metadata | str | None]:
+def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
+    """What `scan` gives of a file, and last, unless it ends as it should, a string that says why reading stopped."""
     try:
-        yield from salvage(source)
+        with open_regular(source) as file:
+            size = file.seek(0, 2)
+            file.seek(0)
+            if file.read(len(MAGIC)) != MAGIC:
+                yield "the file is empty" if size == 0 else "the file is no MCAP file"
+                return
+            with damage_as_recording_error(source):
+                yield from scan(file, Unpacked(Limits.of_file(size)))
     except OSError as error:
         unreadable = RecordingError(f"The file cannot be read ({error.strerror}): {source}")
         raise resource_error(error, source) or unreadable from error
+    except RecordingError as error:
+        cause = error.__cause__
+        if isinstance(cause, LimitError):
+            yield f"the rest is not read, {cause}"
+        else:
+            yield str(cause) if isinstance(cause, CutOffError) else "a record is damaged"
 
 
 def _survey(source: Path) -> _Survey:
@@ -175,7 +192,7 @@ def _survey(source: Path) -> _Survey:
             metadata.check_seal(item.name, item.metadata)
             found[item.name] = item.metadata
         elif item is not None:
-            counts[item.topic] += 1
+            counts[item.channel.topic] += 1
     for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.EXTERNAL, _frames_of_external)):
         if name not in found:
             continue
@@ -196,7 +213,7 @@ def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames
         topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
     num_frames = min(counts[topic] for topic in topics)
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return _Frames(num_frames, lambda message, count: message.time_ns <= last_ns)
+    return _Frames(num_frames, lambda message, count: message.log_ns <= last_ns)
 
 
 def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
@@ -205,7 +222,7 @@ def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frame
     topics = {stream.topic for stream in frame_streams(info)}
     num_frames = min(counts[topic] for topic in topics)
 
-    def keeps(message: SalvagedMessage, count: int) -> bool:
-        return message.topic not in topics | {channels.TF} or count <= num_frames
+    def keeps(message: ScannedMessage, count: int) -> bool:
+        return message.channel.topic not in topics | {channels.TF} or count <= num_frames
 
     return _Frames(num_frames, keeps)

@@ -21,8 +21,9 @@ from demorec.core.errors import ConfigError, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.mcap.limits import LimitError, Limits, Unpacked
+from demorec.mcap.scan import ScannedMessage
 from demorec.runs.run_file import sha256_of
-from demorec.sources.bag_files import MAX_TIME_NS, SQLITE_MAGIC, BagError, BagMessage, read_mcap, read_sqlite
+from demorec.sources.bag_files import MAX_TIME_NS, SQLITE_MAGIC, BagError, read_mcap, read_sqlite
 from demorec.sources.words import in_natural_order
 
 METADATA = "metadata.yaml"
@@ -68,7 +69,7 @@ class Bag:
         """Of its files, by which it is known again."""
         return tuple((path.name, sha256_of(path)) for path in self.files)
 
-    def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+    def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[ScannedMessage]:
         """Its messages in the order in which they were written.
 
         Args:
@@ -96,7 +97,7 @@ class Bag:
                         continue
                     yield self._unpack(message, tell, unpacked) if self.messages_are_compressed else message
 
-    def _unpack(self, message: BagMessage, tell: Any, unpacked: Unpacked) -> BagMessage:
+    def _unpack(self, message: ScannedMessage, tell: Any, unpacked: Unpacked) -> ScannedMessage:
         try:
             blocks = []  # not at once: as much as the data claim would be reserved, whatever comes
             for block in zstandard.ZstdDecompressor().read_to_iter(message.data, write_size=_COPY_BYTES):

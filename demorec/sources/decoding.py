@@ -11,7 +11,7 @@ import numpy as np
 from demorec.core.errors import in_words
 from demorec.core.plain import MAX_DEPTH, parse_json
 from demorec.mcap.limits import Budget, SpentError
-from demorec.sources.bag_files import BagChannel, BagMessage
+from demorec.mcap.scan import ScannedChannel, ScannedMessage
 from demorec.sources.ros_types import Budgets, Values, ros_decoder
 
 _BYTES_OF_VALUE = 200
@@ -30,7 +30,7 @@ class UnknownEncodingError(ValueError):
     """Messages in an encoding, or of a definition, that cannot be read; `str` is the reason."""
 
 
-def decoder_of(channel: BagChannel, budgets: Budgets | None = None) -> Decoder:
+def decoder_of(channel: ScannedChannel, budgets: Budgets | None = None) -> Decoder:
     """What reads the messages of a channel, within the budgets; UnknownEncodingError says why nothing does."""
     budgets = budgets or Budgets()
     try:
@@ -62,9 +62,9 @@ class BagDecoder:
 
     def __init__(self, num_bytes: int = 0) -> None:
         self.budgets = Budgets(num_bytes)
-        self._decoders: dict[BagChannel, Decoder | UnknownEncodingError] = {}
+        self._decoders: dict[ScannedChannel, Decoder | UnknownEncodingError] = {}
 
-    def values(self, message: BagMessage) -> Values:
+    def values(self, message: ScannedMessage) -> Values:
         """Of a message.
 
         Raises:
@@ -82,7 +82,7 @@ class BagDecoder:
             raise UnknownEncodingError(str(decoder))
         return decoder(message.data)
 
-    def may_keep(self, message: BagMessage) -> bool:
+    def may_keep(self, message: ScannedMessage) -> bool:
         """Whether the values that a message has just given are few enough to be kept beside those kept before."""
         used = self.budgets.values.used - self.budgets.values.begun
         try:

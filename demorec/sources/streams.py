@@ -20,8 +20,9 @@ from demorec.core.errors import in_words
 from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
 from demorec.mcap.limits import SpentError
+from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag
-from demorec.sources.bag_files import BagError, BagMessage
+from demorec.sources.bag_files import BagError
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import (
     FieldError,
@@ -99,7 +100,7 @@ class Stream:
     first_problem: str = ""
     first_refusal: str = ""
 
-    def add(self, number: int, message: BagMessage, values: Values, checksum: int) -> None:
+    def add(self, number: int, message: ScannedMessage, values: Values, checksum: int) -> None:
         """Take one message."""
         self.type = self.type or message.channel.type
         try:
@@ -254,7 +255,7 @@ class BagStreams:
         self._types: dict[str, set[str]] = {}
         self._refused: dict[str, str] = {}
 
-    def add(self, message: BagMessage) -> None:
+    def add(self, message: ScannedMessage) -> None:
         """Take a message."""
         topic = message.channel.topic
         number = self._counts.get(topic, 0)
@@ -292,7 +293,7 @@ class BagStreams:
             kept = {key: values[key] for key in _INFO_FIELDS if key in values} | {"frame_id": frame_id_of(values)}
             self.infos.setdefault(self._info_topics[topic], kept)
 
-    def _add_text(self, topic: str, message: BagMessage, values: Values) -> None:
+    def _add_text(self, topic: str, message: ScannedMessage, values: Values) -> None:
         try:
             value = follow(values, parse_path(self._fields[topic]))
         except ValueError as error:

@@ -19,8 +19,9 @@ import numpy as np
 
 from demorec.episode.info import DEPTH_UNITS
 from demorec.mcap.limits import SpentError
+from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag, open_bag
-from demorec.sources.bag_files import BagError, BagMessage
+from demorec.sources.bag_files import BagError
 from demorec.sources.candidates import Vector, transforms_of, vectors_of
 from demorec.sources.choice import choose_features
 from demorec.sources.clock import NS, SKEW_S
@@ -145,7 +146,7 @@ def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
     return topics
 
 
-def _look_into(topic: _Topic, message: BagMessage, decoder: BagDecoder) -> None:
+def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> None:
     try:
         values = decoder.values(message)
     except (UnknownEncodingError, SpentError) as error:

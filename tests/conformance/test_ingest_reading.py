@@ -14,8 +14,9 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from support import bags
 
+from demorec.mcap.scan import ScannedChannel
 from demorec.sources.bag import Bag, open_bag
-from demorec.sources.bag_files import BagChannel, BagError
+from demorec.sources.bag_files import BagError
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError, decoder_of
 from demorec.sources.fields import stamp_of
 
@@ -170,7 +171,9 @@ HOSTILE = {
 
 @pytest.mark.parametrize("name", sorted(HOSTILE))
 def test_definitions_are_data(name: str) -> None:
-    channel = BagChannel(topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=HOSTILE[name])
+    channel = ScannedChannel(
+        topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=HOSTILE[name]
+    )
     with pytest.raises(UnknownEncodingError):
         decoder_of(channel)
     assert not Path("/tmp/ran").exists()
@@ -179,7 +182,7 @@ def test_definitions_are_data(name: str) -> None:
 def test_no_message_fills_the_memory() -> None:
     schema = b"float64[] values\nstring[] names\nb/E[] items\n" + b"=" * 80 + b"\nMSG: b/E\n"
     decode = decoder_of(
-        BagChannel(topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=schema)
+        ScannedChannel(topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=schema)
     )
     many = (2**32 - 1).to_bytes(4, "little")
     for data in (many, bytes(4) + many, bytes(8) + many, b""):
