@@ -344,7 +344,9 @@ def driver(args: argparse.Namespace) -> dict[str, Any]:
         )
         for count in args.driver:
             plans = (EpisodePlan(config=config, episode_index=index) for index in range(count))
-            run = replace(run, num_episodes=count, attempts=tuple(make_nothing(plan, Path()) for plan in plans))
+            run = replace(
+                run.with_generation(num_episodes=count), attempts=tuple(make_nothing(plan, Path()) for plan in plans)
+            )
             start = time.process_time()
             save_run_file(run, Path(temporary))
             saved = time.process_time()

@@ -21,8 +21,7 @@ from demorec.episode.episode import Outcome
 from demorec.episode.features import STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_recording
-from demorec.runs.external import is_external_run, load_external_run
-from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
+from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, is_external_run, load_any_run_file
 
 _MAX_JSON_BYTES = 2 << 30
 _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}
@@ -113,7 +112,7 @@ class CheckedRun:
     def listed(self) -> dict[str, str]:
         """File -> SHA-256 (hex), as run.json has them."""
         if self.form == "external run":
-            return {line.file: line.sha256 for line in load_external_run(self.path).episodes}
+            return {line.file: line.sha256 for line in load_any_run_file(self.path).attempts}
         return {line["file"]: line["sha256"] for line in self.lines}
 
     @property

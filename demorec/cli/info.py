@@ -19,7 +19,6 @@ from demorec.runs.find import Found, expect
 if TYPE_CHECKING:
     from demorec.episode.info import Origin
     from demorec.mcap.summary import CameraSummary, FeatureSummary, RecordingSummary
-    from demorec.runs.external import ExternalRun
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
@@ -160,23 +159,20 @@ def _camera(summary: RecordingSummary, camera: CameraSummary) -> Iterator[str]:
 
 
 def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.core.plain import to_plain
-    from demorec.runs.external import is_external_run, load_external_run
-    from demorec.runs.run_file import load_run_file
+    from demorec.runs.run_file import load_any_run_file
 
-    if is_external_run(path):
-        external = load_external_run(path)
+    run = load_any_run_file(path)
+    if run.generation is None:
         left_out = _left_out(path)
-        plain = {"kind": "external run", "path": str(path), "digest": external.digest, **to_plain(external)}
-        return plain | {"left_out": left_out}, [*_external_run_lines(path, external), *_left_out_lines(left_out)]
-    run = load_run_file(path)
+        plain = {"kind": "external run", "path": str(path), "digest": run.digest, **run.plain()}
+        return plain | {"left_out": left_out}, [*_external_run_lines(path, run), *_left_out_lines(left_out)]
     plain = {
         "kind": "run",
         "path": str(path),
         "complete": run.is_complete,
         "digest": run.digest,
         "config_digest": run.config_digest,
-        **to_plain(run),
+        **run.plain(),
     }
     return plain, _run_lines(path, run)
 
@@ -214,17 +210,17 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
     return [*aligned(facts), "", *aligned(rows)]
 
 
-def _external_run_lines(path: Path, run: ExternalRun) -> list[str]:
+def _external_run_lines(path: Path, run: RunFile) -> list[str]:
     """About a run."""
-    frames = sum(line.num_frames for line in run.episodes)
-    counts = {word: sum(line.success is success for line in run.episodes) for success, word in _SUCCESS_WORDS.items()}
+    frames = sum(line.num_frames for line in run.attempts)
+    counts = {word: sum(line.success is success for line in run.attempts) for success, word in _SUCCESS_WORDS.items()}
     told = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     facts = [
         ("run", f"{path} (external)"),
         ("robot", run.robot),
-        ("episodes", f"{len(run.episodes)} ({told})"),
+        ("episodes", f"{len(run.attempts)} ({told})"),
         ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
-        ("size", size_in_words(sum(line.num_bytes for line in run.episodes))),
+        ("size", size_in_words(sum(line.num_bytes for line in run.attempts))),
         ("digest", run.digest),
     ]
     rows = [("episode", "outcome", "frames", "size", "file", "task")]
@@ -237,7 +233,7 @@ def _external_run_lines(path: Path, run: ExternalRun) -> list[str]:
             line.file,
             line.instruction,
         )
-        for line in run.episodes
+        for line in run.attempts
     ]
     return [*aligned(facts), "", *aligned(rows)]
 

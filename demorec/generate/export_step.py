@@ -71,7 +71,7 @@ def export_run(
             says(f"{DATASET}/ is no longer there; it is made again.")
         record = ExportRecord(run_digest=run.digest, repo_id=repo_id)
         # Written down before: after a crash in between, what is there is known to be ours.
-        save_run_file(replace(run, export=record), folder)
+        save_run_file(run.with_generation(export=record), folder)
         start = time.process_time()
         wanted = f":{run.num_episodes}" if run.beyond else ""
         report = export_lerobot(
@@ -81,7 +81,7 @@ def export_run(
             progress=progress,
         )
         record = replace(record, dataset_digest=report.digest, seconds=round(time.process_time() - start, 3))
-        save_run_file(replace(run, export=record), folder)
+        save_run_file(run.with_generation(export=record), folder)
         return record, report
 
 

@@ -36,6 +36,7 @@ from demorec.runs.run_file import (
     UNFINISHED,
     Attempt,
     DamagedRunFileError,
+    Generation,
     RunFile,
     RunSession,
     free_name,
@@ -153,7 +154,9 @@ def open_run(
     """
     assert options.out is not None
     path = options.out.absolute()
-    asked = RunFile(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
+    asked = RunFile(
+        generation=Generation(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
+    )
     with _told_as_unusable(path):
         if has_unsettled_parts(path):
             check_unsettled_parts(path, PARTS)
@@ -195,7 +198,7 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, ins
         kept = free_name(path / f"{RUN_NAME}.damaged")
         (path / RUN_NAME).rename(kept)
         progress.says(f"{damage}. It is kept as {kept.name}; the recordings are read instead.")
-    run = replace(run, num_episodes=asked.num_episodes)
+    run = run.with_generation(num_episodes=asked.num_episodes)
     with _told_as_unusable(path):
         for name in (EPISODES, FAILED, UNFINISHED):
             (path / name).mkdir(exist_ok=True)
@@ -265,7 +268,7 @@ def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Insp
             if (lack := resource_error(error, file)) is not None:
                 raise lack from error
             continue
-        return RunFile(config=config, versions=versions, num_episodes=asked.num_episodes)
+        return asked.with_generation(config=config, versions=versions)
     return asked
 
 

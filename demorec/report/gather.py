@@ -29,9 +29,17 @@ from demorec.report.content import (
 )  # fmt: skip
 from demorec.report.dataset import dataset_report
 from demorec.report.filmstrip import MAX_SHOWN, filmstrip, strip_budget
-from demorec.runs.external import is_external_run, load_external_run
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
-from demorec.runs.run_file import FAILED, RUN_NAME, Attempt, DamagedRunFileError, RunFile, load_run_file
+from demorec.runs.run_file import (
+    FAILED,
+    RUN_NAME,
+    Attempt,
+    DamagedRunFileError,
+    RunFile,
+    is_external_run,
+    load_any_run_file,
+    load_run_file,
+)
 
 _KINDS: Mapping[PathKind, str] = {
     "recording": "recording",
@@ -233,4 +241,4 @@ def _facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode
         yield "variation", run.config.variation
         yield "run digest", run.digest
     elif found.kind == "run" and is_external_run(found.path):
-        yield "run digest", load_external_run(found.path).digest
+        yield "run digest", load_any_run_file(found.path).digest

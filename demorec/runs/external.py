@@ -1,4 +1,4 @@
-"""The folder of a run whose episodes were collected: numbered recordings in episodes/, run.json, a lock.
+"""The folder of a run whose episodes are external: numbered recordings in episodes/, run.json, a lock.
 
 The recordings are the truth; run.json has a line for each and can be made again from them. An episode that a crash cut
 off is made whole when the folder is opened again, and nothing that is there is ever written over.
@@ -9,109 +9,32 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
-from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
-from demorec.core.files import LOCK_NAME, MAX_JSON_BYTES, make_folder, read_json_limited, run_lock
-from demorec.core.plain import from_plain, to_plain
-from demorec.core.replacing import json_object
+from demorec.core.errors import ConfigError, RecordingError, resource_error
+from demorec.core.files import LOCK_NAME, make_folder, run_lock
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, recover
 from demorec.runs.run_file import (
-    COLLECTED,
     DATASET,
     EPISODES,
     IMPORT_NAME,
-    RUN_FORMAT,
     RUN_NAME,
+    Attempt,
     DamagedRunFileError,
+    RunFile,
+    RunSession,
     free_name,
+    is_external_run,
+    load_any_run_file,
+    recorded_line,
     recording_name,
     refuse_strangers,
-    replace_run_file,
-    sha256_of,
+    save_run_file,
     utc_now,
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExternalEpisode:
-    """One episode: a line of run.json.
-
-    Attributes:
-        episode_index: Which.
-        instruction: In words.
-        success: None when nobody said.
-        file: Recording, relative to the run's folder.
-        sha256: Of the file.
-        digest: Of its content.
-        num_frames, num_bytes: Of the recording.
-        drops: "frames" or camera -> how many of them could not be taken.
-        reason: Why it is no success.
-    """
-
-    episode_index: int
-    instruction: str
-    success: bool | None
-    file: str
-    sha256: str
-    digest: str
-    num_frames: int
-    num_bytes: int
-    drops: Mapping[str, int] = field(default_factory=dict)
-    reason: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExternalRun:
-    """The content of run.json.
-
-    Attributes:
-        robot: Its name.
-        fps: Nominal frames per second.
-        episodes: Every one, in order.
-        sessions: "started" and "ended" (UTC, ISO 8601; "" while it goes on) of each program that added some.
-    """
-
-    robot: str
-    fps: int
-    episodes: tuple[ExternalEpisode, ...] = ()
-    sessions: tuple[Mapping[str, str], ...] = ()
-
-    @property
-    def digest(self) -> str:
-        """Content digest of the run: of its episodes in order; not of times."""
-        lines = [f"{line.episode_index} {line.success} {line.digest}" for line in self.episodes]
-        return sha256("\n".join(lines).encode()).hexdigest()[:16]
-
-
-def is_external_run(folder: Path) -> bool:
-    """Whether the folder has a run.json of a run whose episodes were collected."""
-    return json_object(folder / RUN_NAME).get("kind") == COLLECTED
-
-
-def load_external_run(folder: Path) -> ExternalRun:
-    """Read run.json.
-
-    Raises:
-        ConfigError: It is of another kind of run, or of a newer format.
-        DamagedRunFileError: It is no run file.
-    """
-    path = folder / RUN_NAME
-    try:
-        plain = read_json_limited(path, MAX_JSON_BYTES)
-        if not isinstance(plain, dict):
-            raise ValueError("no JSON object")
-        if plain.get("kind") != COLLECTED or plain.get("format", 0) > RUN_FORMAT:
-            raise ConfigError(f"The folder holds a run of another kind: choose another folder: {folder}")
-        for derived in ("format", "kind", "digest"):
-            plain.pop(derived)
-        return from_plain(plain, ExternalRun)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
-        raise resource_error(error, path) or damaged from error
 
 
 class ExternalFolder:
@@ -130,17 +53,17 @@ class ExternalFolder:
     def __init__(self, path: Path, *, recovers: bool = True) -> None:
         self.path = path
         self.recovered: list[Path] = []
-        self._session = {"started": utc_now(), "ended": ""}
-        known, is_damaged = ExternalRun(robot="", fps=1), False
+        self._session = RunSession(started=utc_now())
+        known, is_damaged = RunFile(), False
         if os.path.lexists(path / RUN_NAME):
             try:
-                known = load_external_run(path)
+                known = _load(path)
             except DamagedRunFileError:  # the recordings know what it said
                 is_damaged = True
         if recovers:
             self._recover_parts()
         self._sessions = known.sessions
-        lines = {line.file: line for line in known.episodes}
+        lines = {line.file: line for line in known.attempts}
         self.episodes = [self._line(file, lines) for file in sorted((path / EPISODES).glob("episode_*.mcap"))]
         if is_damaged:
             (path / RUN_NAME).rename(free_name(path / f"{RUN_NAME}.damaged"))
@@ -157,7 +80,7 @@ class ExternalFolder:
             part.rename(free_name(part.with_name(f"{part.name}.recovered")))
             self.recovered.append(target)
 
-    def _line(self, file: Path, known: Mapping[str, ExternalEpisode]) -> ExternalEpisode:
+    def _line(self, file: Path, known: Mapping[str, Attempt]) -> Attempt:
         """What run.json says of a recording, or what it says itself where that is not the same file."""
         line = known.get(f"{EPISODES}/{file.name}")
         if line is not None and line.num_bytes == file.stat().st_size:
@@ -208,14 +131,14 @@ class ExternalFolder:
             f"{path}"
         )
 
-    def add(self, recording: Path) -> ExternalEpisode:
+    def add(self, recording: Path) -> Attempt:
         """Take a finished recording into run.json."""
         line = external_line(recording)
         self.extend([line])
         return line
 
-    def extend(self, lines: Iterable[ExternalEpisode]) -> None:
-        """Take finished recordings into run.json, by their `collected_line`."""
+    def extend(self, lines: Iterable[Attempt]) -> None:
+        """Take finished recordings into run.json, by their `external_line`."""
         self.episodes = sorted([*self.episodes, *lines], key=lambda line: line.episode_index)
         self.save()
 
@@ -223,20 +146,24 @@ class ExternalFolder:
         """Write run.json, if there is anything to tell."""
         if (info := self.kind()) is None:
             return
-        session = self._session | ({"ended": utc_now()} if ended else {})
-        run = ExternalRun(
-            robot=info.robot_name, fps=info.fps, episodes=tuple(self.episodes), sessions=(*self._sessions, session)
-        )
-        plain = to_plain(run)
-        lines = plain.pop("episodes")
+        session = replace(self._session, ended=utc_now() if ended else "")
+        sessions = (*self._sessions, session)
+        run = RunFile(robot=info.robot_name, fps=info.fps, attempts=tuple(self.episodes), sessions=sessions)
         try:
-            head = {"format": RUN_FORMAT, "kind": COLLECTED, "digest": run.digest, **plain}
-            replace_run_file(self.path, head, lines)
+            save_run_file(run, self.path)
         except OSError as error:
             unwritable = RecordingError(
                 f"run.json cannot be written ({error.strerror}), the recordings are all there: {self.path}"
             )
             raise resource_error(error) or unwritable from error
+
+
+def _load(path: Path) -> RunFile:
+    """run.json; ConfigError unless it is of external episodes."""
+    run = load_any_run_file(path)
+    if run.generation is not None:
+        raise ConfigError(f"The folder holds a run of another kind: choose another folder: {path}")
+    return run
 
 
 @contextmanager
@@ -253,7 +180,7 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
     if path.is_dir() and not is_external_run(path):
         if (path / RUN_NAME).exists():
             with suppress(DamagedRunFileError):  # whose recordings know what it said
-                load_external_run(path)
+                _load(path)
         refuse_strangers(path, (EPISODES, DATASET, IMPORT_NAME, LOCK_NAME))
     make_folder(path / EPISODES)
     with run_lock(path):
@@ -270,22 +197,9 @@ def episode_path(run: Path, episode_index: int) -> Path:
     return run / EPISODES / recording_name(episode_index, 0, success=True)
 
 
-def external_line(file: Path) -> ExternalEpisode:
+def external_line(file: Path) -> Attempt:
     """The line of run.json that a recording speaks for; RecordingError when it is damaged."""
-    with Recording(file) as recording:
-        info, outcome = recording.info, recording.outcome
-        return ExternalEpisode(
-            episode_index=info.episode_index,
-            instruction=info.instruction,
-            success=None if outcome is None else outcome.success,
-            file=f"{EPISODES}/{file.name}",
-            sha256=sha256_of(file),
-            digest=recording.digest(),
-            num_frames=recording.num_frames,
-            num_bytes=file.stat().st_size,
-            drops={} if outcome is None else outcome.drops,
-            reason="cut off by a crash" if outcome is None else outcome.failure_reason,
-        )
+    return replace(recorded_line(file)[0], file=f"{EPISODES}/{file.name}")
 
 
 def differences(there: EpisodeInfo, new: EpisodeInfo) -> list[str]:

@@ -1,7 +1,8 @@
 """run.json: what a run is, what it is made with, and how far it is; one line per episode, replaced atomically.
 
 The recordings are the truth and this file their table of contents: a line that a crash lost is read back from its
-recording. What decides the data (config, versions) is kept apart from what does not (machine, times).
+recording. What decides the data (config, versions) is kept apart from what does not (machine, times). A run whose
+episodes demorec did not generate is one without a `Generation`.
 """
 
 from __future__ import annotations
@@ -10,23 +11,31 @@ import hashlib
 import json
 import os
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from demorec.core.config import GenerateConfig
-from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
+from demorec.core.errors import (
+    ConfigError,
+    DemorecError,
+    NotSimulatedError,
+    RecordingError,
+    in_words,
+    resource_error,
+)
 from demorec.core.files import MAX_JSON_BYTES, open_regular, read_json_limited, replace_text
 from demorec.core.plain import digest, from_plain, to_plain
-from demorec.core.replacing import shown
+from demorec.core.replacing import json_object, shown
+from demorec.episode.info import EpisodeInfo
 
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
 MAX_EPISODES = 10_000_000
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
-COLLECTED = "collected"
-"""The "kind" that run.json has where the run's episodes were collected; see `demorec.runs.external`."""
+_EXTERNAL = "collected"
+"""The "kind" that run.json has where the episodes are external; see `demorec.runs.external`."""
 IMPORT_NAME = "import.json"
 """Beside run.json: what `demorec import` read, and what it found in it (`demorec.sources.import_file`)."""
 STARTING = "starting"
@@ -44,7 +53,7 @@ class Attempt:
     Attributes:
         episode_index, attempt: Which.
         seed: Root seed; with index and attempt it gives every random number (demorec.core.seeding).
-        success: Whether every check of the task passed.
+        success: Whether every check of the task passed; None when nobody said.
         file: Recording, relative to the run's folder; "" when no scene could be laid out, so that nothing was
             recorded.
         sha256: Of the file.
@@ -53,12 +62,14 @@ class Attempt:
         phase, reason: Of the failure; "" on success.
         seconds: stage -> CPU seconds: "simulation", "rendering", "recording", and "starting" for the first
             attempt of a worker. Not part of any digest.
+        instruction: In words, of an external episode.
+        drops: Of an external episode: "frames" or camera -> how many of them could not be taken.
     """
 
     episode_index: int
-    attempt: int
-    seed: int
-    success: bool
+    attempt: int = 0
+    seed: int = 0
+    success: bool | None
     file: str
     sha256: str
     digest: str
@@ -67,6 +78,15 @@ class Attempt:
     phase: str = ""
     reason: str = ""
     seconds: Mapping[str, float] = field(default_factory=dict)
+    instruction: str = ""
+    drops: Mapping[str, int] = field(default_factory=dict)
+
+
+_EXTERNAL_LINE = (
+    "episode_index", "instruction", "success", "file", "sha256", "digest", "num_frames", "num_bytes", "drops", "reason"
+)  # fmt: skip
+"""What the line of an external episode says; that of an attempt at a generated one says all but the last of these."""
+_LINE = tuple(one.name for one in fields(Attempt) if one.name not in ("instruction", "drops"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,27 +116,66 @@ class ExportRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunFile:
-    """The content of run.json.
+class Generation:
+    """What a run that demorec generates is made with, and how far it shall go.
 
     Attributes:
         config: What decides the data.
         versions: package -> version, of what decides the bits.
         num_episodes: How many successes were asked for last: of the episodes 0 to num_episodes - 1.
-        attempts: Every finished attempt at these episodes, ordered by episode and attempt.
-        beyond: The same of later episodes, which were made when more was asked for. They stay, and are no part of the
-            run: not of its digest, not of its dataset.
-        sessions: Every start of the command.
+        beyond: As `RunFile.attempts`, of later episodes, which were made when more was asked for. They stay, and are no
+            part of the run: not of its digest, not of its dataset.
         export: The dataset made from it, if any.
     """
 
     config: GenerateConfig
     versions: Mapping[str, str]
     num_episodes: int
-    attempts: tuple[Attempt, ...] = ()
     beyond: tuple[Attempt, ...] = ()
-    sessions: tuple[RunSession, ...] = ()
     export: ExportRecord | None = None
+
+
+class _Generated[V]:
+    """A value of the generation, read as one of the run's; ConfigError where there is none."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, run: RunFile, _: type | None = None) -> V:
+        if run.generation is None:
+            raise ConfigError("The episodes of this run were recorded by another robot or program, not generated.")
+        value: V = getattr(run.generation, self._name)
+        return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFile:
+    """The content of run.json.
+
+    Attributes:
+        generation: None of a run whose episodes are external. Its values can be read as those of the run
+            (`run.config`); that raises ConfigError where there are none.
+        robot, fps: Of external episodes: name of the robot, nominal frames per second.
+        attempts: Every finished attempt at the episodes that are asked for, ordered by episode and attempt.
+        sessions: Every start of the command, or of a program that added episodes.
+    """
+
+    generation: Generation | None = None
+    robot: str = ""
+    fps: int = 0
+    attempts: tuple[Attempt, ...] = ()
+    sessions: tuple[RunSession, ...] = ()
+
+    config = _Generated[GenerateConfig]()
+    versions = _Generated[Mapping[str, str]]()
+    num_episodes = _Generated[int]()
+    beyond = _Generated[tuple[Attempt, ...]]()
+    export = _Generated[ExportRecord | None]()
+
+    def with_generation(self, **changes: Any) -> RunFile:
+        """The same run with other values of its generation, which it must have."""
+        assert self.generation is not None
+        return replace(self, generation=replace(self.generation, **changes))
 
     @property
     def config_digest(self) -> str:
@@ -148,8 +207,11 @@ class RunFile:
     @property
     def digest(self) -> str:
         """Content digest of the run: of config and attempts, in order; not of times, machines or versions."""
-        lines = [self.config_digest]
-        lines += [f"{a.episode_index} {a.attempt} {int(a.success)} {a.digest}" for a in self.attempts]
+        if self.generation is None:
+            lines = [f"{a.episode_index} {a.success} {a.digest}" for a in self.attempts]
+        else:
+            lines = [self.config_digest]
+            lines += [f"{a.episode_index} {a.attempt} {int(bool(a.success))} {a.digest}" for a in self.attempts]
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
     @property
@@ -160,29 +222,42 @@ class RunFile:
     def with_attempts(self, attempts: Iterable[Attempt]) -> RunFile:
         """This run with these attempts, in order; those of later episodes than asked for are `beyond`."""
         ordered = sorted(attempts, key=lambda a: (a.episode_index, a.attempt))
-        return replace(
-            self,
-            attempts=tuple(a for a in ordered if a.episode_index < self.num_episodes),
-            beyond=tuple(a for a in ordered if a.episode_index >= self.num_episodes),
-        )
+        within = tuple(a for a in ordered if a.episode_index < self.num_episodes)
+        beyond = tuple(a for a in ordered if a.episode_index >= self.num_episodes)
+        return replace(self.with_generation(beyond=beyond), attempts=within)
+
+    def plain(self) -> dict[str, Any]:
+        """All of it as plain data."""
+        plain: dict[str, Any] = to_plain(self)
+        if self.generation is None:
+            sessions = [{key: session[key] for key in ("started", "ended")} for session in plain["sessions"]]
+            return {"robot": self.robot, "fps": self.fps, "sessions": sessions, "episodes": self._lines(_EXTERNAL_LINE)}
+        generation = {key: value for key, value in plain["generation"].items() if key != "beyond"}
+        export = generation.pop("export")
+        lines = self._lines(_LINE)
+        count = len(self.attempts)
+        return {
+            **generation,
+            "sessions": plain["sessions"],
+            "export": export,
+            "attempts": lines[:count],
+            "beyond": lines[count:],
+        }
+
+    def _lines(self, keys: Iterable[str]) -> list[dict[str, Any]]:
+        attempts = self.attempts if self.generation is None else self.known
+        return [{key: line[key] for key in keys} for line in map(to_plain, attempts)]
 
 
 def save_run_file(run: RunFile, folder: Path) -> None:
     """Replace run.json in one step: a reader or a crash sees the old or the new one, never a mixture."""
-    plain = to_plain(run)
-    attempts = plain.pop("attempts") + plain.pop("beyond")
-    head = {
-        "format": RUN_FORMAT,
-        "config_digest": run.config_digest,
-        "digest": run.digest,
-        "complete": run.is_complete,
-        **plain,
-    }
-    replace_run_file(folder, head, _episode_lines(run, attempts))
-
-
-def replace_run_file(folder: Path, head: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> None:
-    """Write run.json anew: `head`, and "episodes" with one line each."""
+    plain, head = run.plain(), {"format": RUN_FORMAT}
+    if run.generation is None:
+        lines = plain.pop("episodes")
+        head |= {"kind": _EXTERNAL, "digest": run.digest, **plain}
+    else:
+        lines = _episode_lines(run, plain.pop("attempts") + plain.pop("beyond"))
+        head |= {"config_digest": run.config_digest, "digest": run.digest, "complete": run.is_complete, **plain}
     text = json.dumps(head, indent=2, allow_nan=False)[:-2]
     text += ',\n  "episodes": [\n' + ",\n".join("    " + json.dumps(line, allow_nan=False) for line in lines)
     text += "\n  ]\n}\n"
@@ -190,30 +265,43 @@ def replace_run_file(folder: Path, head: Mapping[str, Any], lines: Iterable[Mapp
     sync_folder(folder)
 
 
+def is_external_run(folder: Path) -> bool:
+    """Whether the folder has a run.json of a run whose episodes are external."""
+    return json_object(folder / RUN_NAME).get("kind") == _EXTERNAL
+
+
 def load_run_file(folder: Path) -> RunFile:
-    """Read run.json.
+    """Read run.json of a run that demorec generated.
 
     Raises:
-        ConfigError: There is none, or it is of a newer format.
+        ConfigError: There is none, or it is of a newer format, or of external episodes.
         DamagedRunFileError: It is no run file.
     """
+    run = load_any_run_file(folder)
+    if run.generation is None:
+        raise ConfigError(
+            f"The episodes of this run were recorded by another robot or program, not generated: {folder}"
+        )
+    return run
+
+
+def load_any_run_file(folder: Path) -> RunFile:
+    """Read run.json, whatever the run's episodes are; errors as of `load_run_file`."""
     path = folder / RUN_NAME
     try:
         plain = read_json_limited(path, MAX_JSON_BYTES)
         if not isinstance(plain, dict):
             raise ValueError("no JSON object")
-        if plain.get("kind") == COLLECTED:
-            raise ConfigError(
-                f"The episodes of this run were recorded by another robot or program, not generated: {folder}"
-            )
-        if plain.get("format", 0) > RUN_FORMAT:
-            raise ConfigError(
-                f"run.json has format {str(plain['format'])[:40]}, this demorec knows up to {RUN_FORMAT}: {path}"
-            )
-        attempts = [line for line in plain.pop("episodes") if line.pop("state") != "planned"]
-        for derived in ("format", "config_digest", "digest", "complete"):
+        if (version := plain.pop("format")) > RUN_FORMAT:
+            raise ConfigError(f"run.json has format {str(version)[:40]}, this demorec knows up to {RUN_FORMAT}: {path}")
+        lines, sessions = plain.pop("episodes"), plain.pop("sessions", [])
+        del plain["digest"]
+        if plain.pop("kind", "") == _EXTERNAL:
+            return from_plain({**plain, "attempts": lines, "sessions": sessions}, RunFile)
+        attempts = [line for line in lines if line.pop("state") != "planned"]
+        for derived in ("config_digest", "complete"):
             plain.pop(derived)
-        run = from_plain({**plain, "attempts": attempts}, RunFile)
+        run = from_plain({"generation": plain, "attempts": attempts, "sessions": sessions}, RunFile)
         _refuse_impossible(run)
         return run.with_attempts(run.attempts)
     except FileNotFoundError as error:
@@ -298,6 +386,35 @@ def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dic
             yield {"state": "planned", "episode_index": index, "seed": run.config.seed}
 
 
+def recorded_line(path: Path) -> tuple[Attempt, EpisodeInfo]:
+    """Read all of a recording: its line of run.json, with the bare name as its `file`, and what is known of it.
+
+    Raises:
+        RecordingError: It is damaged.
+    """
+    from demorec.mcap import open_recording  # which reading run.json alone does not need
+
+    with open_recording(path) as recording:
+        info, outcome = recording.info, recording.outcome
+        is_simulated = info.simulation is not None
+        line = Attempt(
+            episode_index=info.episode_index,
+            attempt=info.attempt,
+            seed=info.root_seed if is_simulated else 0,
+            success=None if outcome is None else outcome.success,
+            file=path.name,
+            sha256=sha256_of(path),
+            digest=recording.digest(),
+            num_frames=recording.num_frames,
+            num_bytes=path.stat().st_size,
+            phase="" if outcome is None else outcome.failure_phase,
+            reason="cut off by a crash" if outcome is None else outcome.failure_reason,
+            instruction="" if is_simulated else info.instruction,
+            drops={} if outcome is None else outcome.drops,
+        )
+        return line, info
+
+
 def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[str, str]]:
     """Read all of a finished recording: nothing that run.json says of it is taken on trust.
 
@@ -306,25 +423,11 @@ def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[s
         plain data; and package -> version of what decided the bits.
 
     Raises:
-        RecordingError: It is no complete recording.
+        RecordingError: It is no complete recording of an episode that demorec simulated.
     """
-    from demorec.mcap import open_recording  # which reading run.json alone does not need
-
-    with open_recording(path, simulated=True) as recording:
-        info, outcome = recording.info, recording.outcome
-        if outcome is None:
-            raise RecordingError(f"The recording was cut off by a crash: {path}")
-        attempt = Attempt(
-            episode_index=info.episode_index,
-            attempt=info.attempt,
-            seed=info.root_seed,
-            success=bool(outcome.success),
-            file=path.name,
-            sha256=sha256_of(path),
-            digest=recording.digest(),
-            num_frames=recording.num_frames,
-            num_bytes=path.stat().st_size,
-            phase=outcome.failure_phase,
-            reason=outcome.failure_reason,
-        )
-        return attempt, info.config, info.versions
+    attempt, info = recorded_line(path)
+    if info.simulation is None:
+        raise NotSimulatedError("scene", path)
+    if attempt.success is None:
+        raise RecordingError(f"The recording was cut off by a crash: {path}")
+    return attempt, info.config, info.versions

@@ -16,7 +16,8 @@ from typing import Any
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
 from demorec.core.processes import SPAWN
 from demorec.episode.info import EpisodeInfo
-from demorec.runs.external import ExternalEpisode, ExternalFolder, differences
+from demorec.runs.external import ExternalFolder, differences
+from demorec.runs.run_file import Attempt
 from demorec.sources.bag import Bag, Files, open_bag
 from demorec.sources.episode_writer import PlannedEpisode
 from demorec.sources.import_file import BagReport, ImportFile, SkippedBag, save_import_file
@@ -131,7 +132,7 @@ class Batch:
         *,
         ahead: int,
         read: Callable[[Bag], PlannedBag],
-        write: Callable[[PlannedBag], tuple[BagReport, list[ExternalEpisode]]],
+        write: Callable[[PlannedBag], tuple[BagReport, list[Attempt]]],
         tell: Callable[[BagReport], None],
     ) -> None:
         """Take new bags into a run; what a bag raises is raised after all bags before it are there.
@@ -148,7 +149,7 @@ class Batch:
         self._kind = folder.kind()
         waiting, failure = deque(bags), None
         reading: deque[tuple[Bag, Future[PlannedBag]]] = deque()
-        writing: deque[Future[tuple[BagReport, list[ExternalEpisode]]]] = deque()
+        writing: deque[Future[tuple[BagReport, list[Attempt]]]] = deque()
         while waiting or reading or writing:
             while waiting and len(reading) + len(writing) < ahead:
                 bag = waiting.popleft()
@@ -173,7 +174,7 @@ class Batch:
         if self._known.bags:
             save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
 
-    def _take(self, folder: ExternalFolder, report: BagReport, lines: Sequence[ExternalEpisode]) -> BagReport:
+    def _take(self, folder: ExternalFolder, report: BagReport, lines: Sequence[Attempt]) -> BagReport:
         """A bag whose episodes are written into the run."""
         folder.extend(lines)
         self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())

@@ -23,12 +23,12 @@ from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.video import size_problem
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import (
-    ExternalEpisode,
     differences,
     episode_path,
     external_line,
     open_external_run,
 )
+from demorec.runs.run_file import Attempt
 from demorec.sources.bag import Bag, Files, bags_in
 from demorec.sources.bag_files import BagError
 from demorec.sources.bag_findings import all_findings, row_findings
@@ -202,7 +202,7 @@ class _Importer:
                 yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
                 return
 
-    def write(self, planned: PlannedBag, folder: Path) -> tuple[BagReport, list[ExternalEpisode]]:
+    def write(self, planned: PlannedBag, folder: Path) -> tuple[BagReport, list[Attempt]]:
         """Write a bag's episodes into a run; its report, and their lines of run.json."""
         self._write(planned.bag, planned.episodes, folder)
         paths = [episode_path(folder, episode.info.episode_index) for episode in planned.episodes]

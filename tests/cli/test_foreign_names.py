@@ -18,7 +18,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, NotAllowedError
 from demorec.core.plain import to_plain
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.runs.run_file import RUN_NAME, RunFile, inspect_recording, save_run_file
+from demorec.runs.run_file import RUN_NAME, Generation, RunFile, inspect_recording, save_run_file
 
 SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap"))
 MODULE = "names_of_a_stranger"
@@ -65,7 +65,9 @@ def run_of(name: str, folder: Path) -> Path:
     file = "episodes/episode_000000.mcap"
     attempt = replace(inspect_recording(recording_of(name, folder / file))[0], file=file, success=True)
     config = GenerateConfig(task=name, robot=name, cameras=(name,))
-    save_run_file(RunFile(config=config, versions={}, num_episodes=1, attempts=(attempt,)), folder)
+    save_run_file(
+        RunFile(generation=Generation(config=config, versions={}, num_episodes=1), attempts=(attempt,)), folder
+    )
     return folder
 
 

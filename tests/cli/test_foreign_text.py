@@ -19,7 +19,7 @@ from support.recording import write_episode
 
 from demorec.cli import COMMANDS, main, run_command
 from demorec.mcap import Recording
-from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
+from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
 
 HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
 NAME = "\x1b[31mred\u202e.mcap"
@@ -93,7 +93,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     attempt = replace(inspect_recording(good)[0], file="episodes/episode_000000.mcap")
     config = GenerateConfig(cameras=())
-    save_run_file(RunFile(config=config, versions={}, num_episodes=1, attempts=(attempt,)), run)
+    save_run_file(RunFile(generation=Generation(config=config, versions={}, num_episodes=1), attempts=(attempt,)), run)
     file = run / "run.json"
     plain = json.loads(file.read_text())
     plain["versions"] = {HOSTILE: HOSTILE}

@@ -17,7 +17,7 @@ from support import bag_mappings, bags
 from demorec.cli import main
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.mcap import Recording
-from demorec.runs.external import load_external_run
+from demorec.runs.run_file import load_any_run_file
 
 
 def _run(*words: str | Path) -> int:
@@ -54,7 +54,7 @@ def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: p
     told = capsys.readouterr()
     assert "Nothing odd was found." in told.out
     assert told.err == ""
-    (episode,) = load_external_run(tmp_path / "run").episodes
+    (episode,) = load_any_run_file(tmp_path / "run").attempts
     with Recording(tmp_path / "run" / episode.file) as recording:
         sizes = {feature.name: len(feature.names) for feature in recording.info.features}
         assert (sizes["observation.state"], sizes["action"], len(recording.info.cameras)) == FEATURES[name]

@@ -26,7 +26,7 @@ from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.tables import CHECKS
 from demorec.episode.info import Origin
 from demorec.mcap import Recording
-from demorec.runs.external import load_external_run
+from demorec.runs.run_file import load_any_run_file
 from demorec.sources import import_run
 from demorec.sources.bag_files import BagError
 from demorec.sources.import_file import BagReport
@@ -145,7 +145,7 @@ def test_bad_bags_are_skipped_and_listed(
     for number, (line, (_, reason)) in enumerate(zip(lines[-len(BAD) :], BAD.values(), strict=True)):
         assert line.startswith(f"  {folder / f'run_{2 * number + 1}.mcap'}: ")
         assert reason in line
-    assert len(load_external_run(run).episodes) == len(BAD)
+    assert len(load_any_run_file(run).attempts) == len(BAD)
     for number in range(len(BAD)):
         with Recording(run / "episodes" / f"episode_{number:06d}.mcap") as recording:
             assert _files(recording) == [f"run_{2 * number}.mcap"]
@@ -170,7 +170,7 @@ def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path],
         progress=lambda *counts: done.append(counts),
     )  # fmt: skip
     assert _content(tmp_path / "run") == _content(alone)
-    assert load_external_run(tmp_path / "run").digest == load_external_run(alone).digest
+    assert load_any_run_file(tmp_path / "run").digest == load_any_run_file(alone).digest
     assert tuple(told) == result.reports
     assert done == [(count, 2 * len(BAD)) for count in range(2 * len(BAD) + 1)]
 
@@ -189,7 +189,7 @@ def test_an_interrupted_import_goes_on_to_the_same_run(batch: tuple[Path, Path],
         result = import_bags([batch[0]], batch[1], run, skip_bad=True)
         assert result.num_new == len(BAD) - moment - 1
         assert _content(run) == _content(alone)
-        assert load_external_run(run).digest == load_external_run(alone).digest
+        assert load_any_run_file(run).digest == load_any_run_file(alone).digest
 
 
 def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_again(tmp_path: Path) -> None:
@@ -309,4 +309,4 @@ def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone
     psutil.wait_procs(workers, timeout=30)
     import_bags([batch[0]], batch[1], run, skip_bad=True)
     assert _content(run) == _content(alone)
-    assert load_external_run(run).digest == load_external_run(alone).digest
+    assert load_any_run_file(run).digest == load_any_run_file(alone).digest

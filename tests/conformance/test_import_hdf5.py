@@ -24,7 +24,7 @@ from support.hdf5 import (
 
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error
 from demorec.mcap import Recording
-from demorec.runs.external import load_external_run
+from demorec.runs.run_file import load_any_run_file
 from demorec.sources.frames_writer import FramesImport, Picture
 from demorec.sources.hdf5_arrays import StoredCamera
 from demorec.sources.hdf5_import import episode_places, import_hdf5
@@ -100,7 +100,7 @@ def test_a_mask_chooses_and_a_dataset_tells_the_outcome(tmp_path: Path) -> None:
         opened["data/demo_10/rewards"][-1] = 0
     result, run = imported(file, changes=changes)
     assert (result.num_episodes, result.num_frames) == (2, 13)
-    lines = load_external_run(run).episodes
+    lines = load_any_run_file(run).attempts
     assert [(line.num_frames, line.success) for line in lines] == [(7, True), (6, False)]
     assert tuple(result.left_out) == ("dones", "states", "next_obs")
 

@@ -20,7 +20,7 @@ from support.training import CAMERA, DEPTH, write_by_lerobot
 from demorec.cli import main
 from demorec.core.errors import DemorecError
 from demorec.mcap import Recording
-from demorec.runs.external import load_external_run
+from demorec.runs.run_file import load_any_run_file
 from demorec.sources.dataset_import import import_lerobot
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
@@ -67,7 +67,7 @@ def shown_by(dataset: Path) -> list[NDArray[np.uint8]]:
 
 def test_numbers_and_tasks_are_those_of_the_dataset(imported: tuple[str, Path, Path]) -> None:
     _, dataset, run = imported
-    assert [line.num_frames for line in load_external_run(run).episodes] == list(LENGTHS)
+    assert [line.num_frames for line in load_any_run_file(run).attempts] == list(LENGTHS)
     begin = 0
     for number, file in enumerate(recordings(run)):
         with Recording(file) as recording:

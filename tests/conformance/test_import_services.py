@@ -13,7 +13,7 @@ from support import bag_mappings, bags
 from support.commands import exit_code
 
 from demorec.mcap import Recording
-from demorec.runs.external import load_external_run
+from demorec.runs.run_file import load_any_run_file
 from demorec.sources.fields import FieldError
 from demorec.sources.ros_types import Budgets, ros_decoder
 from demorec.sources.service_calls import CallReader
@@ -121,7 +121,7 @@ def imported(notes: bags.Notes, episodes: str, folder: Path) -> int:
 @pytest.mark.parametrize(("notes", "episodes"), [(one_service(), ONE), (two_services(), TWO)], ids=["one", "two"])
 def test_calls_cut_episodes(notes: bags.Notes, episodes: str, tmp_path: Path) -> None:
     assert imported(notes, episodes, tmp_path) == 0
-    lines = load_external_run(tmp_path / "run").episodes
+    lines = load_any_run_file(tmp_path / "run").attempts
     assert len(lines) == 2
     for line, (begin, end) in zip(lines, ((0.5, 1.2), (1.8, 2.6)), strict=True):
         with Recording(tmp_path / "run" / line.file) as recording:
@@ -135,7 +135,7 @@ def test_times_of_recording_are_taken_where_the_mapping_says_so(tmp_path: Path) 
     text = MAPPING.replace("fps = 30", 'fps = 30\nstamp = "log"') + "\n" + ONE
     mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
     assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
-    line = load_external_run(tmp_path / "run").episodes[0]
+    line = load_any_run_file(tmp_path / "run").attempts[0]
     with Recording(tmp_path / "run" / line.file) as recording:
         assert int(recording.columns().time_ns[0]) == bags.EPOCH_NS + 503_000_000
 

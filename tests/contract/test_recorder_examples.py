@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from demorec.mcap import Recording
-from demorec.runs.external import load_external_run
+from demorec.runs.run_file import load_any_run_file
 
 pytestmark = pytest.mark.slow  # loops in real time, and three programs that load PyBullet and gymnasium
 EXAMPLES = Path(__file__).parents[2] / "examples" / "recorder"
@@ -42,7 +42,7 @@ def first_of(run: Path) -> Recording:
 
 
 def test_a_robots_loop(runs: Path) -> None:
-    assert [line.success for line in load_external_run(runs / "real_robot").episodes] == [True, True]
+    assert [line.success for line in load_any_run_file(runs / "real_robot").attempts] == [True, True]
     with first_of(runs / "real_robot") as recording:
         columns = recording.columns()
     targets = np.sin(np.arange(60) / 10)
@@ -73,7 +73,7 @@ def test_a_simulation_of_ones_own(runs: Path) -> None:
 
 
 def test_a_gymnasium_environment(runs: Path) -> None:
-    lines = load_external_run(runs / "gym_wrapper").episodes
+    lines = load_any_run_file(runs / "gym_wrapper").attempts
     assert [line.num_frames for line in lines] == [40, 40, 40]
     with first_of(runs / "gym_wrapper") as recording:
         columns = recording.columns()

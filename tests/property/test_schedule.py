@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.generate.run import Schedule
-from demorec.runs.run_file import Attempt, RunFile
+from demorec.runs.run_file import Attempt, Generation, RunFile
 
 MAX_ATTEMPTS = 3
 
@@ -50,7 +50,7 @@ def test_every_order_and_every_interruption_come_to_the_same_attempts(outcomes: 
     config = GenerateConfig(max_attempts=MAX_ATTEMPTS)
     kept = {key for key in sorted(everything) if chance.random() < 0.5}
     order = chance.sample(range(len(outcomes)), len(outcomes))
-    run = RunFile(config=config, versions={}, num_episodes=len(outcomes)).with_attempts(
+    run = RunFile(generation=Generation(config=config, versions={}, num_episodes=len(outcomes))).with_attempts(
         line(*key, everything[key]) for key in kept
     )
     schedule = Schedule(run, episodes=order)

@@ -27,7 +27,7 @@ from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import decoded_images, frames_of
-from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
+from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
 from support.mcap import metadata_of
 
 Pictures = list[dict[str, CameraImages]]
@@ -61,7 +61,10 @@ def simulate_run(folder: Path, num_episodes: int, **config: Any) -> Path:
         attempts.append(replace(inspect_recording(folder / file)[0], file=file))
         assert attempts[-1].success
     (folder / "failed").mkdir(exist_ok=True)
-    run = RunFile(config=GenerateConfig(**config), versions={}, num_episodes=num_episodes, attempts=tuple(attempts))
+    run = RunFile(
+        generation=Generation(config=GenerateConfig(**config), versions={}, num_episodes=num_episodes),
+        attempts=tuple(attempts),
+    )
     save_run_file(run, folder)
     return folder
 

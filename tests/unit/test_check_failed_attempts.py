@@ -15,7 +15,7 @@ from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.core.config import GenerateConfig
 from demorec.generate.options import RunResult
-from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
+from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
 
 FAILED = "failed/episode_000000.attempt_0.mcap"
 
@@ -25,7 +25,10 @@ def run(tmp_path: Path) -> Path:
     """A run of one failed attempt, made up, so that checks of its physics fail."""
     folder = make_run(tmp_path / "run", [], failures=[0], cameras=())
     attempt = replace(inspect_recording(folder / FAILED)[0], file=FAILED)
-    save_run_file(RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,)), folder)
+    save_run_file(
+        RunFile(generation=Generation(config=GenerateConfig(), versions={}, num_episodes=1), attempts=(attempt,)),
+        folder,
+    )
     return folder
 
 
@@ -90,14 +93,17 @@ def test_a_recording_of_a_success_is_judged_in_full(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run", [12], cameras=())
     path = folder / "episodes/episode_000000.mcap"
     attempt = replace(inspect_recording(path)[0], file="episodes/episode_000000.mcap")
-    save_run_file(RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,)), folder)
+    save_run_file(
+        RunFile(generation=Generation(config=GenerateConfig(), versions={}, num_episodes=1), attempts=(attempt,)),
+        folder,
+    )
     assert report_of(folder, path).is_bad()
 
 
 def test_the_closing_table_counts_them_apart(run: Path) -> None:
     """What decides the exit code of generate-dataset."""
     attempt = replace(inspect_recording(run / FAILED)[0], file=FAILED)
-    known = RunFile(config=GenerateConfig(), versions={}, num_episodes=1, attempts=(attempt,))
+    known = RunFile(generation=Generation(config=GenerateConfig(), versions={}, num_episodes=1), attempts=(attempt,))
     result = RunResult(folder=run, run=known, made=(), interrupted=False)
     found, failures = check_run(result, progress=lambda done, total: None)
     assert "not counted: those of 1 failed attempt" in found

@@ -15,11 +15,11 @@ from demorec.cli.generate_report import next_commands
 from demorec.core.config import GenerateConfig
 from demorec.generate.contents import set_aside
 from demorec.generate.options import RunResult
-from demorec.runs.run_file import ExportRecord, RunFile
+from demorec.runs.run_file import ExportRecord, Generation, RunFile
 
 
 def result_of(folder: Path, *, cameras: tuple[str, ...] = ("front",)) -> RunResult:
-    run = RunFile(config=GenerateConfig(cameras=cameras), versions={}, num_episodes=1)
+    run = RunFile(generation=Generation(config=GenerateConfig(cameras=cameras), versions={}, num_episodes=1))
     return RunResult(folder=folder, run=run, made=(), interrupted=False)
 
 

@@ -13,7 +13,7 @@ from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.core.config import GenerateConfig
 from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import export_step
-from demorec.runs.run_file import RunFile, inspect_recording, save_run_file
+from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
 
 
 def test_the_dataset_has_what_was_asked_for_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,7 +24,7 @@ def test_the_dataset_has_what_was_asked_for_last(tmp_path: Path, monkeypatch: py
         line = replace(inspect_recording(path)[0], file=path.relative_to(folder).as_posix())
         # A success after a failed attempt is the second one; the made-up recordings call all of them the first.
         lines.append(replace(line, attempt=1) if line.success and line.episode_index in (1, 3) else line)
-    run = RunFile(config=GenerateConfig(), versions={}, num_episodes=2).with_attempts(lines)
+    run = RunFile(generation=Generation(config=GenerateConfig(), versions={}, num_episodes=2)).with_attempts(lines)
     assert len(run.beyond) == 3  # episode 2, and both attempts at episode 3
     save_run_file(run, folder)
     recordings = {path: path.read_bytes() for path in folder.rglob("*.mcap")}
@@ -36,7 +36,7 @@ def test_the_dataset_has_what_was_asked_for_last(tmp_path: Path, monkeypatch: py
     assert info(folder / "dataset")["total_episodes"] == 2
     assert {path: path.read_bytes() for path in folder.rglob("*.mcap")} == recordings
     assert levels(folder, "run_dataset", "run_files") == {"run_dataset": "pass", "run_files": "pass"}
-    save_run_file(replace(run, num_episodes=4).with_attempts(lines), folder)
+    save_run_file(run.with_generation(num_episodes=4).with_attempts(lines), folder)
     assert levels(folder, "run_dataset")["run_dataset"] == "fail", "the dataset is of two"
 
 

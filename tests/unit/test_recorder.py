@@ -25,7 +25,7 @@ from demorec.mcap import Recording
 from demorec.mcap.recorder.encoder import Encoder
 from demorec.mcap.writer import EpisodeWriter
 from demorec.robots.panda import PANDA
-from demorec.runs.external import load_external_run
+from demorec.runs.run_file import load_any_run_file
 
 TOP = {"top": (48, 64)}
 PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
@@ -123,7 +123,7 @@ def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
             with run.episode() as episode:
                 episode.write([0.0])
                 episode.discard()
-    found = load_external_run(tmp_path / "run")
+    found = load_any_run_file(tmp_path / "run")
     assert [line.episode_index for line in found.episodes] == [0, 1, 2, 3]
     assert [line.instruction for line in found.episodes] == ["stack", "another"] * 2
     assert len(found.sessions) == 2
@@ -135,14 +135,14 @@ def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
 def test_a_lost_run_json_is_made_again(tmp_path: Path) -> None:
     with recorder(tmp_path / "run") as run, run.episode() as episode:
         episode.write([0.0])
-    before = load_external_run(tmp_path / "run")
+    before = load_any_run_file(tmp_path / "run")
     for damage in (None, "{"):
         (tmp_path / "run" / "run.json").unlink()
         if damage is not None:
             (tmp_path / "run" / "run.json").write_text(damage)
         with recorder(tmp_path / "run"):
             pass
-        assert load_external_run(tmp_path / "run").episodes == before.episodes
+        assert load_any_run_file(tmp_path / "run").attempts == before.attempts
     assert (tmp_path / "run" / "run.json.damaged").read_text() == "{"
 
 
@@ -156,7 +156,7 @@ def test_what_ends_an_episode_is_told(tmp_path: Path) -> None:
             episode.write([0.0])
             episode.success = True
             raise KeyboardInterrupt
-    failed, interrupted = load_external_run(tmp_path / "run").episodes
+    failed, interrupted = load_any_run_file(tmp_path / "run").attempts
     assert failed.success is False
     assert interrupted.success is True
     assert interrupted.reason == "interrupted"
@@ -308,7 +308,7 @@ def test_frames_that_the_encoder_cannot_take_are_an_error(tmp_path: Path, monkey
             for _ in range(40):
                 episode.write([0.0])
         go_on.set()
-    assert 15 <= load_external_run(tmp_path / "run").episodes[0].num_frames <= 16
+    assert 15 <= load_any_run_file(tmp_path / "run").attempts[0].num_frames <= 16
 
 
 def test_frames_that_the_encoder_cannot_take_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,7 +316,7 @@ def test_frames_that_the_encoder_cannot_take_are_counted(tmp_path: Path, monkeyp
     with recorder(tmp_path / "run", when_full="drop") as run, run.episode() as episode:
         taken = [episode.write([float(index)]) for index in range(50)]
         go_on.set()
-    line = load_external_run(tmp_path / "run").episodes[0]
+    line = load_any_run_file(tmp_path / "run").attempts[0]
     assert line.num_frames == sum(taken)
     assert line.drops == {"frames": 50 - sum(taken)}
     with recording_of(tmp_path / "run") as found:
@@ -371,7 +371,7 @@ def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: si
         assert len(run.recovered) == (1 if number == signal.SIGKILL else 0)
         with run.episode() as episode:
             episode.write([0.0], [0.0])
-    first, second = load_external_run(tmp_path / "run").episodes
+    first, second = load_any_run_file(tmp_path / "run").attempts
     assert (first.success, second.episode_index) == (None, 1)
     assert last - 50 <= first.num_frames - 1 <= last
     if number == signal.SIGINT:

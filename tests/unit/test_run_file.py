@@ -19,6 +19,7 @@ from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     ExportRecord,
+    Generation,
     RunFile,
     RunSession,
     load_run_file,
@@ -45,11 +46,13 @@ def a_run() -> RunFile:
         for (episode, attempt), success in expected_attempts(6, seed=3).items()
     ]
     return RunFile(
-        config=GenerateConfig(seed=3, cameras=("wrist",)),
-        versions={"numpy": "2"},
-        num_episodes=8,
+        generation=Generation(
+            config=GenerateConfig(seed=3, cameras=("wrist",)),
+            versions={"numpy": "2"},
+            num_episodes=8,
+            export=ExportRecord(run_digest="12", repo_id="me/cubes"),
+        ),
         sessions=(RunSession(started="2026-01-01T00:00:00+00:00", machine={"host": "somewhere"}),),
-        export=ExportRecord(run_digest="12", repo_id="me/cubes"),
     ).with_attempts(attempts)
 
 
@@ -176,15 +179,17 @@ def test_it_is_never_written_through_what_lies_in_the_way(tmp_path: Path) -> Non
 
 def test_fewer_episodes_are_the_run_that_they_would_have_been_alone(tmp_path: Path) -> None:
     run = a_run()
-    fewer = replace(run, num_episodes=2).with_attempts(run.known)
-    alone = replace(run, num_episodes=2, attempts=tuple(line for line in run.attempts if line.episode_index < 2))
+    fewer = run.with_generation(num_episodes=2).with_attempts(run.known)
+    alone = replace(
+        run.with_generation(num_episodes=2), attempts=tuple(line for line in run.attempts if line.episode_index < 2)
+    )
     assert (fewer.digest, fewer.successes, fewer.given_up) == (alone.digest, alone.successes, alone.given_up)
     assert fewer.is_complete
     assert fewer.digest != run.digest
     assert fewer.beyond == tuple(line for line in run.attempts if line.episode_index >= 2) != ()
     save_run_file(fewer, tmp_path)
     assert load_run_file(tmp_path) == fewer
-    assert replace(fewer, num_episodes=8).with_attempts(fewer.known) == run
+    assert fewer.with_generation(num_episodes=8).with_attempts(fewer.known) == run
 
 
 def test_a_newer_format_is_no_damage(tmp_path: Path) -> None:
@@ -199,13 +204,13 @@ def test_a_newer_format_is_no_damage(tmp_path: Path) -> None:
 def test_the_digest_depends_on_content_and_on_nothing_else() -> None:
     run = a_run()
     same = [
-        replace(run, sessions=(), export=None, versions={}, num_episodes=9),
+        replace(run, sessions=()).with_generation(export=None, versions={}, num_episodes=9),
         run.with_attempts([replace(a, seconds={}, sha256="", num_bytes=0) for a in reversed(run.attempts)]),
     ]
     assert {other.digest for other in same} == {run.digest}
     first, *rest = run.attempts
     other = [
-        replace(run, config=replace(run.config, seed=4)),
+        run.with_generation(config=replace(run.config, seed=4)),
         run.with_attempts(rest),
         run.with_attempts([replace(first, digest="x"), *rest]),
         run.with_attempts([replace(first, success=not first.success), *rest]),
