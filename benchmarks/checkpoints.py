@@ -64,7 +64,7 @@ def plot(tried: list[Tried], curve: list[tuple[int, float]], path: Path) -> None
     loss.set_xlabel("updates")
     loss.set_ylabel("loss (L1, normalised actions)")
     last = tried[-1].evaluation
-    parts = cells(last.factors, [rollout.success for rollout in last.rollouts])
+    parts = cells(last.factors, [bool(rollout.success) for rollout in last.rollouts])
     bars.bar(range(len(parts)), [100 * part.rate.value for part in parts], color="C0")
     names = [f"{part.factor} {part.low:.3g}..{part.high:.3g} ({part.rate.trials})" for part in parts]
     bars.set_xticks(range(len(parts)), names, rotation=90, fontsize=6.5)
@@ -111,7 +111,7 @@ def main() -> None:
         tried.append(Tried(updates=int(checkpoint.name), evaluation=found))
         told = [loss for update, loss in curve if update <= tried[-1].updates]
         print(f"{tried[-1].updates:>8} {told[-1] if told else float('nan'):>7.3f}  {found.rate}", flush=True)
-    for part in cells(tried[-1].evaluation.factors, [r.success for r in tried[-1].evaluation.rollouts]):
+    for part in cells(tried[-1].evaluation.factors, [bool(r.success) for r in tried[-1].evaluation.rollouts]):
         print(f"{part.factor:<20} {part.low:.3f} .. {part.high:.3f}  {part.rate}")
     if args.plot is not None:
         plot(tried, curve, args.plot)

@@ -233,7 +233,7 @@ def plot(rows: dict[tuple[str, int, int], list[Stage]], path: Path) -> None:
     shown = {arm: found for (arm, _, count), found in rows.items() if arm != "corrected" or count == last}
     for number, (arm, found) in enumerate(shown.items()):
         factors = [factor for one in found for factor in one.evaluation.factors]
-        successes = [r.success for one in found for r in one.evaluation.rollouts]
+        successes = [bool(r.success) for one in found for r in one.evaluation.rollouts]
         parts = cells(factors, successes)
         places = np.arange(len(parts)) + 0.26 * (number - 1)
         bars.bar(places, [100 * part.rate.value for part in parts], 0.24, color=("C7", "C0", "C1")[number], label=arm)

@@ -70,7 +70,7 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
     """The closing table, with what `check_run` returned."""
     run, folder = result.run, result.folder
     attempts = run.attempts
-    first_tries = sum(a.success and a.attempt == 0 for a in attempts)
+    first_tries = sum(bool(a.success) and a.attempt == 0 for a in attempts)
     tried = len({a.episode_index for a in attempts})
     frames = sum(a.num_frames for a in run.successes)
     size = sum(a.num_bytes for a in run.successes)
@@ -92,7 +92,7 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
     if result.made:
         session = run.sessions[-1]
         wall = session.wall_seconds
-        rate = sum(a.success for a in result.made) / wall * 60
+        rate = sum(bool(a.success) for a in result.made) / wall * 60
         made = f"{wall:.1f} s for making episodes with {counted(session.workers, 'worker')}, {rate:.1f} a minute"
         rows.append(("wall time", f"{made}; export and checks are extra"))
     if aside := set_aside(folder):
@@ -160,7 +160,7 @@ def print_estimate(measured: Sequence[Made], tried: Sequence[Made], dataset_byte
     """The table of a dry run, from what `estimate` returned."""
     assert options.out is not None
     last, cores = measured[-1].attempt, available_cores()
-    num_workers, successes = options.workers or cores, sum(report.attempt.success for report in tried)
+    num_workers, successes = options.workers or cores, sum(bool(report.attempt.success) for report in tried)
     each = sum(last.seconds.values())
     attempts = options.num_episodes * len(tried) / max(successes, 1)
     # Wall-clock time with a core for each worker, without the export.

@@ -73,7 +73,7 @@ class RunFolder:
     @property
     def kept(self) -> str:
         """A sentence on what is there, for messages."""
-        done = sum(a.success for a in self._attempts.values() if a.episode_index < self.run.num_episodes)
+        done = sum(bool(a.success) for a in self._attempts.values() if a.episode_index < self.run.num_episodes)
         return f"{done} of {self.run.num_episodes} episodes are complete and kept: {self.path}"
 
     def begin_session(self, *, executor: str, workers: int) -> None:

@@ -251,7 +251,7 @@ class RunFile:
 
 def save_run_file(run: RunFile, folder: Path) -> None:
     """Replace run.json in one step: a reader or a crash sees the old or the new one, never a mixture."""
-    plain, head = run.plain(), {"format": RUN_FORMAT}
+    plain, head = run.plain(), dict[str, Any](format=RUN_FORMAT)
     if run.generation is None:
         lines = plain.pop("episodes")
         head |= {"kind": _EXTERNAL, "digest": run.digest, **plain}
@@ -311,7 +311,7 @@ def load_any_run_file(folder: Path) -> RunFile:
         raise resource_error(error, path) or damaged from error
 
 
-def recording_name(episode_index: int, attempt: int, *, success: bool) -> str:
+def recording_name(episode_index: int, attempt: int, *, success: bool | None) -> str:
     """episode_000003.mcap, or episode_000003.attempt_0.mcap for a failed attempt."""
     middle = "" if success else f".attempt_{attempt}"
     return f"episode_{episode_index:06d}{middle}.mcap"

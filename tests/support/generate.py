@@ -79,7 +79,7 @@ def run_fake(
 
 def attempts_of(result: RunResult) -> dict[tuple[int, int], bool]:
     """(episode, attempt) -> whether it succeeded."""
-    return {(a.episode_index, a.attempt): a.success for a in result.run.attempts}
+    return {(a.episode_index, a.attempt): bool(a.success) for a in result.run.attempts}
 
 
 def num_finished(out: Path) -> int:

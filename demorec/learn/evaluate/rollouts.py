@@ -107,12 +107,12 @@ class Evaluation:
     @property
     def rate(self) -> Rate:
         """Of strict successes."""
-        return Rate(successes=sum(r.success for r in self.rollouts), trials=len(self.rollouts))
+        return Rate(successes=sum(bool(r.success) for r in self.rollouts), trials=len(self.rollouts))
 
     @property
     def successes(self) -> dict[int, bool]:
         """Scene (episode index) -> success."""
-        return {r.episode_index: r.success for r in self.rollouts}
+        return {r.episode_index: bool(r.success) for r in self.rollouts}
 
 
 def settings_for(
