@@ -182,7 +182,7 @@ def _evaluation_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
     for number, (reason, count) in enumerate(failures.most_common()):
         yield f"{'failures' if number == 0 else '':<13} {count:>4}  {reason}"
     yield from ("", f"{'by cell':<20} {'range':<20} success (Wilson 95 %)")
-    for cell in cells(evaluation.factors, [r.success for r in evaluation.rollouts]):
+    for cell in cells(evaluation.factors, [bool(r.success) for r in evaluation.rollouts]):
         yield f"{cell.factor:<20} {f'{cell.low:.3f} .. {cell.high:.3f}':<20} {cell.rate}"
     yield from ("", f"recordings    {out / 'episodes'}, {out / 'failed'}")
 
@@ -194,7 +194,7 @@ def _plain(evaluation: Evaluation) -> dict[str, Any]:
     plain: dict[str, Any] = to_plain(evaluation)
     plain["success_rate"] = evaluation.rate.value
     plain["interval"] = list(evaluation.rate.interval)
-    plain["cells"] = to_plain(cells(evaluation.factors, [r.success for r in evaluation.rollouts]))
+    plain["cells"] = to_plain(cells(evaluation.factors, [bool(r.success) for r in evaluation.rollouts]))
     return plain
 
 

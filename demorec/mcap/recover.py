@@ -193,10 +193,11 @@ def _survey(source: Path) -> _Survey:
             found[item.name] = item.metadata
         elif item is not None:
             counts[item.channel.topic] += 1
-    for name, look in ((metadata.EPISODE, _frames_of_episode), (metadata.EXTERNAL, _frames_of_external)):
+    for name in metadata.RECORDS:
         if name not in found:
             continue
-        frames, outcome, reason = look(found[name], counts), found.get(metadata.OUTCOME), reason or "the end is missing"
+        frames, outcome = _frames(name, found[name], counts), found.get(metadata.OUTCOME)
+        reason = reason or "the end is missing"
         if outcome is not None:
             ended = metadata.read_outcome_metadata(name, outcome)
             outcome = outcome if ended.num_frames == frames.num_frames else None
@@ -205,24 +206,17 @@ def _survey(source: Path) -> _Survey:
     raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
 
 
-def _frames_of_episode(episode: dict[str, str], counts: Counter[str]) -> _Frames:
-    info, cameras, _ = metadata.read_episode_metadata(metadata.EPISODE, episode)
-    topics = [stream.topic for stream in frame_streams(info) if stream.topic != channels.JOINT_STATES]
+def _frames(record: str, episode: dict[str, str], counts: Counter[str]) -> _Frames:
+    info, cameras, _ = metadata.read_episode_metadata(record, episode)
+    topics = {stream.topic for stream in frame_streams(info)}
+    if info.simulation is None:  # images come before the frames that hold them: what is there of these has its images
+        num_frames = min(counts[topic] for topic in topics)
+        topics.add(channels.TF)
+        return _Frames(num_frames, lambda message, count: message.channel.topic not in topics or count <= num_frames)
+    topics.remove(channels.JOINT_STATES)
     for camera, streams in cameras.items():
-        topics.append(channels.video_topic(camera, streams.video.codec))
-        topics += [channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)]
+        topics.add(channels.video_topic(camera, streams.video.codec))
+        topics |= {channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)}
     num_frames = min(counts[topic] for topic in topics)
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
     return _Frames(num_frames, lambda message, count: message.log_ns <= last_ns)
-
-
-def _frames_of_external(episode: dict[str, str], counts: Counter[str]) -> _Frames:
-    """Images come before the frames that hold them, so what is there of the frames has its images."""
-    info, _, _ = metadata.read_episode_metadata(metadata.EXTERNAL, episode)
-    topics = {stream.topic for stream in frame_streams(info)}
-    num_frames = min(counts[topic] for topic in topics)
-
-    def keeps(message: ScannedMessage, count: int) -> bool:
-        return message.channel.topic not in topics | {channels.TF} or count <= num_frames
-
-    return _Frames(num_frames, keeps)

@@ -219,7 +219,7 @@ class EpisodeWriter(Closing):
             if (images := first.images.get(camera.name)) is None:
                 raise RecordingError(f"Frame 0 has no image of the camera {camera.name!r}.")
             beside = [kind for kind in ("depth", "segmentation") if getattr(images, kind) is not None]
-            self._cameras[camera.name] = CameraWriter(camera, self._video, self._info.fps, beside=beside, compiled=True)
+            self._cameras[camera.name] = CameraWriter(camera, self._video, self._info.fps, beside=beside)
 
     def _changes(self, frame: Frame) -> list[Message]:
         if frame.phase == self._phase and frame.is_deliberate_miss == self._is_miss and not frame.events:

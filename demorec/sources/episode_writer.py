@@ -22,7 +22,7 @@ from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import Int
 from demorec.sources.fields import picture_bytes
-from demorec.sources.mapping import STATE, recorded_unit
+from demorec.sources.frames_writer import imported_feature
 from demorec.sources.picture_messages import decode_picture
 from demorec.sources.ros_types import Values
 from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines
@@ -171,7 +171,6 @@ def urdf_in_bag(bag: Bag, streams: BagStreams, topic: str) -> str:
 
 def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints: Container[str]) -> Feature:
     """A feature as recordings know it, given the joints of the robot's model."""
-    units = tuple(map(recorded_unit, feature.units))
     sources = lines.mapping.features[name]
     told = []
     for index, source in enumerate(sources):
@@ -180,15 +179,8 @@ def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints:
             continue
         clock = "header" if lines.lines[name, index].is_header else "log"
         told.append(f"{source.topic} {source.field}, {lines.rule((name, index))[0]} by {clock} time")
-    moves = [element if element in joints and name == STATE else "" for element in feature.names]
-    return Feature(
-        name=name,
-        dtype="float32" if feature.values.dtype == np.float32 else "float64",
-        names=feature.names,
-        units=units if any(units) else (),
-        joints=tuple(moves) if any(moves) else (),
-        source="; ".join(told),
-    )
+    moved = (element if element in joints else "" for element in feature.names)
+    return imported_feature(name, feature.values.dtype, feature.names, feature.units, moved, "; ".join(told))
 
 
 def described_camera(name: str, plan: CameraRows, lines: Timelines) -> Camera:

@@ -1,4 +1,4 @@
-"""An episode whose frames are evenly spaced and come one after the other, as those of datasets do."""
+"""What imported episodes say of themselves; and the writing of one whose frames are evenly spaced, as in datasets."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from functools import cache
 from importlib.metadata import version
 from typing import Any
 
-from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.episode.episode import Outcome, Sample, SampledFrame, Vector, frame_time_ns
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFile
 from demorec.mcap import EpisodeWriter
+from demorec.robots.urdf import Urdf
 from demorec.runs.external import ExternalFolder
+from demorec.sources.mapping import STATE, SourceMapping, recorded_unit
 
 Picture = bytes | NDArray[Any]
 """A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `EpisodeWriter.picture` takes them."""
@@ -48,6 +51,55 @@ class FramesImport:
 def importing_versions() -> Mapping[str, str]:
     """Of what reads and writes an episode, for its recording."""
     return {name: version(name) for name in ("demorec", "av")}
+
+
+def joints_of(urdf: str) -> frozenset[str]:
+    """Of a robot's model; ValueError, for the inside of a sentence, when it is none."""
+    try:
+        return frozenset(joint.name for joint in Urdf.parse(urdf).joints)
+    except ValueError as error:
+        raise ValueError(f"the robot's model cannot be used ({error})") from error
+
+
+def imported_feature(
+    name: str, dtype: DTypeLike, names: tuple[str, ...], units: Iterable[str], moved: Iterable[str], source: str
+) -> Feature:
+    """A feature as recordings know it, given the units of its elements and the joints that they are said to be of."""
+    units = tuple(map(recorded_unit, units))
+    joints = tuple(moved) if name == STATE else ()
+    return Feature(
+        name=name,
+        dtype="float32" if dtype == np.float32 else "float64",
+        names=names,
+        units=units if any(units) else (),
+        joints=joints if any(joints) else (),
+        source=source,
+    )
+
+
+def imported_info(
+    mapping: SourceMapping,
+    *,
+    episode_index: int,
+    instruction: str,
+    urdf: str,
+    fps: int,
+    features: Iterable[Feature],
+    cameras: Iterable[Camera],
+    files: Iterable[SourceFile],
+) -> EpisodeInfo:
+    """What is known of an episode that was imported by a mapping."""
+    return EpisodeInfo(
+        episode_index=episode_index,
+        instruction=" ".join(instruction.split()),
+        robot_name=mapping.robot.name,
+        urdf=urdf,
+        fps=fps,
+        features=tuple(features),
+        cameras=tuple(cameras),
+        origin=Origin(kind="import", files=tuple(files), mapping_digest=mapping.digest),
+        versions=importing_versions(),
+    )
 
 
 def write_frames(

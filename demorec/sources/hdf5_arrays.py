@@ -15,8 +15,8 @@ from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
 from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, Feature, Kept
 from demorec.sources.fields import FieldError, converted
-from demorec.sources.frames_writer import Picture
-from demorec.sources.mapping import MAX_ELEMENTS, STATE, CameraSource, Source, conversion_factor, recorded_unit
+from demorec.sources.frames_writer import Picture, imported_feature
+from demorec.sources.mapping import MAX_ELEMENTS, CameraSource, Source, conversion_factor
 from demorec.sources.picture_messages import PictureHead, decode_picture, picture_head
 from demorec.sources.ros_types import Values
 
@@ -81,20 +81,11 @@ class StoredFeature:
     def described(self, joints: Container[str]) -> Feature:
         """The feature as recordings know it, given the joints of the robot's model."""
         names = tuple(name for column in self.columns for name in column.names)
-        units = tuple(
-            recorded_unit(column.part.to or column.part.unit) for column in self.columns for _ in column.names
-        )
+        units = (column.part.to or column.part.unit for column in self.columns for _ in column.names)
         called = (name.removesuffix(".pos") for name in names)  # as LeRobot calls the position of a joint
-        moves = tuple(name if name in joints and self.name == STATE else "" for name in called)
-        source = "; ".join(column.part.dataset for column in self.columns)
-        return Feature(
-            name=self.name,
-            dtype="float32" if self.dtype is np.float32 else "float64",
-            names=names,
-            units=units if any(units) else (),
-            joints=moves if any(moves) else (),
-            source=f"{source} of the next row" if self.shift else source,
-        )
+        moved = (name if name in joints else "" for name in called)
+        source = "; ".join(column.part.dataset for column in self.columns) + (" of the next row" if self.shift else "")
+        return imported_feature(self.name, self.dtype, names, units, moved, source)
 
     def vectors(self, count: int) -> Iterator[Vector]:
         """(D,) of each of the first `count` frames.

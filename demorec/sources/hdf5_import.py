@@ -23,14 +23,13 @@ from demorec.core.errors import ConfigError
 from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.episode.episode import Outcome, Vector
-from demorec.episode.info import EpisodeInfo, Origin, SourceFile
+from demorec.episode.info import EpisodeInfo, SourceFile
 from demorec.episode.validity import find_problems
-from demorec.robots.urdf import Urdf
 from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
 from demorec.sources.episode_writer import urdf_text
-from demorec.sources.frames_writer import FramesImport, importing_versions, write_frames
+from demorec.sources.frames_writer import FramesImport, imported_info, joints_of, write_frames
 from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, is_camera, picture_lengths
 from demorec.sources.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.sources.mapping_file import read_mapping
@@ -152,19 +151,18 @@ class _Stored:
         if attribute := mapping.robot.urdf_attribute:
             urdf = str(found_attribute(file, place, attribute) or "")
         try:
-            joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf or attribute else set()
+            joints = joints_of(urdf) if urdf or attribute else frozenset()
         except ValueError as error:
-            raise Hdf5FitError(f"the robot's model cannot be used ({error})") from error
-        info = EpisodeInfo(
+            raise Hdf5FitError(str(error)) from error
+        info = imported_info(
+            mapping,
             episode_index=episode_index,
             instruction=task_of(file, place, mapping),
-            robot_name=mapping.robot.name,
             urdf=urdf,
             fps=rate_of(file, place, mapping),
-            features=tuple(feature.described(joints) for feature in self.features),
-            cameras=tuple(camera.described() for camera in self.cameras),
-            origin=Origin(kind="import", files=(source,), mapping_digest=mapping.digest),
-            versions=importing_versions(),
+            features=(feature.described(joints) for feature in self.features),
+            cameras=(camera.described() for camera in self.cameras),
+            files=[source],
         )
         if wrong := find_problems(info):
             raise Hdf5FitError("; ".join(wrong))
@@ -332,7 +330,7 @@ def task_of(file: ForeignFile, place: str, mapping: SourceMapping) -> str:
     """What the robot was asked to do; Hdf5Error when the file does not say."""
     task = mapping.task
     if task.text:
-        return " ".join(task.text.split())
+        return task.text
     if task.file_name:
         if text := task_in_name(file.path.stem):
             return text
@@ -340,7 +338,7 @@ def task_of(file: ForeignFile, place: str, mapping: SourceMapping) -> str:
     found = found_attribute(file, place, task.attribute)
     if not isinstance(found, str) or not found.strip():
         raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {place or 'the episode'}: {file.path}")
-    return " ".join(found.split())
+    return found
 
 
 def success_of(file: ForeignFile, place: str, mapping: SourceMapping, num_rows: int) -> bool | None:

@@ -16,12 +16,11 @@ import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
-from demorec.episode.info import EpisodeInfo, Origin, SourceFile
+from demorec.episode.info import SourceFile
 from demorec.episode.validity import find_problems
 from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.video import size_problem
-from demorec.robots.urdf import Urdf
 from demorec.runs.external import (
     differences,
     episode_path,
@@ -45,7 +44,7 @@ from demorec.sources.episode_writer import (
 )
 from demorec.sources.episodes import Window, subtask_rows, task_text, windows
 from demorec.sources.fields import FieldError
-from demorec.sources.frames_writer import importing_versions
+from demorec.sources.frames_writer import imported_info, joints_of
 from demorec.sources.import_file import BagReport, EpisodeReport, ImportFile, load_import_file, stream_reports
 from demorec.sources.mapping import SourceMapping
 from demorec.sources.mapping_file import read_mapping
@@ -163,23 +162,18 @@ class _Importer:
         topic = self.mapping.robot.urdf_topic
         urdf = urdf_in_bag(bag, lines.streams, topic) if topic else self.urdf
         try:
-            joints = {joint.name for joint in Urdf.parse(urdf).joints} if urdf else set()
+            joints = joints_of(urdf) if urdf else frozenset()
         except ValueError as error:
-            raise BagError(f"The robot's model cannot be used ({error}): {bag.path}") from error
-        info = EpisodeInfo(
+            raise BagError(f"The episode cannot be recorded: {error}: {bag.path}") from error
+        info = imported_info(
+            self.mapping,
             episode_index=index,
-            instruction=" ".join(task_text(bag, lines.streams, rows.window, self.mapping).split()),
-            robot_name=self.mapping.robot.name,
+            instruction=task_text(bag, lines.streams, rows.window, self.mapping),
             urdf=urdf,
             fps=self.mapping.clock.fps,
-            features=tuple(described_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
-            cameras=tuple(described_camera(name, plan, lines) for name, plan in rows.cameras.items()),
-            origin=Origin(
-                kind="import",
-                files=tuple(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
-                mapping_digest=self.mapping.digest,
-            ),
-            versions=importing_versions(),
+            features=(described_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
+            cameras=(described_camera(name, plan, lines) for name, plan in rows.cameras.items()),
+            files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
         )
         subtasks = subtask_rows(bag, lines.streams, rows.window, rows.times_ns, self.mapping)
         episode = PlannedEpisode(info=info, rows=rows, subtasks=subtasks)

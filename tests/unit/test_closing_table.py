@@ -38,7 +38,7 @@ def test_a_shell_reads_them_as_they_are_meant(monkeypatch: pytest.MonkeyPatch, f
 def test_modules_of_the_users_own_are_allowed_in_them() -> None:
     config = GenerateConfig(task="mytask:Mine", robot="lab.arms:A1", cameras=("front", "lab.arms:CORNER"))
     result = result_of(Path("/data"))
-    result = replace(result, run=replace(result.run, config=config))
+    result = replace(result, run=result.run.with_generation(config=config))
     for line in next_commands(result, None):
         assert shlex.split(line)[2:] == ["/data", "--allow", "mytask", "--allow", "lab.arms"]
 
