@@ -257,7 +257,7 @@ class Dataset:
             yield from ((f"{name}, episode {each.number}", poses, hand) for name, poses in told.items())
 
     def check_simulated(self) -> None:
-        """Raise ConfigError for a dataset of collected episodes, which no simulator can make or replay."""
+        """Raise ConfigError for a dataset of external episodes, which no simulator can make or replay."""
         if any(row["episode_info"] is None for row in self.sidecar):
             raise ConfigError(
                 f"The episodes of this dataset were recorded by another robot or program and have no scene: {self.path}"

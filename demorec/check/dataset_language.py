@@ -130,7 +130,7 @@ def dataset_language_truth(dataset: Dataset) -> Found:
     if not dataset.spoken or not dataset.sidecar:
         return None
     if not dataset.infos:
-        return NotMeasured(why="the episodes were collected, and what they say is as it came")
+        return NotMeasured(why="the episodes are external, and what they say is as it came")
     wrong = []
     boxes = _Boxes(dataset)
     for each in (each for each in dataset.described() if each.number < len(dataset.spoken)):

@@ -14,7 +14,7 @@ import numpy as np
 
 from demorec.core.errors import NotSimulatedError
 from demorec.core.geometry import Pose
-from demorec.core.plain import write_optional_part
+from demorec.core.plain import PartValue, write_optional_part
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
 
@@ -136,19 +136,6 @@ class Simulation:
     config_digest: str = ""
 
 
-class _Simulated[V]:
-    """A value of the simulation, read as one of the episode's; NotSimulatedError where there is no simulation."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, info: EpisodeInfo, _: type | None = None) -> V:
-        if info.simulation is None:
-            raise NotSimulatedError(self._name)
-        value: V = getattr(info.simulation, self._name)
-        return value
-
-
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInfo:
     """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
@@ -184,14 +171,14 @@ class EpisodeInfo:
     versions: Mapping[str, str] = field(default_factory=dict)
     simulation: Simulation | None = None
 
-    root_seed = _Simulated[int]()
-    task = _Simulated[str]()
-    robot = _Simulated[RobotSpec]()
-    scene = _Simulated[Scene]()
-    physics_hz = _Simulated[int]()
-    behaviour = _Simulated[Mapping[str, float]]()
-    config = _Simulated[Mapping[str, Any]]()
-    config_digest = _Simulated[str]()
+    root_seed = PartValue[int]("simulation", NotSimulatedError)
+    task = PartValue[str]("simulation", NotSimulatedError)
+    robot = PartValue[RobotSpec]("simulation", NotSimulatedError)
+    scene = PartValue[Scene]("simulation", NotSimulatedError)
+    physics_hz = PartValue[int]("simulation", NotSimulatedError)
+    behaviour = PartValue[Mapping[str, float]]("simulation", NotSimulatedError)
+    config = PartValue[Mapping[str, Any]]("simulation", NotSimulatedError)
+    config_digest = PartValue[str]("simulation", NotSimulatedError)
 
     def with_simulation(self, **changes: Any) -> EpisodeInfo:
         """The same episode with other values of its simulation; NotSimulatedError where it has none."""

@@ -16,7 +16,7 @@ from typing import Any
 from demorec.core.errors import RecordingError, in_words
 from demorec.core.plain import from_plain, to_json, to_plain
 from demorec.episode.episode import Outcome
-from demorec.episode.info import EXTERNAL_VERSION, FORMAT_VERSION, EpisodeInfo
+from demorec.episode.info import DEPTH_UNITS, EXTERNAL_VERSION, FORMAT_VERSION, EpisodeInfo
 from demorec.episode.validity import from_description, read_episode_info
 from demorec.mcap.video import VideoSettings
 
@@ -124,36 +124,31 @@ def read_episode_metadata(
             raise ValueError(f"its description is of format version {info.format_version}")
         if record == EPISODE:
             cameras = from_description(metadata["cameras"], dict[str, CameraStreams])
-            _check_cameras(info, cameras)
-            return info, cameras, ""
-        videos = from_description(metadata["cameras"], dict[str, VideoSettings])
-        _check_videos(info, videos)
-        is_depth = {camera.name: camera.is_depth for camera in info.cameras}
-        streams = {name: CameraStreams(video=videos[name], depth=depth) for name, depth in is_depth.items()}
-        return info, streams, metadata["urdf_sha256"]
+        else:
+            videos = from_description(metadata["cameras"], dict[str, VideoSettings])
+            cameras = {
+                name: CameraStreams(video=video, depth=video.codec in DEPTH_UNITS) for name, video in videos.items()
+            }
+        _check_cameras(info, cameras)
+        return info, cameras, metadata["urdf_sha256"] if record == EXTERNAL else ""
     except (KeyError, ValueError) as error:
         what = f"format version {version}" if record == EPISODE else "an external episode"
         raise RecordingError(f"The recording's metadata is not that of {what} ({in_words(error)})") from error
 
 
 def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
-    """ValueError unless all cameras of the scene (none, before the first frame) were recorded as it says."""
-    if cameras and cameras.keys() != {camera.name for camera in info.cameras}:
-        raise ValueError("the recorded cameras are not those of the scene")
-    for camera in info.cameras if cameras else ():
-        video = cameras[camera.name].video
-        if (video.width, video.height, video.fps) != (camera.width, camera.height, info.fps):
-            raise ValueError(f"the video of the camera {camera.name!r} has another size or rate than the scene")
-        if video.gop < 1:
-            raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
-
-
-def _check_videos(info: EpisodeInfo, videos: Mapping[str, VideoSettings]) -> None:
-    """ValueError unless the images of all cameras are of the size and codec that the description says."""
+    """ValueError unless all cameras (of a simulation none, before the first frame) were recorded as `info` says."""
+    is_simulated = info.simulation is not None
+    if not cameras and is_simulated:
+        return
+    if cameras.keys() != {camera.name for camera in info.cameras}:
+        raise ValueError("the recorded cameras are not those of the description")
     for camera in info.cameras:
-        video = videos.get(camera.name)
-        if video is None or (video.width, video.height) != (camera.width, camera.height):
-            raise ValueError(f"the video of the camera {camera.name!r} has another size")
+        video = cameras[camera.name].video
+        if (video.width, video.height) != (camera.width, camera.height) or (is_simulated and video.fps != info.fps):
+            raise ValueError(f"the video of the camera {camera.name!r} has another size or rate than the description")
+        if is_simulated and video.gop < 1:
+            raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
         if camera.kept and video.codec != camera.kept:
             raise ValueError(f"the video of the camera {camera.name!r} is {video.codec}, not {camera.kept}")
 

@@ -26,7 +26,7 @@ from demorec.core.errors import (
     resource_error,
 )
 from demorec.core.files import MAX_JSON_BYTES, open_regular, read_json_limited, replace_text
-from demorec.core.plain import digest, from_plain, to_plain
+from demorec.core.plain import PartValue, digest, from_plain, to_plain
 from demorec.core.replacing import json_object, shown
 from demorec.episode.info import EpisodeInfo
 
@@ -135,17 +135,8 @@ class Generation:
     export: ExportRecord | None = None
 
 
-class _Generated[V]:
-    """A value of the generation, read as one of the run's; ConfigError where there is none."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, run: RunFile, _: type | None = None) -> V:
-        if run.generation is None:
-            raise ConfigError("The episodes of this run were recorded by another robot or program, not generated.")
-        value: V = getattr(run.generation, self._name)
-        return value
+def _not_generated(_: str) -> ConfigError:
+    return ConfigError("The episodes of this run were recorded by another robot or program, not generated.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,11 +157,11 @@ class RunFile:
     attempts: tuple[Attempt, ...] = ()
     sessions: tuple[RunSession, ...] = ()
 
-    config = _Generated[GenerateConfig]()
-    versions = _Generated[Mapping[str, str]]()
-    num_episodes = _Generated[int]()
-    beyond = _Generated[tuple[Attempt, ...]]()
-    export = _Generated[ExportRecord | None]()
+    config = PartValue[GenerateConfig]("generation", _not_generated)
+    versions = PartValue[Mapping[str, str]]("generation", _not_generated)
+    num_episodes = PartValue[int]("generation", _not_generated)
+    beyond = PartValue[tuple[Attempt, ...]]("generation", _not_generated)
+    export = PartValue[ExportRecord | None]("generation", _not_generated)
 
     def with_generation(self, **changes: Any) -> RunFile:
         """The same run with other values of its generation, which it must have."""

@@ -19,7 +19,7 @@ from demorec.sources.picture_messages import KEPT_FORMATS, VIDEO_FORMATS, Pictur
 from demorec.sources.streams import BagStreams, Stream
 
 RATE = 0.05
-"""By which the rate of images that rows follow may differ from fps: as far as `collected_rate` takes it for that of the
+"""By which the rate of images that rows follow may differ from fps: as far as the check `rate` takes it for that of the
 episode. Where fps is the rate rounded, half an image a second is more."""
 _SAME_COUNT = 2
 """Images that cameras of one rate differ by: one more or less at each end of an episode."""

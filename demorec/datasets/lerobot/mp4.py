@@ -176,7 +176,7 @@ class Mp4Writer:
             self._is_open = False
 
     def abort(self) -> None:
-        """Drop what was collected; nothing after `close`."""
+        """Drop what was gathered; nothing after `close`."""
         if self._is_open:
             self._is_open = False
             with suppress(av.FFmpegError):  # libav writes the index even so, which fails again on a full disk

@@ -18,7 +18,7 @@ from demorec.datasets.staging import sync_file
 _ROWS_PER_TABLE = 100
 _ROWS_PER_GROUP = 4096
 _BYTES_PER_GROUP = 2 * MEBIBYTE
-"""Tables are collected up to so many rows or bytes: a row group costs a writer and a reader far more than its rows."""
+"""Tables are gathered up to so many rows or bytes: a row group costs a writer and a reader far more than its rows."""
 
 
 class RollingParquet:
