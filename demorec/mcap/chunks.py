@@ -85,6 +85,22 @@ class ChunkPlace:
             yield group
 
 
+def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, int, int]]:
+    """(opcode, start, end) of the contents of the records in a chunk, or in what `where` says; nothing is copied.
+
+    Raises:
+        ValueError, struct.error: They do not fill it.
+    """
+    position, end = 0, len(content)
+    while position < end:
+        opcode, length = RECORD_HEAD.unpack_from(content, position)
+        start = position + RECORD_HEAD.size
+        position = start + length
+        if position > end:
+            raise ValueError(f"a record that reaches beyond {where}")
+        yield opcode, start, position
+
+
 def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int | None = None) -> bytes:
     """The records in a chunk, given the content of its record; a checksum of 0 stands for none.
 

@@ -29,7 +29,7 @@ from mcap.records import (
 
 from demorec.core.errors import DemorecError, RecordingError, ResourceError, in_words, resource_error
 from demorec.core.files import open_regular
-from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content
+from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content, records_in
 from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.scan import MAX_METADATA_BYTES, MESSAGE_HEAD, read_channel, read_record, read_schema
 
@@ -127,7 +127,8 @@ class Container:
         self._metadata: dict[str, MetadataIndex] = {}
         self._attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
-        for opcode, content in _records_of(summary):
+        for opcode, start, end in records_in(summary, "the file's index"):
+            content = summary[start:end]
             if opcode == Opcode.CHANNEL:
                 channel = read_channel(content)
                 channels[channel.id] = channel
@@ -240,33 +241,14 @@ class Container:
             yield chunk_content(record, self._limits, place.uncompressed_size)
 
 
-def _records_of(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, content) of the records in the file's index."""
-    position = 0
-    while position < len(content):
-        opcode, length = RECORD_HEAD.unpack_from(content, position)
-        position += RECORD_HEAD.size
-        if position + length > len(content):
-            raise ValueError("a record that reaches beyond the file's index")
-        yield opcode, content[position : position + length]
-        position += length
-
-
 def _messages_of(contents: Iterable[bytes], wanted: dict[int, str], limits: Limits) -> Iterator[Message]:
-    # Every record of a chunk comes through here: those that are not wanted are stepped over, not copied.
     count = 0
     for content in contents:
-        position, end = 0, len(content)
-        while position < end:
-            opcode, length = RECORD_HEAD.unpack_from(content, position)
-            start = position + RECORD_HEAD.size
-            position = start + length
-            if position > end:
-                raise ValueError("a record that reaches beyond its chunk")
+        for opcode, start, end in records_in(content):
             count += 1
             if opcode == Opcode.MESSAGE:
                 channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(content, start)
                 topic = wanted.get(channel_id)
                 if topic is not None:
-                    yield Message(topic, log_time, content[start + MESSAGE_HEAD.size : position])
+                    yield Message(topic, log_time, content[start + MESSAGE_HEAD.size : end])
         limits.check_records(count)

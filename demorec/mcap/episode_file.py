@@ -190,23 +190,17 @@ class EpisodeFile(Closing):
 
     def _pictures[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
         """As `_read`, of a topic of images; RecordingError unless a simulated episode has one at each frame's time."""
-        count = 0
+        count, is_simulated = 0, self.info.simulation is not None
         for time_ns, picture in self._read(topic, read):
-            if self.info.simulation is not None and (
-                count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps)
-            ):
-                raise RecordingError(
-                    f"Image {count} of {topic} is at {time_ns} ns, not at its frame's time: {self.path}"
-                )
+            if is_simulated and (count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps)):
+                raise self._wrong_times(topic)
             yield time_ns, picture
             count += 1
-        self._check_num_pictures(topic, count)
+        if is_simulated and count != self.num_frames:
+            raise self._wrong_times(topic)
 
-    def _check_num_pictures(self, topic: str, count: int) -> None:
-        if self.info.simulation is not None and count != self.num_frames:
-            raise RecordingError(
-                f"The recording has {self.num_frames} frames, but {count} images on {topic}: {self.path}"
-            )
+    def _wrong_times(self, topic: str) -> RecordingError:
+        return RecordingError(f"The recording's images on {topic} are not one at the time of each frame: {self.path}")
 
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded images of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""

@@ -6,19 +6,16 @@ any other: the features and images that its description names, at stamps that go
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
-from demorec.core.geometry import Array, Pose
 from demorec.core.registry import nearest_match
-from demorec.episode.episode import CameraImages, Frame, SampledFrame
+from demorec.episode.episode import CameraImages, Frame, JointSample, Observation, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
 from demorec.episode.sensed import STREAMS
 from demorec.mcap.lossless import DEPTH_TYPES
@@ -49,7 +46,6 @@ class FrameCheck:
         self._joints, self._arm = (len(info.robot.joint_names),), (len(info.robot.arm_joints),)
         self._objects = {body.name for body in info.scene.movable}
         self._cameras = {camera.name for camera in info.scene.cameras}
-        self._version = info.format_version
         self._sensed = {
             name: (len(row.names(info.robot)),)
             for name, (row, stream) in STREAMS.items()
@@ -57,81 +53,51 @@ class FrameCheck:
         }
 
     def __call__(self, frame: Frame) -> None:
-        """Raise RecordingError for what is wrong with a frame; missing images are found by who codes them."""
-        seen, action, command = frame.observation, frame.action, frame.command
-        joints = [seen.joint_position, seen.joint_velocity, seen.joint_effort]
-        for sample in frame.joint_samples:
-            joints += (sample.joint_position, sample.joint_velocity, sample.joint_effort)
-        targets = [action.joint_target, command.joint_target]
-        if {vector.shape for vector in joints} != {self._joints} or {vector.shape for vector in targets} != {self._arm}:
-            raise _wrong_shape(frame, self._joints, joints, self._arm, targets)
-        sensed = [seen.sensed.get(name) for name in self._sensed]
-        if [None if vector is None else vector.shape for vector in sensed] != [*self._sensed.values()]:
-            raise self._wrong_sensed(frame)
-        if seen.object_poses.keys() != self._objects:
-            raise _other_names(frame, "poses of the objects", seen.object_poses, self._objects)
-        if not frame.images.keys() <= self._cameras:
-            raise _other_names(frame, "images of the cameras", frame.images, self._cameras)
-        poses = [seen.base_from_tcp, action.base_from_tcp_target, command.base_from_tcp_target]
-        poses += seen.object_poses.values()
-        poses += [images.world_from_camera for images in frame.images.values()]
-        parts = [part for pose in poses for part in (pose.position, pose.quat_xyzw)]
-        numbers = np.concatenate([*joints, *targets, *seen.sensed.values(), *parts])
-        scalars = (seen.gripper_width, seen.contact_force, action.gripper_target, command.gripper_target)
-        # One sum in place of sixty questions; it is finite unless a summand is not, or all are absurdly large.
-        if not math.isfinite(numbers.sum() + sum(scalars)):
-            _refuse_not_finite(frame)
+        """Raise RecordingError for what is wrong with a frame; images are looked at when they are encoded."""
+        poses, images = frame.observation.object_poses, frame.images
+        for what, found, known, fits in (
+            ("poses of the objects", poses, self._objects, poses.keys() == self._objects),
+            ("images of the cameras", images, self._cameras, images.keys() <= self._cameras),
+        ):
+            if not fits:
+                raise RecordingError(
+                    f"Frame {frame.frame_index} has {what} {', '.join(sorted(found)) or 'none'}, the scene has "
+                    f"{', '.join(sorted(known)) or 'none'}."
+                )
+        vectors = list(self._vectors(frame))
+        for owner, name, vector, shape in vectors:
+            if vector is None or vector.shape != shape:
+                told = f"no {name}" if vector is None else f"a {name} of shape {vector.shape}"
+                raise RecordingError(
+                    f"Frame {frame.frame_index} has {told} in its {owner}, it must be of shape {shape}."
+                )
+        if not np.isfinite(np.concatenate([vector for _, _, vector, _ in vectors])).all():
+            owner, name = next((owner, name) for owner, name, vector, _ in vectors if not np.isfinite(vector).all())
+            raise RecordingError(f"Frame {frame.frame_index} has a {name} in its {owner} that is not finite.")
 
-    def _wrong_sensed(self, frame: Frame) -> RecordingError:
-        sensed = frame.observation.sensed
-        name, shape = next(
-            (name, shape) for name, shape in self._sensed.items() if name not in sensed or sensed[name].shape != shape
+    def _vectors(self, frame: Frame) -> Iterator[tuple[str, str, Any, tuple[int, ...]]]:
+        """Where, what, numbers, their shape; None for the numbers of what is missing."""
+        seen = frame.observation
+        states: Iterable[tuple[str, Observation | JointSample]] = (
+            ("observation", seen),
+            *((f"joint sample at {sample.time_ns} ns", sample) for sample in frame.joint_samples),
         )
-        found = f"a {name} of shape {sensed[name].shape}" if name in sensed else f"no {name}"
-        return RecordingError(
-            f"Frame {frame.frame_index} has {found}; recordings of format version {self._version} have one of shape "
-            f"{shape} at each frame, zeros where nothing senses it."
-        )
-
-
-def _wrong_shape(
-    frame: Frame, joints: tuple[int], found: Sequence[Array], arm: tuple[int], targets: Sequence[Array]
-) -> RecordingError:
-    vector, wanted = next(
-        (vector, wanted)
-        for wanted, vectors in ((joints, found), (arm, targets))
-        for vector in vectors
-        if vector.shape != wanted
-    )
-    what = "joint target" if any(vector is target for target in targets) else "joint vector"
-    return RecordingError(f"Frame {frame.frame_index} has a {what} of shape {vector.shape}, the robot's is {wanted}.")
-
-
-def _other_names(frame: Frame, what: str, found: Iterable[str], known: Iterable[str]) -> RecordingError:
-    return RecordingError(
-        f"Frame {frame.frame_index} has {what} {', '.join(sorted(found)) or 'none'}, the scene has "
-        f"{', '.join(sorted(known)) or 'none'}."
-    )
-
-
-def _refuse_not_finite(frame: Frame) -> None:
-    owners: dict[str, Any] = {"observation": frame.observation, "action": frame.action, "command": frame.command}
-    owners |= {f"joint sample at {sample.time_ns} ns": sample for sample in frame.joint_samples}
-    owners |= {f"image of {name}": images for name, images in frame.images.items()}
-    for owner, value in owners.items():
-        numbers = {field.name: getattr(value, field.name) for field in fields(value)}
-        for name, found in {**numbers, **numbers.get("sensed", {})}.items():
-            if name != "sensed" and not _is_finite(found):
-                raise RecordingError(f"Frame {frame.frame_index} has a {name} in its {owner} that is not finite.")
-
-
-def _is_finite(value: Any) -> bool:
-    if isinstance(value, Pose):
-        return bool(np.isfinite(value.vector()).all())
-    if isinstance(value, Mapping):
-        return all(_is_finite(item) for item in value.values())
-    is_number = isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype == np.float64)
-    return not is_number or bool(np.isfinite(value).all())
+        for owner, state in states:
+            for name in ("joint_position", "joint_velocity", "joint_effort"):
+                yield owner, name, getattr(state, name), self._joints
+        for name in ("gripper_width", "contact_force"):
+            yield "observation", name, np.array([getattr(seen, name)]), (1,)
+        for name, shape in self._sensed.items():
+            yield "observation", name, seen.sensed.get(name), shape
+        for owner, action in (("action", frame.action), ("command", frame.command)):
+            yield owner, "joint_target", action.joint_target, self._arm
+            yield owner, "gripper_target", np.array([action.gripper_target]), (1,)
+            yield owner, "base_from_tcp_target", action.base_from_tcp_target.vector(), (7,)
+        yield "observation", "base_from_tcp", seen.base_from_tcp.vector(), (7,)
+        for pose in seen.object_poses.values():
+            yield "observation", "object_poses", pose.vector(), (7,)
+        for camera, images in frame.images.items():
+            yield f"image of {camera}", "world_from_camera", images.world_from_camera.vector(), (7,)
 
 
 def check_images(frame: Frame, camera: Camera, streams: CameraStreams) -> CameraImages:

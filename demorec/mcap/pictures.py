@@ -83,36 +83,6 @@ def read_pixel_statistics(data: bytes) -> PixelStatistics:
     return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256).copy())
 
 
-class PictureTopics:
-    """Where the encoded images of one camera go, be they of colours or of distances.
-
-    Args:
-        camera: The camera.
-        codec: Of the images.
-    """
-
-    def __init__(self, camera: Camera, codec: str) -> None:
-        self._codec, self._size = codec, (camera.height, camera.width)
-        self._topic, self._again_topic = video_topic(camera.name, codec), camera_topic(camera.name, "video")
-        self._frame_id = camera_frame(camera.name)
-        self._layout = messages.PictureMessages(self._frame_id, DEPTH_FORMAT if codec == "16UC1" else codec)
-
-    def of(self, time_ns: int, packet: bytes) -> list[Message]:
-        """The messages of one image."""
-        if self._codec == "av1":
-            data = messages.protobuf_video(time_ns, self._frame_id, self._codec, packet)
-            return [(self._topic, messages.PROTOBUF_VIDEO, data)]
-        if self._codec == "32FC1":
-            data = messages.image(time_ns, self._frame_id, self._codec, self._size, packet)
-            return [(self._topic, messages.IMAGE, data)]
-        result = [(self._topic, messages.COMPRESSED_IMAGE, self._layout.compressed_image(time_ns, packet))]
-        if self._codec in ("h264", "h265"):
-            # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
-            again = self._layout.compressed_video(time_ns, packet)
-            result.append((self._again_topic, messages.COMPRESSED_VIDEO, again))
-        return result
-
-
 _BESIDE: Mapping[str, tuple[str, Callable[[Any], bytes]]] = {
     "depth": (DEPTH_FORMAT, encode_depth),
     "segmentation": (LABELS_FORMAT, encode_labels),
@@ -146,10 +116,9 @@ class CameraWriter:
             self._encoder = make_encoder(video, camera.width, camera.height, fps)
             settings = self._encoder.settings
         self.streams = CameraStreams(video=settings, **dict.fromkeys(beside, True))
-        self._topics = PictureTopics(camera, settings.codec)
-        self._layouts = {
-            kind: messages.PictureMessages(camera_frame(camera.name), form) for kind, (form, _) in _BESIDE.items()
-        }
+        self._codec, self._frame_id = settings.codec, camera_frame(camera.name)
+        self._layout = messages.PictureMessages(self._frame_id, DEPTH_FORMAT if self._codec == "16UC1" else self._codec)
+        self._layouts = {kind: messages.PictureMessages(self._frame_id, form) for kind, (form, _) in _BESIDE.items()}
         self._waiting: list[tuple[int, list[Message]]] = []
         self._packets: list[bytes] = []
         self._num_images = self.num_ready = self.num_video_bytes = self.last_ns = 0
@@ -186,9 +155,25 @@ class CameraWriter:
         """Stamp and messages of the images before that number that have left the encoder, each once."""
         count = max(0, until - (self.num_ready - len(self._packets)))
         pairs = zip(self._waiting, self._packets[:count], strict=False)
-        taken = [(stamp, self._topics.of(stamp, packet) + others) for (stamp, others), packet in pairs]
+        taken = [(stamp, self._messages(stamp, packet) + others) for (stamp, others), packet in pairs]
         del self._packets[:count], self._waiting[: len(taken)]
         return taken
+
+    def _messages(self, time_ns: int, packet: bytes) -> list[Message]:
+        """Those of one image, be it of colours or of distances."""
+        camera, codec = self.camera, self._codec
+        topic = video_topic(camera.name, codec)
+        if codec == "av1":
+            return [(topic, messages.PROTOBUF_VIDEO, messages.protobuf_video(time_ns, self._frame_id, codec, packet))]
+        if codec == "32FC1":
+            data = messages.image(time_ns, self._frame_id, codec, (camera.height, camera.width), packet)
+            return [(topic, messages.IMAGE, data)]
+        result = [(topic, messages.COMPRESSED_IMAGE, self._layout.compressed_image(time_ns, packet))]
+        if codec in ("h264", "h265"):
+            # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
+            again = self._layout.compressed_video(time_ns, packet)
+            result.append((camera_topic(camera.name, "video"), messages.COMPRESSED_VIDEO, again))
+        return result
 
     def statistics(self) -> Message | None:
         """What was counted of all images; None where nothing was."""

@@ -102,23 +102,12 @@ class RecordingReader(EpisodeFile):
         self._packed_labels = {topic: found[topic] for topic in labels}
         pictures = {}
         for camera, topic in topics.items():
-            if self.info.simulation is not None:
-                self._check_times(topic, found[topic])
+            times = frame_times(self.num_frames, self.info.fps)
+            if self.info.simulation is not None and not np.array_equal(found[topic].time_ns, times):
+                raise self._wrong_times(topic)
             with damage_as_recording_error(self.path):
                 pictures[camera] = messages.coded_pictures(found[topic], self.video_settings(camera).codec)
         return pictures
-
-    def _check_times(self, topic: str, block: Block) -> None:
-        """Raise RecordingError unless there is one image at the time of each frame."""
-        times = frame_times(self.num_frames, self.info.fps)
-        known = block.time_ns[: self.num_frames]
-        wrong = np.flatnonzero(known != times[: len(known)])
-        if len(wrong) or len(block) > self.num_frames:
-            index = int(wrong[0]) if len(wrong) else self.num_frames
-            raise RecordingError(
-                f"Image {index} of {topic} is at {block.time_ns[index]} ns, not at its frame's time: {self.path}"
-            )
-        self._check_num_pictures(topic, len(block))
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation images, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
@@ -144,14 +133,15 @@ class RecordingReader(EpisodeFile):
                 block, first = blocks[topic], counts[camera]
                 counts[camera] += len(block)
                 if not np.array_equal(block.time_ns, times[first : counts[camera]]):
-                    raise RecordingError(f"Images of {topic} are not at the times of the frames: {self.path}")
+                    raise self._wrong_times(topic)
                 chosen = np.array([index for index in range(len(block)) if first + index in frames], dtype=np.intp)
                 for index, message in zip(chosen.tolist(), block.select(chosen).messages(), strict=True):
                     with damage_as_recording_error(self.path):
                         labels = decoders[camera].labels(messages.read_compressed_image(message))
                     yield camera, first + index, labels
         for camera, count in counts.items():
-            self._check_num_pictures(topics[camera], count)
+            if count != self.num_frames:
+                raise self._wrong_times(topics[camera])
 
     def _segmentation_topic(self, camera: str) -> str:
         if not self.has_segmentation(camera):

@@ -17,7 +17,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Metadata, Schema
 
-from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, chunk_content
+from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, chunk_content, records_in
 from demorec.mcap.limits import Unpacked
 
 MAX_METADATA_BYTES = 4 << 20
@@ -160,17 +160,12 @@ class _Records:
         """The messages in a chunk."""
         unpacked = chunk_content(content, self._unpacked.limits)
         self._unpacked.add(len(unpacked))
-        position, count, end = 0, 0, len(unpacked)
-        while position < end:
-            opcode, length = RECORD_HEAD.unpack_from(unpacked, position)
-            start = position + RECORD_HEAD.size
-            position = start + length
-            if position > end:
-                raise ValueError("a record that reaches beyond its chunk")
+        count = 0
+        for opcode, start, end in records_in(unpacked):
             count += 1
             if opcode == Opcode.MESSAGE:
                 channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(unpacked, start)
-                yield ScannedMessage(self._channels[channel], log_ns, unpacked[start + MESSAGE_HEAD.size : position])
+                yield ScannedMessage(self._channels[channel], log_ns, unpacked[start + MESSAGE_HEAD.size : end])
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.read(opcode, unpacked[start:position])
+                self.read(opcode, unpacked[start:end])
         self._unpacked.add(0, count)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -38,6 +38,10 @@ _TRANSFER_SRGB = 13
 _MATRIX_BT601 = 6
 
 
+DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
+"""Codec -> FFmpeg's name of the decoder, of codecs whose images need those before them."""
+_MAX_UNITS = 256
+"""Of an encoded image before its first slice."""
 _PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
 """Codec -> FFmpeg's name of the pixel format, of codecs whose every image stands by itself."""
 
@@ -250,8 +254,7 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
 
 
 def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
-    decoder = {"av1": "libdav1d", "h265": "hevc"}.get(settings.codec, settings.codec)
-    context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
+    context = cast(av.VideoCodecContext, av.CodecContext.create(DECODERS.get(settings.codec, settings.codec), "r"))
     context.thread_count = 1
     # A few bytes can announce images of gigabytes; encoded images are whole blocks of at most 128 pixels.
     context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
@@ -281,21 +284,27 @@ def is_keyframe(codec: str, data: bytes) -> bool:
     keyframes and nowhere else.
     """
     if codec == "h264":
-        return any(head & 31 == 5 for head in _nal_heads(data, lambda head: head & 31 in (1, 5)))
+        return any(kind == 5 for kind, _ in nal_units(codec, data))
     if codec in ("h265", "hevc"):
-        return any(16 <= head >> 1 <= 21 for head in _nal_heads(data, lambda head: head >> 1 < 32))
+        return any(16 <= kind <= 21 for kind, _ in nal_units(codec, data))
     if codec == "av1":
         return any(kind == 1 for kind in _obu_types(data))
     return True
 
 
-def _nal_heads(data: bytes, is_slice: Callable[[int], bool]) -> Iterator[int]:
-    """First byte of each NAL unit, up to the first slice: the parameter sets are in front of it."""
+def nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
+    """Type and place of the NAL units of an access unit, up to the first slice: the parameter sets are in front of it.
+
+    No more than `_MAX_UNITS` are looked at.
+    """
     position = data.find(b"\x00\x00\x01")
-    while 0 <= position < len(data) - 3:
+    for _ in range(_MAX_UNITS):
+        if not 0 <= position < len(data) - 3:
+            return
         head = data[position + 3]
-        yield head
-        if is_slice(head):
+        kind = head & 31 if codec == "h264" else head >> 1 & 63
+        yield kind, position
+        if kind in (1, 5) if codec == "h264" else kind < 32:
             return
         position = data.find(b"\x00\x00\x01", position + 3)
 

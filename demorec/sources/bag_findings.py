@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import DEPTH_UNITS
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.fields import frame_id_of
 from demorec.sources.findings import FROZEN, GAP, LOST, NOTE, STILL_S, Finding, of_stream, stream_findings
-from demorec.sources.mapping import ACTION, STATE, SourceMapping
+from demorec.sources.mapping import SourceMapping
 from demorec.sources.rows import RATE, EpisodeRows, Timelines
 from demorec.sources.streams import BagStreams
 

@@ -13,11 +13,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.episode.episode import Outcome, Sample, SampledFrame, Vector, frame_time_ns
+from demorec.episode.features import STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFile
 from demorec.mcap import EpisodeWriter
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import ExternalFolder
-from demorec.sources.mapping import STATE, SourceMapping, recorded_unit
+from demorec.sources.mapping import SourceMapping, recorded_unit
 
 Picture = bytes | NDArray[Any]
 """A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `EpisodeWriter.picture` takes them."""

@@ -23,8 +23,6 @@ SourceKind = Literal["bag", "hdf5"]
 Unit = Literal["", "rad", "degree", "percent", "m", "mm"]
 Sampling = Literal["latest", "nearest", "linear"]
 Stamp = Literal["header", "log"]
-STATE = "observation.state"
-ACTION = "action"
 MAX_FPS = 1000
 MAX_ELEMENTS = 4096
 """Of a source: more is an image or a point cloud, not a vector."""

@@ -15,18 +15,9 @@ from demorec.core.errors import ConfigError, in_words
 from demorec.core.files import read_text_limited
 from demorec.core.plain import MAX_TOLD, from_plain, listed
 from demorec.core.registry import nearest_match
+from demorec.episode.features import ACTION, STATE
 from demorec.episode.validity import MAX_CAMERAS, MAX_FEATURES
-from demorec.sources.mapping import (
-    ACTION,
-    CONVERSIONS,
-    KIND,
-    MAX_FPS,
-    MAX_SECONDS,
-    STATE,
-    Source,
-    SourceKind,
-    SourceMapping,
-)
+from demorec.sources.mapping import CONVERSIONS, KIND, MAX_FPS, MAX_SECONDS, Source, SourceKind, SourceMapping
 
 _MAX_FILE_BYTES = 1 << 20
 _MAX_TABLES, _MAX_VALUES = 1000, 50_000

@@ -18,11 +18,10 @@ from PIL import Image, UnidentifiedImageError
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import in_words
 from demorec.mcap.lossless import decode_millimetres
-from demorec.mcap.video import is_keyframe
+from demorec.mcap.video import DECODERS, Rgb, is_keyframe, nal_units
 from demorec.sources.fields import FieldError, picture_bytes, whole
 from demorec.sources.ros_types import Values
 
-Rgb = NDArray[np.uint8]
 _CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
     "rgb8": (3, (0, 1, 2)),
     "bgr8": (3, (2, 1, 0)),
@@ -127,13 +126,10 @@ def _from_yuv(pixels: NDArray[np.uint8], luma: int, u: int, v: int) -> Rgb:
     return np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
 
 
-VIDEO_FORMATS = ("h264", "h265", "av1")
+VIDEO_FORMATS = tuple(DECODERS)
 KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
 """What stays as it is, byte for byte."""
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-_DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
-_MAX_UNITS = 256
-"""Of an encoded image before its first slice, that are looked at."""
 _SEQUENCE_BYTES = 24
 """Of an AV1 keyframe, within which its sequence header ends."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
@@ -276,23 +272,10 @@ def decode_file(data: bytes) -> NDArray[np.uint8]:
 def _starts_by_itself(codec: str, data: bytes) -> bool:
     if codec == "av1":
         return is_keyframe(codec, data)
-    kinds = [kind for kind, _ in _nal_units(codec, data)]
+    kinds = [kind for kind, _ in nal_units(codec, data)]
     if codec == "h264":  # ITU-T H.264, table 7-1
         return 5 in kinds and 7 in kinds
     return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
-
-
-def _nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
-    """Type and place of those of an access unit, up to its first slice."""
-    position, count = data.find(b"\x00\x00\x01"), 0
-    while 0 <= position < len(data) - 3:
-        head = data[position + 3]
-        kind = head & 31 if codec == "h264" else (head >> 1) & 63
-        yield kind, position
-        count += 1
-        if (kind in (1, 5) if codec == "h264" else kind < 32) or count == _MAX_UNITS:
-            return
-        position = data.find(b"\x00\x00\x01", position + 3)
 
 
 class _VideoSizes:
@@ -325,7 +308,7 @@ _sizes = _VideoSizes()
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:
     """Those in front of a keyframe's image, without what may differ from image to image beside them."""
-    units = list(_nal_units(codec, data))
+    units = list(nal_units(codec, data))
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
     places = [place for _, place in units[1:]] + [units[-1][1]]
     return b"".join(data[at:end] for (kind, at), end in zip(units, places, strict=True) if kind in kinds)
@@ -333,7 +316,7 @@ def _parameter_sets(codec: str, data: bytes) -> bytes:
 
 def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
     try:
-        context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[codec], "r"))
+        context = cast(av.VideoCodecContext, av.CodecContext.create(DECODERS[codec], "r"))
         context.thread_count = 1
         context.options = {"max_pixels": str(MAX_PIXELS)}
         for data in packets:

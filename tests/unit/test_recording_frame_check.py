@@ -41,19 +41,19 @@ def pose_of_nan(pose: Pose) -> Pose:
 FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "seven joints for nine": (
         lambda f: observed(f, joint_position=f.observation.joint_position[:7]),
-        r"joint vector of shape \(7,\), the robot's is \(9,\)",
+        r"joint_position of shape \(7,\) in its observation, it must be of shape \(9,\)",
     ),
     "a column": (
         lambda f: observed(f, joint_effort=f.observation.joint_effort[:, None]),
-        r"joint vector of shape \(9, 1\)",
+        r"joint_effort of shape \(9, 1\)",
     ),
     "a target with fingers": (
         lambda f: moved(f, joint_target=np.zeros(9)),
-        r"joint target of shape \(9,\), the robot's is \(7,\)",
+        r"joint_target of shape \(9,\) in its command, it must be of shape \(7,\)",
     ),
     "a sample of another length": (
         lambda f: replace(f, joint_samples=(replace(f.joint_samples[0], joint_velocity=np.zeros(3)),)),
-        r"joint vector of shape \(3,\)",
+        r"joint_velocity of shape \(3,\) in its joint sample",
     ),
     "no objects": (lambda f: observed(f, object_poses={}), "poses of the objects none, the scene has cube"),
     "an unknown object": (
@@ -66,11 +66,11 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     ),
     "no wrench": (
         lambda f: observed(f, sensed={}),
-        r"no wrench; recordings of format version 2 have one of shape \(6,\) at each frame",
+        r"no wrench in its observation, it must be of shape \(6,\)",
     ),
     "a force without a torque": (
         lambda f: observed(f, sensed={"wrench": np.zeros(3)}),
-        r"a wrench of shape \(3,\); recordings",
+        r"a wrench of shape \(3,\)",
     ),
     "a NaN in the wrench": (
         lambda f: observed(f, sensed={"wrench": with_nan(f.observation.sensed["wrench"])}),
