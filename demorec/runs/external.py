@@ -15,6 +15,7 @@ from pathlib import Path
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error
 from demorec.core.files import LOCK_NAME, make_folder, run_lock
+from demorec.core.replacing import json_object
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, recover
 from demorec.runs.run_file import (
@@ -159,11 +160,10 @@ class ExternalFolder:
 
 
 def _load(path: Path) -> RunFile:
-    """run.json; ConfigError unless it is of external episodes."""
-    run = load_any_run_file(path)
-    if run.generation is not None:
+    """run.json; ConfigError where it is one, damaged or not, of another kind of run."""
+    if json_object(path / RUN_NAME) and not is_external_run(path):
         raise ConfigError(f"The folder holds a run of another kind: choose another folder: {path}")
-    return run
+    return load_any_run_file(path)
 
 
 @contextmanager
