@@ -76,7 +76,7 @@ class _Pending(NamedTuple):
 
 
 class EpisodeWriter(Closing):
-    """Context manager that writes one episode; left without `finish`, NAME.mcap.part stays for `recover`.
+    """Context manager that writes one episode.
 
     Frames must not be changed after they were given. Depth and segmentation of simulated cameras are recorded when the
     first frame has them.
@@ -87,6 +87,7 @@ class EpisodeWriter(Closing):
         video: How images are encoded that come as pixels.
         overwrite: Whether a recording of that name may be replaced.
         begins: Whether all of `info` is known. Else only file and encoders are opened, and `begin` must follow.
+        keeps_part: Whether NAME.mcap.part stays for `recover` when it is left without `finish`.
 
     Attributes:
         num_frames: So far.
@@ -105,8 +106,9 @@ class EpisodeWriter(Closing):
         video: VideoConfig | None = None,
         overwrite: bool = False,
         begins: bool = True,
+        keeps_part: bool = True,
     ) -> None:
-        self.num_frames = 0
+        self.num_frames, self._keeps_part = 0, keeps_part
         self._info, self._video = info, video or VideoConfig()
         self._pending: list[_Pending] = []
         self._is_begun = False
@@ -206,12 +208,13 @@ class EpisodeWriter(Closing):
         if not self._is_begun:
             self._open_cameras(frame)
             self._write_description()
-        pictures = {}
-        for name, camera in self._cameras.items():
-            images = check_images(frame, camera.camera, camera.streams)
-            pictures[name] = camera.add(
+        cameras = {name: check_images(frame, one.camera, one.streams) for name, one in self._cameras.items()}
+        pictures = {
+            name: self._cameras[name].add(
                 frame.time_ns, images.color, depth=images.depth, segmentation=images.segmentation
             )
+            for name, images in cameras.items()
+        }
         return _Pending(frame.time_ns, FrameValues.of(frame), pictures, self._changes(frame), frame.joint_samples)
 
     def _open_cameras(self, first: Frame) -> None:
@@ -326,8 +329,11 @@ class EpisodeWriter(Closing):
         )
 
     def close(self) -> None:
-        """End it and leave NAME.mcap.part as it is; harmless when called twice, and after `finish`."""
-        self._file.close()
+        """End it, and leave NAME.mcap.part as it is or nothing; harmless when called twice, and after `finish`."""
+        if self._keeps_part:
+            self._file.close()
+        else:
+            self._file.discard()
 
     def discard(self) -> None:
         """Give the episode up and remove what was written of it."""

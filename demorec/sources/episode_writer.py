@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
-from demorec.core.files import read_text_limited
+from demorec.core.files import Closing, read_text_limited
 from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import DEPTH_UNITS, Camera, EpisodeInfo, Feature
 from demorec.mcap import EpisodeWriter
@@ -64,7 +64,7 @@ def _places(numbers: Int, first: int) -> Int:
     return places
 
 
-class ImportedEpisodeWriter:
+class ImportedEpisodeWriter(Closing):
     """Writes one episode; a context manager, which leaves nothing behind unless `finish` was called.
 
     Args:
@@ -80,15 +80,11 @@ class ImportedEpisodeWriter:
             first = int(plan.taken.min()) if len(plan.taken) else 0
             self._waiting[name] = _Waiting(plan=plan, first=first, places=_places(plan.taken, first))
         self._next_row = 0
-        self._writer = EpisodeWriter(path, episode.info, video=video)
-        self._is_finished = False
+        self._writer = EpisodeWriter(path, episode.info, video=video, keeps_part=False)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if not self._is_finished:
-            self._writer.discard()
+    def close(self) -> None:
+        """Leave nothing behind unless it is finished."""
+        self._writer.close()
 
     @property
     def is_complete(self) -> bool:
@@ -144,7 +140,6 @@ class ImportedEpisodeWriter:
             missing = [w.plan.topic for w in self._waiting.values() if w.num_written < len(w.plan.taken)]
             raise BagError(f"The bag has changed while it was read: images of {missing[0]} are missing.")
         self._writer.finish(Outcome(success=self._rows.window.success, num_frames=self._next_row))
-        self._is_finished = True
 
 
 _MAX_URDF_BYTES = 4 << 20

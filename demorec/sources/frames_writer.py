@@ -132,10 +132,9 @@ def write_frames(
     """
     folder.check_fits(info)
     path = folder.path_of(info.episode_index)
-    writer = EpisodeWriter(path, info, video=video)
     leads = leads or {}
     begin = max(leads.values(), default=0)
-    try:
+    with EpisodeWriter(path, info, video=video, keeps_part=False) as writer:
         for name, lead in leads.items():
             for number in range(begin - lead, begin):
                 writer.picture(name, frame_time_ns(number, info.fps), next(pictures[name]))
@@ -148,7 +147,4 @@ def write_frames(
             writer.write(SampledFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
             count += 1
         writer.finish(replace(outcome, num_frames=count))
-    except BaseException:
-        writer.discard()
-        raise
     folder.add(path)
