@@ -1,7 +1,7 @@
 """CDR, the wire format of ROS 2 messages (OMG DDS-XTypes, plain XCDR1, little endian).
 
-Messages are written and read by the definitions of their types (`demorec.mcap.ros2`). A value is one for each
-field, in order: a tuple of a struct, a sequence of an array, the bytes of uint8[].
+Messages are written and read by the definitions of their types (`demorec.mcap.ros2`, or that of a bag). A value to be
+written is one for each field, in order: a tuple of a struct, a sequence of an array, the bytes of uint8[].
 
 A recording consists of many messages with the same names and lengths and other numbers. So a message is laid out
 once, as a `Layout`: constant bytes with slots for time stamps and float64 (or int64) values. Writing or reading a
@@ -12,7 +12,7 @@ each.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, lru_cache
@@ -26,8 +26,8 @@ from demorec.mcap.ros2 import FieldType, Types, types_of
 HEADER = b"\x00\x01\x00\x00"
 _NANOSECONDS = 1_000_000_000
 _CODES = {
-    "bool": "?", "byte": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i",
-    "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
+    "bool": "?", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I",
+    "int32": "i", "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
 }  # fmt: skip
 
 
@@ -170,6 +170,14 @@ class Layout:
         return values
 
 
+Values = dict[str, Any]
+"""Field -> number, text, NumPy array (numbers), list (texts, messages) or Values."""
+Reader = Callable[[memoryview, int], tuple[Any, int]]
+"""Of bytes and a place in them: what stands there, and the place behind it."""
+
+_MAX_DEPTH = 32
+
+
 def strict_text(raw: bytes) -> str:
     """A string as it is in a message; ValueError for none."""
     if not raw.endswith(b"\x00"):
@@ -177,59 +185,164 @@ def strict_text(raw: bytes) -> str:
     return raw[:-1].decode()
 
 
-class CdrReader:
-    """Reads one message in order; ValueError when it is too short or of another encoding.
+def lenient_text(raw: bytes) -> str:
+    """A string as whoever sent it has it, whatever cannot be decoded in it."""
+    return raw[:-1].decode(errors="replace")
+
+
+class Readers:
+    """Readers of the types of a definition, which is data: one for each type, however often it occurs.
 
     Args:
-        data: The message.
+        types: The definition.
+        order: "<" or ">", of the bytes of numbers.
+        is_aligned: Whether they are aligned, as CDR has them; those of ROS 1 are not.
         text: What becomes of the bytes of a string.
+        take: Called with how many values are made next, before they are.
     """
 
-    def __init__(self, data: bytes, *, text: Callable[[bytes], str] = strict_text) -> None:
-        if data[:4] != HEADER:
-            raise ValueError(f"a message with the encapsulation {data[:4].hex() or 'of no bytes'}, expected 00010000")
-        self._data, self._text = data, text
-        self._position = 4
+    def __init__(
+        self,
+        types: Types,
+        *,
+        order: str = "<",
+        is_aligned: bool = True,
+        text: Callable[[bytes], str] = strict_text,
+        take: Callable[[int], None] = lambda count: None,
+    ) -> None:
+        self._types, self._order, self._is_aligned, self._decode, self._take = types, order, is_aligned, text, take
+        self._made: dict[str, tuple[Reader, int]] = {}
 
-    @property
-    def num_left(self) -> int:
-        """Bytes that were not read."""
-        return len(self._data) - self._position
+    def of(self, kind: str) -> Reader:
+        """That of a type; ValueError when it refers to one that is not defined, or to itself."""
+        return self._message(kind, 0)[0]
 
-    def values(self, schema: str) -> Iterator[Any]:
-        """The fields of a message of a type; an array of numbers is a NumPy array."""
-        types = types_of(schema)
-        return (self._field(types, field) for field in types[""])
+    def _message(self, kind: str, depth: int) -> tuple[Reader, int]:
+        """The reader of a type that is so deep within others, and how deep others are within it."""
+        found = self._made.get(kind)
+        if depth + (found[1] if found else 0) > _MAX_DEPTH:
+            raise ValueError("its definition is nested too deeply")
+        if found is None:
+            found = self._made[kind] = self._new(kind, depth)
+        return found
 
-    def _field(self, types: Types, field: FieldType) -> Any:
-        if not field.is_array:
-            return self._value(types, field.kind)
-        length = self._value(types, "uint32") if field.length is None else field.length
-        if field.kind == "uint8" and field.length is None:
-            return self._take(length)
-        if field.kind not in _CODES:
-            return [self._value(types, field.kind) for _ in range(length)]
-        dtype = np.dtype("<" + _CODES[field.kind])
-        if length:
-            self._align(dtype.itemsize)
-        return np.frombuffer(self._take(dtype.itemsize * length), dtype)
+    def _new(self, kind: str, depth: int) -> tuple[Reader, int]:
+        parts = [(field.name, *self._field(field, depth)) for field in self._types[kind]]
+        height = max((below for _, _, below in parts), default=0)
+        readers = [(name, reader) for name, reader, _ in parts]
+        take, count = self._take, 1 + len(readers)
+        if not readers and self._is_aligned:  # ROS 2 gives a type without fields a byte
+            return lambda data, position: ({}, position + 1), height
 
-    def _value(self, types: Types, kind: str) -> Any:
-        if kind in types:
-            return tuple([self._field(types, field) for field in types[kind]])
+        def read(data: memoryview, position: int) -> tuple[Values, int]:
+            take(count)
+            values = {}
+            for field, read_field in readers:
+                values[field], position = read_field(data, position)
+            return values, position
+
+        return read, height
+
+    def _field(self, field: FieldType, depth: int) -> tuple[Reader, int]:
+        if field.is_array and field.kind in _CODES:
+            return self._numbers(field.kind, field.length), 0
+        if field.kind in self._types:
+            reader, height = self._message(field.kind, depth + 1)
+        elif "/" in field.kind:
+            raise ValueError(f"its definition lacks the type {field.kind[:80]!r}")
+        else:
+            reader, height = self._scalar(field.kind), -1
+        return (self._list(reader, field.length) if field.is_array else reader), height + 1
+
+    def _scalar(self, kind: str) -> Reader:
         if kind == "string":
-            return self._text(self._take(self._value(types, "uint32")))
-        code = "<" + _CODES[kind]
-        size = struct.calcsize(code)
-        self._align(size)
-        return struct.unpack(code, self._take(size))[0]
+            return self._text()
+        if kind not in _CODES:
+            raise ValueError(f"it has a field of the type {kind}, which is not read")
+        number = struct.Struct(self._order + _CODES[kind])
+        size, unpack = number.size, number.unpack_from
+        if not self._is_aligned or size == 1:
+            return lambda data, position: (unpack(data, position)[0], position + size)
+        mask = size - 1
 
-    def _align(self, size: int) -> None:
-        self._position += -(self._position - 4) % size
+        def read(data: memoryview, position: int) -> tuple[Any, int]:
+            position = (position + mask) & ~mask
+            return unpack(data, position)[0], position + size
 
-    def _take(self, size: int) -> bytes:
-        start = self._position
-        if start + size > len(self._data):
-            raise ValueError(f"a message of {len(self._data)} bytes that ends within a field")
-        self._position = start + size
-        return self._data[start : start + size]
+        return read
+
+    def _text(self) -> Reader:
+        length_of, decode, has_nul = self._scalar("uint32"), self._decode, self._is_aligned
+
+        def read(data: memoryview, position: int) -> tuple[str, int]:
+            length, position = length_of(data, position)
+            end = position + length
+            if end > len(data):
+                raise ValueError("a text reaches beyond its end")
+            raw = bytes(data[position:end])
+            return decode(raw if has_nul else raw + b"\0"), end
+
+        return read
+
+    def _numbers(self, kind: str, count: int | None) -> Reader:
+        dtype = np.dtype(self._order + ("B" if kind == "bool" else _CODES[kind]))
+        size = dtype.itemsize
+        mask = size - 1 if self._is_aligned else 0
+        length_of = self._scalar("uint32")
+
+        def read(data: memoryview, position: int) -> tuple[Any, int]:
+            number = count
+            if number is None:
+                number, position = length_of(data, position)
+            if number == 0:
+                return np.empty(0, dtype), position
+            position = (position + mask) & ~mask
+            end = position + number * size
+            if end > len(data):
+                raise ValueError("an array reaches beyond its end")
+            return np.frombuffer(data, dtype, number, position), end
+
+        return read
+
+    def _list(self, read_element: Reader, count: int | None) -> Reader:
+        length_of, take = self._scalar("uint32"), self._take
+
+        def read(data: memoryview, position: int) -> tuple[list[Any], int]:
+            number = count
+            if number is None:
+                number, position = length_of(data, position)
+            if number > len(data) - position:  # each element takes a byte at least
+                raise ValueError("a list reaches beyond its end")
+            take(number)
+            values = []
+            for _ in range(number):
+                value, position = read_element(data, position)
+                values.append(value)
+            return values, position
+
+        return read
+
+
+def read_whole(read: Reader, data: memoryview) -> tuple[Values, int]:
+    """A message, and how many bytes are left behind it; ValueError when it is cut off."""
+    try:
+        values, position = read(data, 0)
+    except struct.error:
+        raise ValueError("it ends within a value") from None
+    return values, len(data) - position
+
+
+@lru_cache(maxsize=128)
+def _reader_of(schema: str, text: Callable[[bytes], str]) -> Reader:
+    return Readers(types_of(schema), text=text).of("")
+
+
+def decode(schema: str, data: bytes, *, text: Callable[[bytes], str] = strict_text) -> tuple[Values, int]:
+    """A message of a type that recordings use, and how many bytes are left behind it.
+
+    Raises:
+        ValueError: It is too short or of another encoding.
+    """
+    if data[:4] != HEADER:
+        raise ValueError(f"a message with the encapsulation {data[:4].hex() or 'of no bytes'}, expected 00010000")
+    return read_whole(_reader_of(schema, text), memoryview(data)[4:])

@@ -5,14 +5,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
-from demorec.mcap.cdr import HEADER, CdrReader, encode
+from demorec.mcap.cdr import decode, encode
 from demorec.mcap.chunks import Block
 from demorec.mcap.ros2 import DEFINITIONS, Types, types_of
 
@@ -37,13 +36,13 @@ _LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
 
 def read_string(data: bytes) -> str:
     """The text of a std_msgs/String."""
-    text: str = next(CdrReader(data).values(STRING))
+    text: str = decode(STRING, data)[0]["data"]
     return text
 
 
 def read_boolean(data: bytes) -> bool:
     """The value of a std_msgs/Bool."""
-    return bool(next(CdrReader(data).values(BOOL)))
+    return bool(decode(BOOL, data)[0]["data"])
 
 
 def log(time_ns: int, event: Event) -> bytes:
@@ -53,12 +52,11 @@ def log(time_ns: int, event: Event) -> bytes:
 
 def read_log(data: bytes) -> Event:
     """Inverse of `log`; ValueError for an unknown level."""
-    values = CdrReader(data).values(LOG)
-    _, level_number = islice(values, 2)
+    values, _ = decode(LOG, data)
     for level, number in _LOG_LEVELS.items():
-        if number == level_number:
-            return Event(name=next(values), message=next(values), level=level)  # type: ignore[arg-type]
-    raise ValueError(f"a log message of level {level_number}")
+        if number == values["level"]:
+            return Event(name=values["name"], message=values["msg"], level=level)  # type: ignore[arg-type]
+    raise ValueError(f"a log message of level {values['level']}")
 
 
 def _stamp(time_ns: int) -> tuple[int, int]:
@@ -108,8 +106,7 @@ def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], dat
 
 def read_image(data: bytes) -> bytes:
     """The pixels of an `image`; ValueError when it is cut off."""
-    *_, pixels = CdrReader(data).values(IMAGE)
-    return bytes(pixels)
+    return bytes(decode(IMAGE, data)[0]["data"])
 
 
 def read_compressed_image(data: bytes) -> bytes:
@@ -225,8 +222,9 @@ def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequ
 
 def read_camera_info(data: bytes) -> Calibration:
     """Inverse of `camera_info`."""
-    _, height, width, _, _, k = islice(CdrReader(data).values(CAMERA_INFO), 6)
-    return Calibration(width=width, height=height, intrinsics=k.astype(np.float64).reshape(3, 3))
+    values, _ = decode(CAMERA_INFO, data)
+    intrinsics = values["k"].astype(np.float64).reshape(3, 3)
+    return Calibration(width=values["width"], height=values["height"], intrinsics=intrinsics)
 
 
 def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
@@ -244,8 +242,7 @@ def label_info(labels: Sequence[tuple[int, str]]) -> bytes:
 
 def read_label_info(data: bytes) -> dict[int, str]:
     """Inverse of `label_info`."""
-    _, labels = islice(CdrReader(data).values(LABEL_INFO), 2)
-    return dict(labels)
+    return {item["class_id"]: item["class_name"] for item in decode(LABEL_INFO, data)[0]["class_map"]}
 
 
 Value = bool | int | float | str | bytes
@@ -268,19 +265,22 @@ def message_fields(schema: str, data: bytes) -> dict[str, Value]:
         return dict(protobuf_fields(data))
     if schema not in DEFINITIONS:
         raise ValueError(f"no recording has messages of the type {schema!r}")
-    if data[:4] != HEADER:
-        raise ValueError("a message of another encapsulation")
-    reader = CdrReader(data, text=lambda raw: raw.decode(errors="backslashreplace").removesuffix("\0"))
-    found = dict(_leaves(types_of(schema), "", "", reader.values(schema)))
-    if reader.num_left:
-        raise ValueError(f"a message with {reader.num_left} bytes too many")
-    return found
+    values, num_left = decode(schema, data, text=_any_text)
+    if num_left:
+        raise ValueError(f"a message with {num_left} bytes too many")
+    return dict(_leaves(types_of(schema), "", "", values))
+
+
+def _any_text(raw: bytes) -> str:
+    return raw.decode(errors="backslashreplace").removesuffix("\0")
 
 
 def _leaves(types: Types, kind: str, prefix: str, values: Any) -> Iterator[tuple[str, Value]]:
     """Path and value of every field of a struct."""
-    for field, value in zip(types[kind], values, strict=True):
-        path = prefix + field.name
+    for field in types[kind]:
+        path, value = prefix + field.name, values[field.name]
+        if field.kind == "uint8" and field.is_array:
+            value = value.tobytes()
         if not field.is_array or isinstance(value, bytes):
             items = [(path, value)]
         else:

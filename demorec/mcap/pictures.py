@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.episode.info import Camera
 from demorec.mcap import messages
-from demorec.mcap.cdr import CdrReader, encode
+from demorec.mcap.cdr import decode, encode
 from demorec.mcap.channels import Message, camera_topic, video_topic
 from demorec.mcap.lossless import DEPTH_FORMAT, LABELS_FORMAT, encode_depth, encode_distances, encode_labels
 from demorec.mcap.metadata import CameraStreams
@@ -77,7 +77,7 @@ def pixel_statistics(statistics: PixelStatistics) -> bytes:
 
 def read_pixel_statistics(data: bytes) -> PixelStatistics:
     """Inverse of `pixel_statistics`."""
-    _, values = CdrReader(data).values(messages.INT64_ARRAY)
+    values = decode(messages.INT64_ARRAY, data)[0]["data"]
     if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
         raise ValueError("a histogram of other numbers than counts")
     return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256).copy())

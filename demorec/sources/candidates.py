@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from demorec.mcap.cdr import Values
 from demorec.sources.fields import (
     SourceLayout,
     SourceReader,
@@ -23,7 +24,6 @@ from demorec.sources.fields import (
     parse_path,
 )
 from demorec.sources.mapping import MAX_ELEMENTS, Source
-from demorec.sources.ros_types import Values
 from demorec.sources.words import first_numbers
 
 Kind = Literal["arm", "gripper", "base", "pose", "twist", "numbers"]

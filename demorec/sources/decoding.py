@@ -10,9 +10,10 @@ import numpy as np
 
 from demorec.core.errors import in_words
 from demorec.core.plain import MAX_DEPTH, parse_json
+from demorec.mcap.cdr import Values
 from demorec.mcap.limits import Budget, SpentError
 from demorec.mcap.scan import ScannedChannel, ScannedMessage
-from demorec.sources.ros_types import Budgets, Values, ros_decoder
+from demorec.sources.ros_types import Budgets, ros_decoder
 
 _BYTES_OF_VALUE = 200
 """That are counted for each that is kept."""

@@ -18,13 +18,13 @@ from demorec.core.files import Closing, read_text_limited
 from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import DEPTH_UNITS, Camera, EpisodeInfo, Feature
 from demorec.mcap import EpisodeWriter
+from demorec.mcap.cdr import Values
 from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import Int
 from demorec.sources.fields import picture_bytes
 from demorec.sources.frames_writer import imported_feature
 from demorec.sources.picture_messages import decode_picture
-from demorec.sources.ros_types import Values
 from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines
 from demorec.sources.streams import BagStreams
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.registry import nearest_match
+from demorec.mcap.cdr import Values
 from demorec.sources.bag_files import MAX_TIME_NS
 from demorec.sources.mapping import MAX_ELEMENTS, Source, conversion_factor
-from demorec.sources.ros_types import Values
 
 _STEP = re.compile(r"(?P<name>[^.\[\]]+)|\[(?P<key>[^=\]]+)=(?P<value>[^\]]*)\]|\[(?P<index>\d+)\]")
 _STAMP_PATHS = (

@@ -14,11 +14,11 @@ from demorec.core.config import MAX_PIXELS
 from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
 from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, Feature, Kept
+from demorec.mcap.cdr import Values
 from demorec.sources.fields import FieldError, converted
 from demorec.sources.frames_writer import Picture, imported_feature
 from demorec.sources.mapping import MAX_ELEMENTS, CameraSource, Source, conversion_factor
 from demorec.sources.picture_messages import PictureHead, decode_picture, picture_head
-from demorec.sources.ros_types import Values
 
 _BLOCK_ROWS = 1024
 _EXACT = 2**53

@@ -17,10 +17,10 @@ from PIL import Image, UnidentifiedImageError
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import in_words
+from demorec.mcap.cdr import Values
 from demorec.mcap.lossless import decode_millimetres
 from demorec.mcap.video import DECODERS, Rgb, is_keyframe, nal_units
 from demorec.sources.fields import FieldError, picture_bytes, whole
-from demorec.sources.ros_types import Values
 
 _CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
     "rgb8": (3, (0, 1, 2)),

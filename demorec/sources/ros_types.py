@@ -6,11 +6,9 @@ definition's text and run. A definition from a foreign file is data here: it bec
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import make_typesdict
@@ -18,22 +16,11 @@ from rosbags.typesys.idl import IDLParser
 from rosbags.typesys.msg import MSGParser
 from rosbags.typesys.peg import Parser
 
+from demorec.mcap.cdr import Readers, Values, lenient_text, read_whole
 from demorec.mcap.limits import Budget, Limits, SpentError
+from demorec.mcap.ros2 import FieldType, Types
 
-Values = dict[str, Any]
-"""Field -> number, text, NumPy array (numbers), list (texts, messages) or Values."""
-_Reader = Callable[[memoryview, int], tuple[Any, int]]
-_Fields = list[tuple[str, Any]]
-
-_MAX_DEPTH = 32
-_CODES = {
-    "bool": "?", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
-    "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
-}  # fmt: skip
-_TIME: _Fields = [
-    ("sec", (Nodetype.BASE, ("int32", 0))),
-    ("nanosec", (Nodetype.BASE, ("uint32", 0))),
-]
+_TIME = (FieldType("sec", "int32", False, None), FieldType("nanosec", "uint32", False, None))
 _BUILT_IN = {"builtin_interfaces/msg/Time": _TIME, "builtin_interfaces/msg/Duration": _TIME}
 _SEPARATOR = "=" * 80 + "\n"
 """Between the definitions of types that are in one text."""
@@ -80,29 +67,20 @@ def ros_decoder(
     name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
     budgets.steps.begin()
     types = _types(name, schema_encoding, schema, budgets.steps)
-    if not is_cdr:
-        read = _Builder(types, budgets.values, order="<", is_aligned=False).message(name)
-        return lambda data: _whole(read, memoryview(data), budgets.values)
-    readers = {
-        number: _Builder(types, budgets.values, order=order, is_aligned=True).message(name)
-        for number, order in enumerate("><")
-    }
+    budget = budgets.values
+    readers = [
+        Readers(types, order=order, is_aligned=is_cdr, text=lenient_text, take=budget.take).of(name) for order in "><"
+    ]
 
     def decode(data: bytes) -> Values:
-        if len(data) < 4 or data[0] != 0 or data[1] not in readers:
+        budget.begin()
+        if not is_cdr:
+            return read_whole(readers[1], memoryview(data))[0]
+        if len(data) < 4 or data[0] != 0 or data[1] > 1:
             raise ValueError("its first bytes are not those of a CDR message")
-        return _whole(readers[data[1]], memoryview(data)[4:], budgets.values)
+        return read_whole(readers[data[1]], memoryview(data)[4:])[0]
 
     return decode
-
-
-def _whole(read: _Reader, data: memoryview, budget: Budget) -> Values:
-    budget.begin()
-    try:
-        values: Values = read(data, 0)[0]
-    except struct.error:
-        raise ValueError("it ends within a value") from None
-    return values
 
 
 class _Counted(Parser):  # type: ignore[misc]
@@ -133,7 +111,7 @@ def _from_msg(text: str, name: str, steps: Budget) -> Any:
     return make_typesdict(_CountedMsgParser(f"MSG: {name}\n{text}", steps).specification())
 
 
-def _types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Mapping[str, _Fields]:
+def _types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Types:
     key = (name, schema_encoding, schema)
     if key not in _parsed:
         found = _parsed_types(name, schema_encoding, schema, steps)
@@ -144,11 +122,11 @@ def _types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Map
 
 
 _MAX_PARSED = 512
-_parsed: dict[tuple[str, str, bytes], Mapping[str, _Fields]] = {}
+_parsed: dict[tuple[str, str, bytes], Types] = {}
 """(type, encoding, definition) -> its types: a bag is read twice, and the next one has the same definitions."""
 
 
-def _parsed_types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Mapping[str, _Fields]:
+def _parsed_types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Types:
     try:
         if "/srv/" in name:
             parsed = _service_event(name, schema.decode(), steps)
@@ -170,10 +148,21 @@ def _parsed_types(name: str, schema_encoding: str, schema: bytes, steps: Budget)
         raise
     except Exception as error:  # the parser's own errors, and what it does not foresee
         raise ValueError("its definition cannot be read") from error
-    types = {key: list(fields) for key, (_, fields) in parsed.items()}
-    if name not in types:
+    if name not in parsed:
         raise ValueError("it comes without a definition, and is no type of ROS itself")
-    return types
+    found = {kind: tuple(_field_type(*field) for field in fields) for kind, (_, fields) in parsed.items()}
+    return found | {kind: fields for kind, fields in _BUILT_IN.items() if not found.get(kind)}
+
+
+def _field_type(name: str, description: Any) -> FieldType:
+    """A field as the definitions of recordings have it; ValueError for lists of lists."""
+    kind, rest = description
+    if kind not in (Nodetype.SEQUENCE, Nodetype.ARRAY):
+        return FieldType(name, rest[0] if kind == Nodetype.BASE else rest, False, None)
+    (inner, of), length = rest
+    if inner not in (Nodetype.BASE, Nodetype.NAME):
+        raise ValueError("it has lists of lists, which are not read")
+    return FieldType(name, of[0] if inner == Nodetype.BASE else of, True, length if kind == Nodetype.ARRAY else None)
 
 
 def _service_event(name: str, text: str, steps: Budget) -> dict[str, Any]:
@@ -200,129 +189,3 @@ def _service_event(name: str, text: str, steps: Budget) -> dict[str, Any]:
     known = get_typestore(Stores.ROS2_JAZZY).fielddefs
     info = "service_msgs/msg/ServiceEventInfo"
     return {**types, info: known[info], name: definition}
-
-
-class _Builder:
-    """Readers of some types, in one byte order and alignment: one for each type, however often it occurs."""
-
-    def __init__(self, types: Mapping[str, _Fields], budget: Budget, *, order: str, is_aligned: bool) -> None:
-        self._types = types
-        self._budget = budget
-        self._order = order
-        self._is_aligned = is_aligned
-        self._made: dict[str, tuple[_Reader, int]] = {}
-
-    def message(self, name: str) -> _Reader:
-        """That of a type; ValueError when it refers to one that is not defined, or to itself."""
-        return self._message(name, 0)[0]
-
-    def _message(self, name: str, depth: int) -> tuple[_Reader, int]:
-        """The reader of a type that is so deep within others, and how deep others are within it."""
-        found = self._made.get(name)
-        if depth + (found[1] if found else 0) > _MAX_DEPTH:
-            raise ValueError("its definition is nested too deeply")
-        if found is None:
-            found = self._made[name] = self._new(name, depth)
-        return found
-
-    def _new(self, name: str, depth: int) -> tuple[_Reader, int]:
-        fields = self._types.get(name) or _BUILT_IN.get(name)
-        if fields is None and name not in self._types:
-            raise ValueError(f"its definition lacks the type {name[:80]!r}")
-        parts = [(field, *self._field(description, depth)) for field, description in fields or ()]
-        height = max((below for _, _, below in parts), default=0)
-        readers = [(field, reader) for field, reader, _ in parts]
-        take, count = self._budget.take, 1 + len(readers)
-        if not readers and self._is_aligned:  # ROS 2 gives a type without fields a byte
-            return lambda data, position: ({}, position + 1), height
-
-        def read(data: memoryview, position: int) -> tuple[Values, int]:
-            take(count)
-            values = {}
-            for field, read_field in readers:
-                values[field], position = read_field(data, position)
-            return values, position
-
-        return read, height
-
-    def _field(self, description: Any, depth: int) -> tuple[_Reader, int]:
-        kind, rest = description
-        if kind == Nodetype.BASE:
-            return self._scalar(rest[0]), 0
-        if kind == Nodetype.NAME:
-            reader, height = self._message(rest, depth + 1)
-            return reader, height + 1
-        element, length = rest
-        count = None if kind == Nodetype.SEQUENCE else length
-        if element[0] == Nodetype.BASE and element[1][0] in _CODES:
-            return self._numbers(element[1][0], count), 0
-        reader, height = self._field(element, depth + 1)
-        return self._list(reader, count), height + 1
-
-    def _scalar(self, name: str) -> _Reader:
-        if name == "string":
-            return self._text()
-        if name not in _CODES:
-            raise ValueError(f"it has a field of the type {name}, which is not read")
-        number = struct.Struct(self._order + _CODES[name])
-        size, unpack = number.size, number.unpack_from
-        if not self._is_aligned or size == 1:
-            return lambda data, position: (unpack(data, position)[0], position + size)
-        mask = size - 1
-
-        def read(data: memoryview, position: int) -> tuple[Any, int]:
-            position = (position + mask) & ~mask
-            return unpack(data, position)[0], position + size
-
-        return read
-
-    def _text(self) -> _Reader:
-        length_of, ends_with_nul = self._scalar("uint32"), self._is_aligned
-
-        def read(data: memoryview, position: int) -> tuple[str, int]:
-            length, position = length_of(data, position)
-            end = position + length
-            if end > len(data):
-                raise ValueError("a text reaches beyond its end")
-            last = end - 1 if ends_with_nul and length else end
-            return bytes(data[position:last]).decode(errors="replace"), end
-
-        return read
-
-    def _numbers(self, name: str, count: int | None) -> _Reader:
-        dtype = np.dtype(self._order + ("B" if name == "bool" else _CODES[name]))
-        size = dtype.itemsize
-        mask = size - 1 if self._is_aligned else 0
-        length_of = self._scalar("uint32")
-
-        def read(data: memoryview, position: int) -> tuple[Any, int]:
-            number = count
-            if number is None:
-                number, position = length_of(data, position)
-            if number == 0:
-                return np.empty(0, dtype), position
-            position = (position + mask) & ~mask
-            end = position + number * size
-            if end > len(data):
-                raise ValueError("an array reaches beyond its end")
-            return np.frombuffer(data, dtype, number, position), end
-
-        return read
-
-    def _list(self, read_element: _Reader, count: int | None) -> _Reader:
-        length_of, take = self._scalar("uint32"), self._budget.take
-
-        def read(data: memoryview, position: int) -> tuple[list[Any], int]:
-            number = count
-            if number is None:
-                number, position = length_of(data, position)
-            if number > len(data) - position:  # each element takes a byte at least
-                raise ValueError("a list reaches beyond its end")
-            take(number)
-            values = []
-            for _ in range(number):
-                value, position = read_element(data, position)
-                values.append(value)
-            return values, position
-
-        return read

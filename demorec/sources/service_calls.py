@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from demorec.mcap.cdr import Values
 from demorec.sources.fields import FieldError, follow, parse_path, stamp_of
-from demorec.sources.ros_types import Values
 
 _IS_REQUEST = {0: True, 1: True, 2: False, 3: False}
 """`event_type` of service_msgs/ServiceEventInfo: REQUEST_SENT, REQUEST_RECEIVED, RESPONSE_SENT, RESPONSE_RECEIVED."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import in_words
 from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
+from demorec.mcap.cdr import Values
 from demorec.mcap.limits import SpentError
 from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag
@@ -39,7 +40,7 @@ from demorec.sources.fields import (
 )
 from demorec.sources.mapping import Source, SourceMapping
 from demorec.sources.picture_messages import PictureHeads, picture_head
-from demorec.sources.ros_types import Budgets, Values
+from demorec.sources.ros_types import Budgets
 from demorec.sources.service_calls import CallReader
 from demorec.sources.words import quoted
 

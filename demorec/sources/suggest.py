@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from demorec.episode.info import DEPTH_UNITS
+from demorec.mcap.cdr import Values
 from demorec.mcap.limits import SpentError
 from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag, open_bag
@@ -29,7 +30,6 @@ from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import FieldError, follow, stamp_of
 from demorec.sources.mapping import Clock
 from demorec.sources.picture_messages import PictureHead, picture_head
-from demorec.sources.ros_types import Values
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
 _KEPT = 64
