@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.export import without_verification
 
 from demorec.cli import generate_dataset_main, main
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
@@ -27,11 +26,6 @@ NUM_EPISODES = 3
 def make(out: Path, *, workers: int, episodes: list[int] | None = None, num_episodes: int = NUM_EPISODES) -> RunResult:
     options = RunOptions(out=out, num_episodes=num_episodes, workers=workers)
     return generate(CONFIG, options, progress=RunObserver(), episodes=episodes)
-
-
-@pytest.fixture
-def unverified(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_verification(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +75,7 @@ def test_a_run_knows_the_versions_that_its_recordings_know(reference: RunResult)
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unverified")
+@pytest.mark.usefixtures("without_lerobot")
 def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: RunResult
 ) -> None:
@@ -101,7 +95,7 @@ def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
     assert "Different: 0 (attempt 0)" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("unverified")
+@pytest.mark.usefixtures("without_lerobot")
 def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path, reference: RunResult) -> None:
     from demorec.view.from_dataset import open_dataset_episode
 
@@ -129,7 +123,7 @@ def reproduce(source: Path, out: Path) -> int:
     return int(ended.value.code or 0)
 
 
-@pytest.mark.usefixtures("unverified")
+@pytest.mark.usefixtures("without_lerobot")
 def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path: Path, reference: RunResult) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
