@@ -17,8 +17,9 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("HF_DATASETS_OFFLINE", "1")
 # Containers often forbid Python to write bytecode; every process that a test starts would then compile PyTorch anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-from demorec.mcap.video import ordinary_scheduling
 from support.export import without_verification
+
+from demorec.mcap.video import ordinary_scheduling
 
 sys.dont_write_bytecode = False
 hypothesis.settings.register_profile("untimed", deadline=None)  # machines are busy at times

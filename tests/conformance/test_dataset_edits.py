@@ -112,7 +112,7 @@ def test_features_and_tasks(small: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.permutations(range(5)), st.integers(0, 9), st.sampled_from([0.2, 0.4, 0.6]))
 def test_round_trips(
     small: Path, tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int, share: float

@@ -16,6 +16,7 @@ from demorec.mcap import Recording
 
 pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run") / "run", (8, 7, 5), failures=(1,), depth=True)
