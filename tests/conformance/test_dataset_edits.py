@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.check import checked
+from support.commands import exit_code
 from support.datasets import TOP, content, items, same, write_with_lerobot
 from support.export import data_table, export, info, make_run
-
-from demorec.cli import main
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 KINDS: dict[str, dict[str, Any]] = {
@@ -24,10 +24,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-def edit(*words: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["dataset", *map(str, words)])
-    return int(ended.value.code or 0)
+edit = partial(exit_code, "dataset")
 
 
 @pytest.fixture(

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.commands import exit_code
 
-from demorec.cli import generate_dataset_main, main
+from demorec.cli import generate_dataset_main
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
 from demorec.datasets.lerobot.verify import Verifier
@@ -118,9 +119,7 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
 
 
 def reproduce(source: Path, out: Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["reproduce", str(source), "--out", str(out), "--workers", "1"])
-    return int(ended.value.code or 0)
+    return exit_code("reproduce", source, "--out", out, "--workers", "1")
 
 
 @pytest.mark.usefixtures("without_lerobot")
@@ -164,7 +163,5 @@ def test_the_command_does_it_all_and_says_so(
         for word in ("success", "frames", "recordings", "dataset", "simulation", "rendering", "export", "checks"):
             assert word in told
     assert verified == [2], "once, two frames of the episode"
-    with pytest.raises(SystemExit) as ended:
-        generate_dataset_main([*args, "--fps", "60"])
-    assert ended.value.code == 2
+    assert exit_code(*args, "--fps", "60", program=generate_dataset_main) == 2
     assert "fps is 30 there and 60 here" in capsys.readouterr().err
