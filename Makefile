@@ -5,6 +5,8 @@
 SHELL := /bin/bash
 DEMO ?= recordings/demo
 TEST_WORKERS ?= $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); echo $$(( n > 4 ? 4 : n )))
+# In the order of their names: pytest-xdist would put files of few tests last, which are those that take long.
+IN_PARALLEL = -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder
 BIN := .venv/bin
 PYBULLET ?= $(or $(patsubst .venv/.stamp-%,%,$(wildcard .venv/.stamp-*)),$(shell command -v c++ g++ >/dev/null && echo source || echo wheel))
 STAMP := .venv/.stamp-$(PYBULLET)
@@ -21,10 +23,10 @@ demo: $(STAMP)
 	@echo "Look at it:  $(BIN)/demorec view $(DEMO)   (or --web in a browser, or $(BIN)/rerun $(DEMO)/playback-*.rrd)"
 
 test: $(STAMP)
-	$(BIN)/pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile
+	$(BIN)/pytest -m "not slow" $(IN_PARALLEL)
 
 test-slow: $(STAMP)
-	$(BIN)/pytest -m "slow and not long" -n $(TEST_WORKERS) --dist loadfile --ignore tests/crash/test_ray.py
+	$(BIN)/pytest -m "slow and not long" $(IN_PARALLEL) --ignore tests/crash/test_ray.py
 	$(BIN)/pytest -m slow -n 0 tests/crash/test_ray.py  # alone: a node of Ray gives up on a machine that is too busy
 
 # Before a release: what test-slow does in part.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import hypothesis
 import pytest
@@ -16,6 +17,8 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("HF_DATASETS_OFFLINE", "1")
 # Containers often forbid Python to write bytecode; every process that a test starts would then compile PyTorch anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+from support.export import without_verification
+
 from demorec.mcap.video import ordinary_scheduling
 
 sys.dont_write_bytecode = False
@@ -23,10 +26,37 @@ hypothesis.settings.register_profile("untimed", deadline=None)  # machines are b
 hypothesis.settings.load_profile("untimed")
 
 
-@pytest.fixture(autouse=True)
-def _no_real_time_threads() -> Iterator[None]:
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup() -> Iterator[None]:
     """LeRobot's own AV1 encoding, run by root, would leave the test process with real-time priority."""
     with ordinary_scheduling():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Iterator[None]:
+    """As in fixtures."""
+    with ordinary_scheduling():
+        return (yield)
+
+
+@pytest.fixture
+def without_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exports are not verified and `dataset_opens` is left out: a process of LeRobot takes seconds to start."""
+    without_verification(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def hdf5_read_here() -> Iterator[None]:
+    """HDF5 files are walked through in this process first; tests/crash/test_hdf5_damage.py has the one to be spared."""
+    from demorec.datasets.hdf5 import trial
+
+    def walked(path: Path) -> str:
+        trial.walk(path)
+        return ""
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trial, "why_not_read", walked)
         yield
 
 

@@ -13,18 +13,11 @@ import h5py
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
+from support.commands import exit_code
 
-from demorec.cli import main
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-
-
-def _run(*words: str | Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return int(ended.value.code or 0)
-
 
 BAGS: dict[str, tuple[Callable[[float], bags.Notes], Callable[[bags.Notes, Path], Path]]] = {
     "franka": (bags.franka, lambda notes, path: bags.write_rosbag2(notes, path / "franka")),
@@ -44,13 +37,13 @@ def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: p
     make, write = BAGS[name]
     notes = bags.in_order(make(1.6))
     bag = write(notes, tmp_path)
-    assert _run("import", "--suggest", bag) == 0
+    assert exit_code("import", "--suggest", bag) == 0
     text = capsys.readouterr().out
     for topic in {note.topic for note in notes}:
         (line,) = [line for line in text.splitlines() if line.startswith(f"#   {topic}  ")]
         assert f"{sum(note.topic == topic for note in notes)} messages" in line
     mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
     told = capsys.readouterr()
     assert "Nothing odd was found." in told.out
     assert told.err == ""
@@ -64,7 +57,7 @@ def test_a_suggested_mapping_works_as_it_is(name: str, tmp_path: Path, capsys: p
 def test_foreign_names_do_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evil = '/x\x1b[2J"\n[robot]\nname = "y"\u202e'
     notes = [replace(note, topic=note.topic.replace("/leader", evil)) for note in bags.so101(0.5)]
-    assert _run("import", "--suggest", bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")) == 0
+    assert exit_code("import", "--suggest", bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")) == 0
     text = capsys.readouterr().out
     assert all(line.isprintable() for line in text.splitlines())
     assert tomllib.loads(text)["robot"]["name"] == "bag"
@@ -152,7 +145,7 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
         "codec": [*words, "--gop", "0"],
     }.get(name, words)
     before = sorted(path for path in tmp_path.rglob("*"))
-    assert _run("import", *words) == code
+    assert exit_code("import", *words) == code
     out, err = capsys.readouterr()
     assert told in err
     assert err.startswith("demorec import: ")
@@ -200,12 +193,12 @@ def test_a_full_disk_leaves_nothing_half_written(
 
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
-        assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 1
+        assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 1
     err = capsys.readouterr().err
     assert "No space left on device" in err
     assert err.count("\n") == 1
     assert not list((tmp_path / "run/episodes").glob("*.mcap"))
-    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
     assert len(list((tmp_path / "run/episodes").glob("*.mcap"))) == 1
 
 
@@ -225,7 +218,7 @@ def test_interrupting_leaves_nothing_half_written(
 
     with monkeypatch.context() as patched:
         patched.setattr(ImportedEpisodeWriter, "add", interrupted)
-        assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 130
+        assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 130
     assert "interrupted" in capsys.readouterr().err
     assert not list((tmp_path / "run/episodes").iterdir())
-    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0

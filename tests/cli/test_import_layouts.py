@@ -9,17 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import bags
+from support.commands import exit_code
 from support.layout_topics import Layout, Part
 from support.layouts import LAYOUTS, UR
 
-from demorec.cli import main
 from demorec.mcap import Recording
-
-
-def _run(*words: str | Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return int(ended.value.code or 0)
 
 
 def _expected(notes: bags.Notes, parts: Sequence[Part], time_ns: int, layout: Layout) -> list[float]:
@@ -44,18 +38,18 @@ def test_a_suggestion_is_right_unedited_or_refused(
     layout = LAYOUTS[name]
     notes = layout.notes()
     bag = layout.write(notes, tmp_path)
-    assert _run("import", "--suggest", bag) == 0
+    assert exit_code("import", "--suggest", bag) == 0
     text, warned = capsys.readouterr()
     mapping = tmp_path / "robot.toml"
     mapping.write_text(text)
-    code = _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
+    code = exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
     if layout.unsure:
         assert "The arm is left out" in warned
         assert "# ATTENTION: The arm is left out" in text
         assert code != 0
         assert "observation.state" in capsys.readouterr().err
         mapping.write_text(_uncommented(text, layout.unsure))
-        assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+        assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
         return
     assert (code, warned) == (0, ""), capsys.readouterr().err
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
@@ -92,13 +86,13 @@ def test_the_fault_of_a_gripper_alone_is_loud(tmp_path: Path, capsys: pytest.Cap
     """A bag whose arm nobody recorded: its gripper is no state of an arm."""
     notes = [note for note in LAYOUTS["Franka"].notes() if "robot_state" not in note.topic]
     bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
-    assert _run("import", "--suggest", bag) == 0
+    assert exit_code("import", "--suggest", bag) == 0
     text, warned = capsys.readouterr()
     assert "The arm is left out: the only joints that are known to be measured are a gripper's (fr3_finger" in warned
     assert "observation.state" not in tomllib.loads(text).get("features", {})
     mapping = tmp_path / "robot.toml"
     mapping.write_text(text)
-    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") != 0
+    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") != 0
 
 
 @pytest.mark.parametrize("way", ["its publisher ends", "messages name fewer"])
@@ -116,10 +110,10 @@ def test_a_joint_that_stops_coming_is_a_finding(way: str, tmp_path: Path, capsys
         return bags.with_body(note, name=[names[k] for k in left], position=position[left]) if left else None
 
     bag = bags.write_mcap([left for note in notes if (left := without(note)) is not None], tmp_path / "bag.mcap")
-    assert _run("import", "--suggest", bag) == 0
+    assert exit_code("import", "--suggest", bag) == 0
     mapping = tmp_path / "robot.toml"
     mapping.write_text(capsys.readouterr().out)
-    assert _run("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
+    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
     assert f"early_end: observation.state ({lost}): /joint_states: '{lost}' stop" in told
     assert "Nothing odd was found." not in told

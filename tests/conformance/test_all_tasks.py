@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.check import checked, simulate_run
+from support.commands import exit_code
 
-from demorec.cli import main
 from demorec.core.tables import TASKS
 from demorec.mcap import Recording
 
@@ -21,9 +21,7 @@ def test_all_tasks_go_into_one_dataset(tmp_path: Path) -> None:
         for task in TASKS.names()
     ]
     out = tmp_path / "all"
-    with pytest.raises(SystemExit) as ended:
-        main(["export", "lerobot", *map(str, runs), "--out", str(out)])
-    assert not ended.value.code
+    assert exit_code("export", "lerobot", *runs, "--out", out) == 0
 
     lerobot = importlib.import_module("lerobot.datasets.lerobot_dataset")
     dataset = lerobot.LeRobotDataset("local/all", root=out)

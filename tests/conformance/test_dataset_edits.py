@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from support.check import checked
-from support.datasets import TOP, content, items, same, write_with_lerobot
+from support.commands import exit_code
+from support.datasets import TOP, items, same, write_with_lerobot
 from support.export import data_table, export, info, make_run
-
-from demorec.cli import main
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 KINDS: dict[str, dict[str, Any]] = {
@@ -24,10 +22,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-def edit(*words: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["dataset", *map(str, words)])
-    return int(ended.value.code or 0)
+edit = partial(exit_code, "dataset")
 
 
 @pytest.fixture(
@@ -92,6 +87,7 @@ def test_decoded_statistics_are_those_of_the_images(small: Path, tmp_path: Path)
 
 
 def test_idle_ends_are_cut_off(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert edit("trim", small, "--head", 0, "--tail", 0, "--out", tmp_path / "t") == 2  # nothing to cut is no request
     assert edit("trim", small, "--idle", "--idle-margin", 1, "--out", tmp_path / "t") == 0
     assert "episode 0: 2 frames cut at the beginning, 2 at the end" in capsys.readouterr().out
     assert [len(episode) for episode in items(tmp_path / "t")] == [8 + number for number in range(5)]
@@ -109,39 +105,6 @@ def test_features_and_tasks(small: Path, tmp_path: Path) -> None:
     assert set(found[0][0]) == {"observation.state", "observation.images.front", "timestamp", "task"}
     assert np.array_equal(found[2][3]["observation.images.front"], before[2][3][TOP])
     assert [str(episode[0]["task"]) for episode in found[:3]] == ["put it there", "push", "put it there"]
-
-
-@pytest.mark.slow
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.permutations(range(5)), st.integers(0, 9), st.sampled_from([0.2, 0.4, 0.6]))
-def test_round_trips(
-    small: Path, tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int, share: float
-) -> None:
-    round_trips(small, tmp_path_factory.mktemp("trips"), order, seed, share)
-
-
-def test_one_round_trip(small: Path, tmp_path: Path) -> None:
-    round_trips(small, tmp_path, [3, 0, 4, 2, 1], seed=1, share=0.4)
-
-
-def round_trips(small: Path, at: Path, order: list[int], seed: int, share: float) -> None:
-    assert edit("trim", small, "--head", 0, "--tail", 0, "--out", at / "no") == 2  # nothing to cut is no request
-    assert edit("reorder", small, "--order", ",".join(map(str, range(5))), "--out", at / "as_it_is") == 0
-    back = [order.index(number) for number in range(5)]
-    assert edit("reorder", small, "--order", ",".join(map(str, order)), "--out", at / "r") == 0
-    assert edit("reorder", at / "r", "--order", ",".join(map(str, back)), "--out", at / "back") == 0
-    assert edit("rename", small, "action=a", "--out", at / "n") == 0
-    assert edit("rename", at / "n", "a=action", "--out", at / "named") == 0
-    shares = (f"a={share}", f"b={1 - share}")
-    assert edit("split", small, "--shares", *shares, "--seed", seed, "--out", at / "parts") == 0
-    assert edit("merge", at / "parts/a", at / "parts/b", "--out", at / "merged") == 0
-    states = data_table(at / "merged").column("observation.state").to_pylist()
-    assert sorted(map(tuple, states)) == sorted(map(tuple, data_table(small).column("observation.state").to_pylist()))
-    rows = data_table(at / "as_it_is").drop_columns(["task_index"]).to_pydict()
-    for name in ("back", "named"):
-        found = data_table(at / name).drop_columns(["task_index"])
-        assert found.to_pydict() == rows, name
-    assert content(at / "named") == content(at / "as_it_is")
 
 
 def test_all_differences_are_named_and_a_mapping_solves_them(

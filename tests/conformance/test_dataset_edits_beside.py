@@ -11,17 +11,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.check import checked
+from support.commands import exit_code
 from support.export import data_table, export, make_run
-
-from demorec.cli import main
 
 BOXES = "demorec/boxes/observation.images.front.json"
 
 
 def edit(*words: object) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["dataset", *map(str, words)])
-    assert ended.value.code == 0
+    assert exit_code("dataset", *words) == 0
 
 
 def table(root: Path, name: str) -> list[dict[str, Any]]:

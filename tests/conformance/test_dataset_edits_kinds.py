@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from av.video.stream import VideoStream
 from support.check import checked
+from support.commands import exit_code
 from support.datasets import TOP, items, same, write_with_lerobot
 from support.training import DEPTH, write_by_lerobot
-
-from demorec.cli import main
 
 pytestmark = [
     pytest.mark.usefixtures("hf_datasets_cache"),
@@ -26,9 +25,7 @@ LENGTHS = [12 + number for number in range(6)]
 
 
 def edit(*words: object) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["dataset", *map(str, words)])
-    assert ended.value.code == 0
+    assert exit_code("dataset", *words) == 0
 
 
 def reordered(root: Path) -> Path:

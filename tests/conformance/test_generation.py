@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.export import without_verification
+from support.commands import exit_code
 
-from demorec.cli import generate_dataset_main, main
+from demorec.cli import generate_dataset_main
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
 from demorec.datasets.lerobot.verify import Verifier
@@ -27,11 +27,6 @@ NUM_EPISODES = 3
 def make(out: Path, *, workers: int, episodes: list[int] | None = None, num_episodes: int = NUM_EPISODES) -> RunResult:
     options = RunOptions(out=out, num_episodes=num_episodes, workers=workers)
     return generate(CONFIG, options, progress=RunObserver(), episodes=episodes)
-
-
-@pytest.fixture
-def unverified(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_verification(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +76,7 @@ def test_a_run_knows_the_versions_that_its_recordings_know(reference: RunResult)
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unverified")
+@pytest.mark.usefixtures("without_lerobot")
 def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: RunResult
 ) -> None:
@@ -101,7 +96,7 @@ def test_reproduce_makes_runs_and_datasets_again_and_sees_a_difference(
     assert "Different: 0 (attempt 0)" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("unverified")
+@pytest.mark.usefixtures("without_lerobot")
 def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path, reference: RunResult) -> None:
     from demorec.view.from_dataset import open_dataset_episode
 
@@ -124,12 +119,10 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
 
 
 def reproduce(source: Path, out: Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["reproduce", str(source), "--out", str(out), "--workers", "1"])
-    return int(ended.value.code or 0)
+    return exit_code("reproduce", source, "--out", out, "--workers", "1")
 
 
-@pytest.mark.usefixtures("unverified")
+@pytest.mark.usefixtures("without_lerobot")
 def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path: Path, reference: RunResult) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
@@ -170,7 +163,5 @@ def test_the_command_does_it_all_and_says_so(
         for word in ("success", "frames", "recordings", "dataset", "simulation", "rendering", "export", "checks"):
             assert word in told
     assert verified == [2], "once, two frames of the episode"
-    with pytest.raises(SystemExit) as ended:
-        generate_dataset_main([*args, "--fps", "60"])
-    assert ended.value.code == 2
+    assert exit_code(*args, "--fps", "60", program=generate_dataset_main) == 2
     assert "fps is 30 there and 60 here" in capsys.readouterr().err

@@ -19,9 +19,9 @@ import pytest
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
+from support.commands import exit_code
 
 from demorec.check.run import CheckedRun
-from demorec.cli import main
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.tables import CHECKS
 from demorec.episode.info import Origin
@@ -35,12 +35,6 @@ from demorec.sources.import_run import import_bags
 FRONT = "/follower/cam_front/image_raw/compressed"
 DROPPING = bag_mappings.SO101.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
 """A bad bag is no reason to drop an episode: it has none."""
-
-
-def _demorec(*words: str | Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return int(ended.value.code or 0)
 
 
 def _bag(path: Path, seconds: float = 0.6, change: Callable[[bags.Notes], bags.Notes] = lambda notes: notes) -> Path:
@@ -138,7 +132,7 @@ def test_bad_bags_are_skipped_and_listed(
 ) -> None:
     folder, mapping = batch
     run = tmp_path / "run"
-    assert _demorec("import", folder, "--mapping", mapping, "--out", run, "--skip-bad") == 1
+    assert exit_code("import", folder, "--mapping", mapping, "--out", run, "--skip-bad") == 1
     lines = capsys.readouterr().out.splitlines()
     header = lines[-len(BAD) - 1]
     assert header == f"Skipped {len(BAD)} of {2 * len(BAD)} bags:"
@@ -149,9 +143,9 @@ def test_bad_bags_are_skipped_and_listed(
     for number in range(len(BAD)):
         with Recording(run / "episodes" / f"episode_{number:06d}.mcap") as recording:
             assert _files(recording) == [f"run_{2 * number}.mcap"]
-    assert _demorec("info", run) == 0
+    assert exit_code("info", run) == 0
     shown = capsys.readouterr().out
-    assert _demorec("info", run, "--json") == 0
+    assert exit_code("info", run, "--json") == 0
     left_out = json.loads(capsys.readouterr().out)["left_out"]
     for number, (_, reason) in enumerate(BAD.values()):
         assert left_out[number]["bag"] == f"run_{2 * number + 1}.mcap"
@@ -262,7 +256,7 @@ def test_a_folder_stands_for_the_bags_in_it_in_their_natural_order(tmp_path: Pat
     mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
     result = import_bags([folder], mapping, tmp_path / "run")
     assert [report.name for report in result.reports] == ["run_1", "run_2", "run_3.mcap", "run_10.mcap"]
-    assert _demorec("import", "--suggest", folder) == 0
+    assert exit_code("import", "--suggest", folder) == 0
     with pytest.raises(BagError, match=r"holds no metadata.yaml.* and no bags"):
         import_bags([folder / "photos"], mapping, tmp_path / "run")
 
@@ -270,7 +264,7 @@ def test_a_folder_stands_for_the_bags_in_it_in_their_natural_order(tmp_path: Pat
 @pytest.mark.parametrize("kind", ["hdf5", "lerobot"])
 def test_only_bags_are_skipped(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for flags in (["--skip-bad"], ["--workers", "2"]):
-        assert _demorec("import", kind, tmp_path / "x", "--mapping", "x", "--out", tmp_path / "run", *flags) == 2
+        assert exit_code("import", kind, tmp_path / "x", "--mapping", "x", "--out", tmp_path / "run", *flags) == 2
         assert "Only bags can be skipped" in capsys.readouterr().err
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import bag_mappings, bags
+from support.commands import exit_code
 
-from demorec.cli import main
 from demorec.mcap import Recording
 
 STATE, ACTION, FRONT = "/joint_states", "/joint_command", "/front/rgb"
@@ -71,13 +71,6 @@ def real(seconds: float = 2.0, *, skew_s: float = 0.0) -> bags.Notes:
     return bags.in_order(notes)
 
 
-def run(*words: str | Path) -> int:
-    """The exit code of a command."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return int(ended.value.code or 0)
-
-
 @pytest.fixture
 def imports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[bags.Notes, str], tuple[int, str, str]]:
     """Exit code, output and error of an import of messages by a mapping; "suggested" for the suggested one."""
@@ -86,9 +79,9 @@ def imports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[bag
         bag = bags.write_rosbag2(notes, tmp_path / "stack_cups_01")
         file = bag_mappings.write_mapping(mapping, tmp_path / "robot.toml")
         if mapping == "suggested":
-            assert run("import", "--suggest", bag) == 0
+            assert exit_code("import", "--suggest", bag) == 0
             bag_mappings.write_mapping(capsys.readouterr().out, file)
-        code = run("import", bag, "--mapping", file, "--out", tmp_path / "run")
+        code = exit_code("import", bag, "--mapping", file, "--out", tmp_path / "run")
         return code, *capsys.readouterr()
 
     return do
@@ -194,11 +187,11 @@ def test_the_suggested_task_is_that_of_each_bag(
         notes = bags.in_order(bags.so101(0.6 + 0.1 * number))
         path = bags.write_mcap(notes, tmp_path / (f"{name}.mcap" if not number else "push_the_block_1.mcap"))
         paths.append(path)
-    assert run("import", "--suggest", paths[0]) == 0
+    assert exit_code("import", "--suggest", paths[0]) == 0
     text = capsys.readouterr().out
     assert tomllib.loads(text)["task"] == ({"file_name": True} if task else {})
     mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-    code = run("import", *paths, "--mapping", mapping, "--out", tmp_path / "run")
+    code = exit_code("import", *paths, "--mapping", mapping, "--out", tmp_path / "run")
     if task is None:
         assert code == 2
         assert "[task] needs one of text, topic and file_name" in capsys.readouterr().err

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import bag_mappings, bags
+from support.commands import exit_code
 
 from demorec.check.run import CheckedRun
-from demorec.cli import main
 from demorec.core.tables import CHECKS
 from demorec.mcap import Recording
 
@@ -71,19 +71,12 @@ def bag(cameras: Mapping[str, Sequence[int]], *, shift_s: float = 0.0, joints_ra
     return bags.in_order(notes)
 
 
-def run(*words: str | Path) -> int:
-    """The exit code of a command."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return int(ended.value.code or 0)
-
-
 def imported(
     path: Path, mapping: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> tuple[str, dict[str, list[int]]]:
     """What an import says, and the stamp of the image that each row of its only episode shows of each camera."""
     file = bag_mappings.write_mapping(mapping, tmp_path / "robot.toml")
-    assert run("import", path, "--mapping", file, "--out", tmp_path / "run") == 0
+    assert exit_code("import", path, "--mapping", file, "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         columns = recording.columns()
@@ -93,7 +86,7 @@ def imported(
 
 def suggested(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """The suggestion for a bag."""
-    assert run("import", "--suggest", path) == 0
+    assert exit_code("import", "--suggest", path) == 0
     return capsys.readouterr().out
 
 

@@ -86,6 +86,7 @@ def test_what_else_a_dataset_says_is_left_out(
         assert len(opened.subtasks) == (2 if "style" in change else 0)
 
 
+@pytest.mark.usefixtures("without_lerobot")
 def test_a_dataset_has_exactly_what_was_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     (recording,) = recordings(tmp_path / "run")

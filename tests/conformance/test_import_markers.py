@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from support import bag_mappings, bags
+from support.commands import exit_code
 
 from demorec.check.run import CheckedRun
-from demorec.cli import main
 from demorec.core.tables import CHECKS
 from demorec.mcap import Recording
 
@@ -27,9 +27,7 @@ def _import(tmp_path: Path, marks: list[tuple[float, str]], *, keys: str = "", m
     bag = bags.write_rosbag2(bags.in_order(notes), tmp_path / "bag")
     text = f'{bag_mappings.SO101}[episodes]\ncut = "marker"\ntopic = "{TOPIC}"\n{keys}\n{more}'
     mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-    with pytest.raises(SystemExit) as ended:
-        main(["import", str(bag), "--mapping", str(mapping), "--out", str(tmp_path / "run")])
-    return int(ended.value.code or 0)
+    return exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
 
 
 def _begins(run: Path) -> list[float]:

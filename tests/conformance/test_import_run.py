@@ -15,8 +15,8 @@ from av.bitstream import BitStreamFilterContext
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
+from support.commands import exit_code
 
-from demorec.cli import main
 from demorec.core.errors import ConfigError
 from demorec.mcap import Recording
 from demorec.sources.bag_files import BagError
@@ -236,9 +236,7 @@ def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Note
     bag = bags.write_trossen(bags.in_order(notes), folder / "bag.mcap")
     text = bag_mappings.TROSSEN.replace("fps = 30", 'fps = 30\nrows = "/cameras/cam_high/image"')
     import_bags([bag], bag_mappings.write_mapping(text, folder / "robot.toml"), folder / "run")
-    with pytest.raises(SystemExit) as ended:
-        main(["export", "lerobot", str(folder / "run"), "--out", str(folder / "dataset"), "--repo-id", "local/x"])
-    assert not ended.value.code
+    assert exit_code("export", "lerobot", folder / "run", "--out", folder / "dataset", "--repo-id", "local/x") == 0
     return notes, folder / "dataset"
 
 

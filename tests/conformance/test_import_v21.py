@@ -18,7 +18,6 @@ import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
 
-from demorec.cli import main
 from demorec.mcap import Recording
 from demorec.view.from_dataset import open_dataset_episode
 
@@ -138,9 +137,7 @@ def test_every_tool_reads_it(version: str, tmp_path: Path, capsys: pytest.Captur
 def test_its_copy_in_the_new_format_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, copy = write_v21(tmp_path / "old"), tmp_path / "new"
     for words in (["reorder", root, "--order", "1,0", "--out", copy], ["diff", root, copy]):
-        with pytest.raises(SystemExit) as ended:
-            main(["dataset", *map(str, words)])
-        assert not ended.value.code, capsys.readouterr()
+        assert exit_code("dataset", *words) == 0, capsys.readouterr()
     told = capsys.readouterr().out
     assert "No difference: 2 of 2 and 2 episodes are the same." in told
     assert "version is v2.1, in B v3.0" in told

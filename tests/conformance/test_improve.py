@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from support.check import edit_json
+from support.commands import exit_code
 from support.export import data_table, info
 from support.training import SMALL_ACT
 
@@ -34,9 +35,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two demonstrations and the settings of a training that takes no time."""
     folder = tmp_path_factory.mktemp("improve")
     words = ["--num-episodes", "2", "--split", "train", "--cameras", "none", "--no-export", "--workers", "1"]
-    with pytest.raises(SystemExit) as ended:
-        generate_dataset_main([*words, "--out", str(folder / "run")])
-    assert ended.value.code == 0
+    assert exit_code(*words, "--out", folder / "run", program=generate_dataset_main) == 0
     (folder / "settings.json").write_text(json.dumps(SETTINGS))
     return folder
 

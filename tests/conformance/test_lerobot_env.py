@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import exit_code
 from support.sim import episode
 
-from demorec.cli import main
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
@@ -126,9 +126,7 @@ def test_evaluate_records_every_rollout_and_goes_on(trained: Path, capsys: pytes
             assert not recording.outcome.success
     assert load_evaluation(trained / "b").rate.trials == 3
 
-    with pytest.raises(SystemExit) as exit_info:
-        main(["evaluate", "--compare", str(trained / "a"), str(trained / "b")])
-    assert exit_info.value.code == 0
+    assert exit_code("evaluate", "--compare", trained / "a", trained / "b") == 0
     assert "0/3 = 0.0 %" in capsys.readouterr().out
 
 
@@ -136,9 +134,7 @@ def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.
     words = ["correct", "--policy", str(trained / "train"), "--episode-length", "9", "--workers", "1", "--seed", "3"]
     words += ["--stray-metres", "0", "--stray-radians", "0"]  # it strays from its first action on
     for count in ("1", "2"):  # the second time it goes on
-        with pytest.raises(SystemExit) as exit_info:
-            main([*words, "--num-episodes", count, "--out", str(trained / "corrections")])
-        assert exit_info.value.code == 0
+        assert exit_code(*words, "--num-episodes", count, "--out", trained / "corrections") == 0
     told = capsys.readouterr().out
     assert "taken over       2  the policy has had its time" in told
     assert "success       2/2 = 100.0 %" in told
@@ -147,9 +143,7 @@ def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.
             phases = recording.columns().phase
         assert set(phases[:9]) == {"policy"}
         assert "policy" not in phases[9:]
-    with pytest.raises(SystemExit) as exit_info:
-        main([*words, "--num-episodes", "2", "--stuck-seconds", "1", "--out", str(trained / "corrections")])
-    assert exit_info.value.code == 2
+    assert exit_code(*words, "--num-episodes", "2", "--stuck-seconds", "1", "--out", trained / "corrections") == 2
     assert "takeover stuck_seconds is 2.0 there and 1.0 here" in capsys.readouterr().err
 
 

@@ -107,6 +107,7 @@ def test_lerobot_makes_the_same_of_what_the_servos_count(run: Path, dataset: Pat
         assert np.abs(state[t] - np.array(list(said.values()))).max() < 0.06  # half a count, which LeRobot rounds to
 
 
+@pytest.mark.usefixtures("without_lerobot")  # which read it in the tests above
 def test_check_is_clean_and_knows_degrees(dataset: Path) -> None:
     results = {result.check: result.level for result in checked(dataset, "dataset").results}
     assert {"warn", "fail"}.isdisjoint(results.values())

@@ -1,4 +1,7 @@
-"""Recordings read by other people's programs: mcap's reader, rosbags, FFmpeg, Rerun; and the robot by PyBullet."""
+"""Recordings read by other people's programs: mcap's reader, rosbags, FFmpeg, Rerun; and the robot by PyBullet.
+
+What holds for any episode is tried with a simulated one and with one of other people's.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from support.external import URDF, make_external, write_external
 from support.present import present
 from support.recording import Codec, frame_number, make_episode, write_episode
 
@@ -27,8 +31,11 @@ from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.robots.assets import asset_path
+from demorec.robots.urdf import Urdf
 
 NUM_FRAMES = 40
+EXTERNAL = make_external()
+Recorded = tuple[str, Path]
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +47,26 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def external(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_external(tmp_path_factory.mktemp("external") / "a.mcap", EXTERNAL)
+
+
+@pytest.fixture(params=["simulated", "external"])
+def recorded(request: pytest.FixtureRequest, path: Path, external: Path) -> Recorded:
+    """The kind of an episode, and its recording."""
+    return request.param, path if request.param == "simulated" else external
+
+
+@pytest.fixture(scope="module")
 def episode() -> tuple[EpisodeInfo, list[Frame], Outcome]:
     return make_episode(num_frames=NUM_FRAMES, depth=True, segmentation=True, physics_rate_joints=True)
 
 
-def test_the_mcap_reader_finds_every_checksum_right(path: Path) -> None:
+def test_the_mcap_reader_finds_every_checksum_right(recorded: Recorded) -> None:
+    kind, path = recorded
     with path.open("rb") as stream:
         records = list(StreamReader(stream, validate_crcs=True).records)
-    assert len(records) > 1000
+    assert len(records) > (1000 if kind == "simulated" else 250)
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
@@ -55,7 +74,9 @@ def test_the_mcap_reader_finds_every_checksum_right(path: Path) -> None:
         assert summary is not None
         assert summary.statistics is not None
         assert sum(1 for _ in reader.iter_messages()) == summary.statistics.message_count
-        assert {metadata.name for metadata in reader.iter_metadata()} == {"demorec.episode", "demorec.outcome"}
+        assert {metadata.name for metadata in reader.iter_metadata()} == {
+            "demorec.episode" if kind == "simulated" else "demorec.collected", "demorec.outcome",
+        }  # fmt: skip
     with path.open("rb") as stream:
         data_end = [record for record in records if type(record).__name__ == "DataEnd"]
         assert data_end[0].data_section_crc not in (0, zlib.crc32(stream.read()))
@@ -91,6 +112,9 @@ def test_mcap_decodes_what_was_written(path: Path, episode: tuple[EpisodeInfo, l
         assert [pose.position.x, pose.position.y, pose.position.z] == expected.position.tolist()
         quat = [pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w]
         assert quat == expected.quat_xyzw.tolist()
+    for frame, (_, content) in zip(frames, decoded["/ee_pose"], strict=True):
+        place = content.pose.position
+        assert [place.x, place.y, place.z] == frame.observation.base_from_tcp.position.tolist()
     for frame, (time, content) in zip(frames, decoded["/wrench"], strict=True):
         force, torque = content.wrench.force, content.wrench.torque
         assert (time, content.header.frame_id) == (frame.time_ns, "panda_hand")
@@ -115,26 +139,60 @@ def test_mcap_decodes_what_was_written(path: Path, episode: tuple[EpisodeInfo, l
         assert ((picture == 0) == (present(frame.images["front"].segmentation) == -1)).all()
 
 
-def test_rosbags_deserialises_every_message(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
-    _, frames, _ = episode
+def test_mcap_decodes_the_numbers_stamps_and_images_of_an_external_one(external: Path) -> None:
+    with external.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        decoded: dict[str, list[tuple[int, Any]]] = {}
+        for _, channel, message, content in reader.iter_decoded_messages():
+            decoded.setdefault(channel.topic, []).append((message.log_time, content))
+    states, forces = decoded["/observation/state"], decoded["/observation/force"]
+    for frame, (time_ns, state), (_, force) in zip(EXTERNAL.frames, states, forces, strict=True):
+        sample = frame.samples["observation.state"]
+        assert time_ns == frame.time_ns
+        assert state.name == ["shoulder", "elbow", "gripper.pos"]
+        assert state.position == sample.vector.tolist()
+        assert (state.velocity, state.effort) == ([], [])
+        assert state.header.stamp.sec * 10**9 + state.header.stamp.nanosec == sample.stamp_ns
+        assert force.data == frame.samples["observation.force"].vector.tolist()
+        assert force.layout.dim[0].label == "x,y,z"
+    rows = [content for _, content in decoded["/frames"]]
+    assert rows[0].layout.dim[0].label == "observation.state,action,observation.force,top,wrist"
+    assert rows[0].data[3:] == [0, -1]
+    for (stamp_ns, _), (time_ns, content) in zip(EXTERNAL.pictures["top"], decoded["/camera/top/h264"], strict=True):
+        assert time_ns == stamp_ns == content.header.stamp.sec * 10**9 + content.header.stamp.nanosec
+    assert decoded["/camera/top/camera_info"][0][1].k[0] == 60.0
+    assert decoded["/robot_description"][0][1].data == URDF
+    urdf = Urdf.parse(URDF)
+    for frame, (_, content) in zip(EXTERNAL.frames, decoded["/tf"], strict=True):
+        shoulder, elbow, _ = frame.samples["observation.state"].vector.astype(float).tolist()
+        poses = urdf.link_poses({"shoulder": shoulder, "elbow": elbow})
+        for transform in content.transforms:
+            expected = poses[transform.header.frame_id].inverse() @ poses[transform.child_frame_id]
+            rotation = transform.transform.rotation
+            found = np.array((rotation.x, rotation.y, rotation.z, rotation.w))
+            assert np.abs(found - expected.quat_xyzw).max() < 1e-12
+
+
+COUNTS = {
+    "simulated": {"/ee_pose": NUM_FRAMES, "/wrench": NUM_FRAMES, "/joint_states": (NUM_FRAMES - 1) * 8 + 1},
+    "external": {**dict.fromkeys(("/observation/state", "/action", "/frames", "/tf", "/camera/top/h264"), 45),
+                 "/camera/wrist/video": 22},
+}  # fmt: skip
+
+
+def test_rosbags_deserialises_every_message(recorded: Recorded) -> None:
+    kind, path = recorded
     store = get_typestore(Stores.EMPTY)
     for name, definition in DEFINITIONS.items():
         store.register(get_types_from_msg(definition, name))
-    count, positions, wrenches = 0, [], []
+    counts: dict[str, int] = {}
     with AnyReader([path], default_typestore=store) as reader:
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
             # What was read, written again, gives the same bytes: no field was skipped or padded otherwise.
             assert bytes(store.serialize_cdr(message, connection.msgtype)) == bytes(raw), connection.topic
-            count += 1
-            if connection.topic == "/ee_pose":
-                positions.append([message.pose.position.x, message.pose.position.y, message.pose.position.z])
-            if connection.topic == "/wrench":
-                force, torque = message.wrench.force, message.wrench.torque
-                wrenches.append([force.x, force.y, force.z, torque.x, torque.y, torque.z])
-    assert count > 1000
-    assert np.array_equal(positions, [frame.observation.base_from_tcp.position for frame in frames])
-    assert np.array_equal(wrenches, [frame.observation.sensed["wrench"] for frame in frames])
+            counts[connection.topic] = counts.get(connection.topic, 0) + 1
+    assert counts | COUNTS[kind] == counts
 
 
 def test_definitions_are_those_of_ros(path: Path) -> None:
@@ -243,14 +301,20 @@ def test_rerun_shows_the_other_codecs(tmp_path: Path, codec: Codec, entity: str,
     assert archetype in rerun_entities(path, tmp_path)[entity]
 
 
-def test_rerun_finds_no_fault(path: Path) -> None:
+def test_rerun_shows_joints_videos_and_frames_of_an_external_one(external: Path, tmp_path: Path) -> None:
+    shown = set().union(*rerun_entities(external, tmp_path).values())
+    assert {"Scalars", "VideoStream", "Transform3D"} <= shown
+
+
+def test_rerun_finds_no_fault(recorded: Recorded) -> None:
+    kind, path = recorded
     rerun = Path(sys.executable).with_name("rerun")
     done = subprocess.run(
         [rerun, "mcap", "check", "--full", path], check=True, capture_output=True, text=True, timeout=120
     )
     _, table = done.stdout.split("Status", 1)
     rows = [line.split() for line in table.splitlines() if " /" in line]
-    assert len(rows) >= 25
+    assert len(rows) >= (25 if kind == "simulated" else 8)
     assert {row[0] for row in rows} == {"ok"}, done.stdout
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 from support.check import checked, simulate
+from support.commands import exit_code
 from support.tasks import tasks_with_slow_ones
 
-from demorec.cli import main
 from demorec.core.config import VideoConfig
 from demorec.core.tables import ROBOTS, TASKS
 
@@ -87,9 +87,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     ]
     for args, code in cases:
         capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main(["check", *(str(arg) for arg in args)])
-        assert int(ended.value.code or 0) == code, args
+        assert exit_code("check", *args) == code, args
         if "--json" in args:
             told = json.loads(capsys.readouterr().out)
             assert told[0]["level"] == "pass"
@@ -120,6 +118,4 @@ def test_what_a_crash_left_of_a_good_recording_lacks_its_end_only(cut_short: lis
 
 def test_strict_turns_warnings_into_failures(cut_short: list[Path]) -> None:
     for args, code in (((), 0), (("--strict",), 1)):
-        with pytest.raises(SystemExit) as ended:
-            main(["check", str(cut_short[1]), *args])
-        assert int(ended.value.code or 0) == code
+        assert exit_code("check", cut_short[1], *args) == code

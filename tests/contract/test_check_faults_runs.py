@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 from support.check import checked, edit_json, level_of, simulate_run
+from support.commands import exit_code
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
-from demorec.cli import main
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,5 @@ def test_what_nobody_foresaw_is_a_finding(good: Path, monkeypatch: pytest.Monkey
 
 def test_the_command_goes_on_behind_a_bad_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "episodes" / "episode_000000.mcap").write_bytes(b"")
-    with pytest.raises(SystemExit) as ended:
-        main(["check", str(run), "--json"])
-    assert ended.value.code == 1
+    assert exit_code("check", run, "--json") == 1
     assert [row["level"] for row in json.loads(capsys.readouterr().out)] == ["fail", "fail", "pass"]

@@ -101,6 +101,7 @@ def level(path: Path, check: str, *, pictures: bool = False) -> str:
     return found[check]
 
 
+@pytest.mark.usefixtures("without_lerobot")
 def test_a_good_one_has_nothing_that_is_odd(strange: Path) -> None:
     report = checked(strange, "dataset", pictures=True)
     assert [result for result in report.results if result.level in ("warn", "fail")] == []

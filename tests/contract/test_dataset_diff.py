@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,6 @@ from support.commands import exit_code
 from support.datasets import TOP, items, write_with_lerobot
 from support.export import data_table, export, files_of, make_run
 
-from demorec.cli import main
-
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 TASKS, INFO, STATS = "meta/tasks.parquet", "meta/info.json", "meta/stats.json"
@@ -33,10 +32,7 @@ LENGTHS = (12, 13, 14, 15)
 Found = tuple[str, str, int | None, int | None]
 
 
-def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["dataset", *map(str, words)])
-    return int(ended.value.code or 0)
+run = partial(exit_code, "dataset")
 
 
 def compared(a: Path, b: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def test_one_round_trip(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.permutations(range(len(LENGTHS))), st.integers(0, 99), st.floats(0.1, 0.9))
 def test_round_trips(
     dataset: Path, tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int, share: float

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from support.check import Spoilt, rewrite_messages, simulate, simulate_run
+from support.commands import exit_code
 from support.mcap import rewritten
 
 from demorec.cli import main
@@ -385,9 +386,7 @@ def test_the_command(blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     shutil.copy(blind, folder / "a.mcap")
     rewrite_messages(blind, folder / "b.mcap", lambda m: () if m[0] == "/wrench" and m[3] == 0 else (m,))
     for flags in ((), ("--json",)):
-        with pytest.raises(SystemExit) as ended:
-            main(["check", str(folder), "--deep", "--only", "opens", *flags])
-        assert ended.value.code == 1
+        assert exit_code("check", folder, "--deep", "--only", "opens", *flags) == 1
         told = capsys.readouterr().out
         if flags:
             deep = [entry for entry in json.loads(told) if entry["kind"] == "deep"]

@@ -25,9 +25,9 @@ from support.commands import exit_code
 from support.export import without_verification
 from support.foreign_dataset import write_foreign
 
-from demorec.check import dataset_files
 from demorec.sources import opening
 
+pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 COMMANDS = {
     "info": "info PATH",
     "check": "check PATH --no-pictures",
@@ -77,7 +77,6 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     without_verification(monkeypatch)
-    monkeypatch.setattr(dataset_files, "lerobot_is_installed", lambda: False)  # it takes seconds to load
     return folder
 
 

@@ -9,7 +9,6 @@ import pytest
 from support import bag_mappings, bags
 from support.export import export, without_verification
 
-from demorec.check import dataset_files
 from demorec.cli import main
 from demorec.sources.import_run import import_bags
 
@@ -79,7 +78,6 @@ def test_it_works_or_says_why_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     without_verification(monkeypatch)
-    monkeypatch.setattr(dataset_files, "lerobot_is_installed", lambda: False)  # it takes seconds to load
     words = {name: str(path) for name, path in places.items()} | {"NEW": str(tmp_path / "new")}
     args = [re.sub(r"\b[A-Z]{3,}\b", lambda found: words[found[0]], word) for word in row.split()]
     with pytest.raises(SystemExit) as ended:

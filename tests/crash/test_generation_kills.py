@@ -18,25 +18,23 @@ from support.generate import num_finished
 from demorec.runs.run_file import load_run_file
 
 pytestmark = pytest.mark.slow
-NUM_EPISODES = 60
-NUM_KILLS = 40
 
 
-def command(out: Path, *more: str, workers: int = 2) -> list[str]:
+def command(out: Path, num_episodes: int, *more: str, workers: int = 2) -> list[str]:
     entry = "from demorec.cli import generate_dataset_main as main; main()"
-    arguments = ["--out", str(out), "--num-episodes", str(NUM_EPISODES), "--workers", str(workers), "--no-check"]
+    arguments = ["--out", str(out), "--num-episodes", str(num_episodes), "--workers", str(workers), "--no-check"]
     return [sys.executable, "-c", entry, *arguments, "--cameras", "wrist", "--width", "32", "--height", "32", *more]
 
 
-def start(out: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(command(out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+def start(out: Path, num_episodes: int) -> subprocess.Popen[str]:
+    return subprocess.Popen(command(out, num_episodes), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
-@pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=[20, pytest.param(60, marks=pytest.mark.long)])
+def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Made by one worker without any trouble."""
     out = tmp_path_factory.mktemp("reference") / "run"
-    subprocess.run(command(out, workers=1), check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(command(out, request.param, workers=1), check=True, stdout=subprocess.DEVNULL)
     return out
 
 
@@ -47,10 +45,12 @@ def test_sigkill_at_random_moments_does_not_change_the_dataset(tmp_path: Path, r
     However slowly workers start on a busy machine, between two kills of the driver there are fewer kills of workers
     than one episode survives (`MAX_LOSSES`).
     """
+    expected = load_run_file(reference)
+    num_kills = expected.num_episodes * 2 // 3
     chance, out, killed = random.Random(7), tmp_path / "run", {"driver": 0, "worker": 0}
     victims = itertools.cycle(("driver", "worker", "driver", "worker", "worker"))
-    process = start(out)
-    while sum(killed.values()) < NUM_KILLS:
+    process = start(out, expected.num_episodes)
+    while sum(killed.values()) < num_kills:
         enough = num_finished(out) + chance.choice((0, 0, 1, 2))
         while num_finished(out) < enough and process.poll() is None:
             time.sleep(0.01)
@@ -67,12 +67,12 @@ def test_sigkill_at_random_moments_does_not_change_the_dataset(tmp_path: Path, r
         else:
             process.kill()
             process.communicate()
-            process = start(out)
+            process = start(out, expected.num_episodes)
     _, errors = process.communicate()
     assert process.returncode == 0, errors
-    assert sum(killed.values()) == NUM_KILLS, "the run ended before it was killed often enough"
+    assert sum(killed.values()) == num_kills, "the run ended before it was killed often enough"
     assert min(killed.values()) > 0
-    run, expected = load_run_file(out), load_run_file(reference)
+    run = load_run_file(out)
     assert run.digest == expected.digest
     assert [a.sha256 for a in run.attempts] == [a.sha256 for a in expected.attempts]
     assert run.export is not None
@@ -81,11 +81,12 @@ def test_sigkill_at_random_moments_does_not_change_the_dataset(tmp_path: Path, r
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of two megabytes."""
+def small_disk(tmp_path: Path, reference: Path) -> Iterator[Path]:
+    """A file system that has room for about half of the recordings."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)]
+    num_bytes = sum(attempt.num_bytes for attempt in load_run_file(reference).attempts)
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={num_bytes // 2}", "tmpfs", str(folder)]
     if os.getuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("a small file system cannot be mounted here")
     yield folder
@@ -93,12 +94,12 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_full_disk_is_told_and_nothing_finished_is_lost(small_disk: Path, reference: Path) -> None:
-    out = small_disk / "run"
-    done = subprocess.run(command(out, "--no-export"), capture_output=True, text=True, check=False)
+    out, num_episodes = small_disk / "run", load_run_file(reference).num_episodes
+    done = subprocess.run(command(out, num_episodes, "--no-export"), capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "the disk is full" in done.stderr
     assert "Traceback" not in done.stderr
     finished = sorted((out / "episodes").glob("*.mcap"))
-    assert 0 < len(finished) < NUM_EPISODES
+    assert 0 < len(finished) < num_episodes
     for path in finished:
         assert path.read_bytes() == (reference / "episodes" / path.name).read_bytes()

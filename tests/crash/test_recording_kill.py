@@ -27,6 +27,7 @@ from demorec.mcap import EpisodeWriter, Recording, recover
 
 FPS = 30
 MOST_FRAMES = 300
+LONG = [pytest.mark.slow, pytest.mark.long]
 
 
 def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
@@ -66,7 +67,12 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
 
 @pytest.mark.parametrize(
     ("codec", "kills"),
-    [("h264", 8), pytest.param("h264", 50, marks=pytest.mark.slow), pytest.param("av1", 20, marks=pytest.mark.slow)],
+    [
+        ("h264", 8),
+        pytest.param("av1", 8, marks=pytest.mark.slow),
+        pytest.param("h264", 50, marks=LONG),
+        pytest.param("av1", 20, marks=LONG),
+    ],
 )
 def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(5)

@@ -85,7 +85,7 @@ seeds = st.integers(0, 2**32 - 1)
 roundings = st.sampled_from(sorted(ROUNDINGS))
 
 
-@settings(max_examples=200, **PATIENT)
+@settings(max_examples=80, **PATIENT)
 @given(rates, phases, jitters, seeds, roundings)
 def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
     """Which the suggested fps is, rounded."""
@@ -97,7 +97,7 @@ def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, se
         assert _kinds(lines, rows) == set()
 
 
-@settings(max_examples=200, **PATIENT)
+@settings(max_examples=80, **PATIENT)
 @given(st.integers(5, 200), phases, jitters, seeds, roundings)
 def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
     times = _moments(Fraction(rate), phase, jitter, seed, rounding)
@@ -119,7 +119,7 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
         )
 
 
-@settings(max_examples=200, **PATIENT)
+@settings(max_examples=80, **PATIENT)
 @given(st.integers(5, 200), phases, phases, st.floats(0.0, 0.24), seeds, roundings)
 def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str) -> None:
     """Up to a quarter of a period all can be shown: images of a pair are nearer to each other than to those after."""
@@ -138,7 +138,7 @@ def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float,
     assert "repeats" not in _kinds(lines, rows)
 
 
-@settings(max_examples=100, **PATIENT)
+@settings(max_examples=80, **PATIENT)
 @given(st.integers(5, 200), phases, phases, jitters, seeds)
 def test_two_cameras_that_jitter_wildly(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int) -> None:
     """Never more are lost than by a reader at the images of the followed camera, and what is lost is found."""

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from demorec.check import dataset_files
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.tables import EXPORTERS
@@ -54,8 +55,9 @@ def export(sources: Path | Sequence[Path], out: Path, exporter: str = "lerobot",
 
 
 def without_verification(patch: pytest.MonkeyPatch) -> None:
-    """Let no export be verified: LeRobot takes seconds to load and does not matter where this is called."""
-    patch.setattr(lerobot_export, "lerobot_is_installed", lambda: False)
+    """As if LeRobot, which takes seconds to load, were not there to open a dataset."""
+    for module in (lerobot_export, dataset_files):
+        patch.setattr(module, "lerobot_is_installed", lambda: False)
 
 
 def data_table(dataset: Path) -> pa.Table:

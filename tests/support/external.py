@@ -1,4 +1,4 @@
-"""Made-up collected episodes: a two-jointed arm with a gripper, of which two cameras send pictures at their own pace.
+"""Made-up external episodes: a two-jointed arm with a gripper, of which two cameras send pictures at their own pace.
 
 Nothing here needs a simulator. The time is uneven and the streams have stamps of their own.
 """
@@ -126,7 +126,7 @@ def write_pictures_and_frames(writer: EpisodeWriter, episode: Episode) -> None:
 
 
 def write_external(path: Path, episode: Episode | None = None, *, video: VideoConfig | None = None) -> Path:
-    """A recording of a collected episode."""
+    """A recording of an external episode."""
     episode = episode or make_external()
     with EpisodeWriter(path, episode.info, video=video) as writer:
         write_pictures_and_frames(writer, episode)

@@ -51,7 +51,7 @@ def run_fake(
     *,
     maker: str = "make",
     num_episodes: int = 8,
-    workers: int = 2,
+    workers: int = 1,
     seed: int = 0,
     recycle_after: int = 500,
     overwrite: bool = False,

@@ -51,7 +51,7 @@ def files_of(root: Path) -> tuple[Path, Path]:
     return record, urdf
 
 
-def collected(**arguments: Any) -> Episode:
+def two_joints(**arguments: Any) -> Episode:
     return make_external(cameras=(TOP,), **arguments)
 
 
@@ -230,7 +230,7 @@ def meshes_in(path: Path) -> set[str]:
 
 
 def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
-    given = collected(num_frames=12)
+    given = two_joints(num_frames=12)
     degrees = [replace(feature, units=("deg", "rad", "")) for feature in given.info.features[:1]]
     given = replace(given, info=replace(given.info, features=(*degrees, *given.info.features[1:])))
     export(write_external(tmp_path / "a.mcap", given), tmp_path / "d")
@@ -267,7 +267,7 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
     longer = URDF.replace('xyz="0.3 0 0"', 'xyz="0.4 0 0"')
     assert longer != URDF
     for number, urdf in enumerate((URDF, longer, URDF, "")):
-        episode = collected(num_frames=10, urdf=urdf, episode_index=number)
+        episode = two_joints(num_frames=10, urdf=urdf, episode_index=number)
         if not urdf:
             info = episode.info
             plain = tuple(replace(feature, joints=()) for feature in info.features)

@@ -250,3 +250,11 @@ def test_an_episode_without_actions_is_refused(tmp_path: Path) -> None:
     path = write_external(tmp_path / "a.mcap", replace(given, info=info, frames=frames))
     with pytest.raises(ConfigError, match="needs actions"):
         export(path, tmp_path / "d.hdf5", "hdf5")
+
+
+@pytest.mark.slow
+def test_lerobot_reads_the_dataset_as_it_was_recorded(tmp_path: Path) -> None:
+    (tmp_path / "run" / "episodes").mkdir(parents=True)
+    write_external(tmp_path / "run" / "episodes" / "episode_000000.mcap", make_external(cameras=(TOP,)))
+    report = export(tmp_path / "run", tmp_path / "d", verify=True)
+    assert (report.num_frames, report.verified_frames, report.not_verified) == (45, 2, "")

@@ -52,7 +52,8 @@ def peak_bytes(work: Callable[[], object]) -> int:
 
 
 @pytest.mark.parametrize(
-    "num_frames", [(90, 360), pytest.param((1800, 18_000), marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
+    "num_frames",
+    [(90, 360), pytest.param((1800, 18_000), marks=[pytest.mark.slow, pytest.mark.long, pytest.mark.timeout(900)])],
 )
 def test_memory_does_not_grow_with_length(
     tmp_path: Path, num_frames: tuple[int, int], capsys: pytest.CaptureFixture[str]

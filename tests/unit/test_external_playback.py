@@ -1,4 +1,4 @@
-"""Collected episodes in Rerun: every feature as a plot, every camera, the robot where its URDF is known."""
+"""External episodes in Rerun: every feature as a plot, every camera, the robot where its URDF is known."""
 
 from __future__ import annotations
 

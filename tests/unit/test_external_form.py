@@ -1,4 +1,4 @@
-"""The form of collected episodes: what is written is what is read, to the bit; what cannot be written is refused."""
+"""The form of external episodes: what is written is what is read, to the bit; what cannot be written is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong with a collected episode is named by the check meant for it; a good one passes them all."""
+"""What is wrong with an external episode is named by the check meant for it; a good one passes them all."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, st
 
 
 @pytest.fixture(scope="module")
-def collected_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def external_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
     with open_external_run(folder) as opened:
         for index in range(2):
@@ -192,21 +192,21 @@ def collected_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_run_is_told_and_checked(collected_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, told, _ = run(capsys, "check", collected_run)
+def test_a_run_is_told_and_checked(external_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, told, _ = run(capsys, "check", external_run)
     assert (code, "3 checked, 0 failed, 0 with warnings" in told) == (0, True)
-    code, told, _ = run(capsys, "info", collected_run)
+    code, told, _ = run(capsys, "info", external_run)
     assert (code, "2 (2 success)" in told, "stack the cups" in told) == (0, True, True)
-    code, told, _ = run(capsys, "info", collected_run / "episodes" / "episode_000001.mcap", "--json")
+    code, told, _ = run(capsys, "info", external_run / "episodes" / "episode_000001.mcap", "--json")
     plain = json.loads(told)
     assert (plain["kind"], plain["frames"], plain["robot"]) == ("external recording", 20, "two_joints")
-    code, told, _ = run(capsys, "info", collected_run / "episodes")
+    code, told, _ = run(capsys, "info", external_run / "episodes")
     assert (code, told.count("(external)")) == (0, 2)
 
 
-def test_a_run_of_other_files_is_a_failure(collected_run: Path, tmp_path: Path) -> None:
+def test_a_run_of_other_files_is_a_failure(external_run: Path, tmp_path: Path) -> None:
     (tmp_path / "episodes").mkdir()
-    (tmp_path / "run.json").write_bytes((collected_run / "run.json").read_bytes())
+    (tmp_path / "run.json").write_bytes((external_run / "run.json").read_bytes())
     write_external(tmp_path / "episodes" / "episode_000001.mcap", steady(num_frames=9, episode_index=1))
     report = check_subject(Subject(path=tmp_path, kind="run"), CheckOptions())
     told = next(result for result in report.results if result.check == "run_files")
