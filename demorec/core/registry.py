@@ -156,13 +156,19 @@ def import_object(kind: str, name: str) -> object:
     module_name, _, attribute = name.partition(":")
     make_importable(module_name)
     try:
-        return getattr(importlib.import_module(module_name), attribute)
+        module = importlib.import_module(module_name)
+        if hasattr(module, attribute):
+            return getattr(module, attribute)
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         reason = str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
         raise ConfigError(
             f"The {kind} {name!r} cannot be imported ({reason}): give it as package.module:Name, with the package "
             "installed, its folder on PYTHONPATH, or the module in the current folder."
         ) from error
+    raise ConfigError(
+        f"The {kind} {name!r} cannot be imported, since the module has no such name."
+        f"{nearest_match(attribute, vars(module))}"
+    )
 
 
 def make_importable(module: str) -> None:

@@ -23,6 +23,11 @@ def test_unknown_names_get_the_nearest_match() -> None:
         SHAPES.load("conter")
 
 
+def test_a_name_that_the_module_lacks_gets_the_nearest_match() -> None:
+    with pytest.raises(ConfigError, match=r"since the module has no such name\. Did you mean 'Fraction'\?"):
+        SHAPES.load("fractions:Fracton", ["fractions"])
+
+
 def test_of_many_names_the_refusal_names_the_command_that_lists_them() -> None:
     many: Registry[type] = Registry(kind="law", rows={f"law_{number}": "collections:Counter" for number in range(31)})
     with pytest.raises(ConfigError) as refused:
