@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
+from itertools import batched
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +71,7 @@ def main() -> None:
     for task in TASKS.names():
         held, end, instruction = grasp_and_end(config(task, "mild"), EPISODES.get(task, 0))
         cells.append([(held, f"{task}: {instruction}"), (end, f"{task}, end")])
-    pairs = [left + right for left, right in zip(cells[0::2], cells[1::2], strict=True)]
+    pairs = [[cell for task in two for cell in task] for two in batched(cells, 2)]
     sheet(pairs).save(args.out / "tasks.jpg", quality=88)
     looks = [(grasp_and_end(config("pick_place", "full"), index)[0], f"look {index}") for index in range(16)]
     sheet([looks[i : i + 4] for i in range(0, 16, 4)]).save(args.out / "looks.jpg", quality=88)

@@ -33,7 +33,7 @@ _SHOWN = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Check recordings, runs and datasets: files, time, physics, alignment, calibration, pictures.
+    """Check recordings, runs and datasets: files, time, physics, alignment, calibration, images.
 
     Exit code 0: everything passed (warnings allowed); 1: a check failed. The failed attempts that a run keeps are
     judged apart: their own failures are told, but only a damaged file counts. `demorec list checks` says what is
@@ -330,7 +330,7 @@ def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:
     shown = report.differences if verbose else report.differences[:_SHOWN]
     details += [str(difference) for difference in shown]
     if len(report.differences) > len(shown):
-        details.append(f"and {len(report.differences) - len(shown)} fields more (--verbose shows all)")
+        details.append(f"and {counted(len(report.differences) - len(shown), 'field')} more (--verbose shows all)")
     if report.replay:
         details.append(f"Replayed: {report.replay}")
     yield from (f"      {detail}" for detail in details)
@@ -343,7 +343,9 @@ def _verdict(report: DeepReport) -> str:
         aside = "; labels, phases and events are taken over in a derived recording" if report.is_derived else ""
         return f"the same to the bit in all {report.num_frames} frames{aside}"
     frames = {frame for difference in report.differences for frame in difference.frames}
-    return f"{len(report.differences)} fields differ, in {len(frames)} of {report.num_frames} frames"
+    count = len(report.differences)
+    told = "1 field differs" if count == 1 else f"{count} fields differ"
+    return f"{told}, in {len(frames)} of {report.num_frames} frames"
 
 
 def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) -> str:

@@ -14,15 +14,17 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, ExportError, check_option
 from demorec.core.registry import check_choice
+from demorec.runs.find import expect
 
 if TYPE_CHECKING:
     from demorec.check.scoring.score import EpisodeScore
     from demorec.datasets.editing.plan import Plan, Source
 
-_COMMANDS = (
+_EDITS = (
     "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle",
-    "diff", "score",
 )  # fmt: skip
+"""Commands that make a plan of a new dataset (`Dataset._plan`)."""
+_COMMANDS = (*_EDITS, "diff", "score")
 _FLAGS = {
     "where": ("select", "drop", "set-task"),
     "episodes": ("select", "drop", "set-task"),
@@ -38,8 +40,8 @@ _FLAGS = {
     "images": ("score",),
     "workers": ("score",),
     "scores": ("select", "drop", "set-task", "split", "reorder"),
-    **dict.fromkeys(("out", "overwrite"), tuple(name for name in _COMMANDS if name != "diff")),
-    **dict.fromkeys(("decode", "dry_run"), _COMMANDS[:-2]),
+    **dict.fromkeys(("out", "overwrite"), (*_EDITS, "score")),
+    **dict.fromkeys(("decode", "dry_run"), _EDITS),
 }
 """The commands that each flag is for."""
 _SHOWN = 20
@@ -147,7 +149,7 @@ class Dataset:
         takes_words = self.command in ("rename", "drop-features")
         if len(self.words) > num_sources and not takes_words:
             raise ConfigError(f"demorec dataset {self.command} takes one dataset; demorec dataset merge joins several.")
-        sources = [Source(Path(word)) for word in self.words[:num_sources]]
+        sources = [Source(expect(Path(word), "dataset").path) for word in self.words[:num_sources]]
         self._add_scores(sources[0])
         plans = self._split(sources[0]) if self.command == "split" else {"": self._plan(sources)}
         for name, plan in plans.items():
@@ -177,7 +179,7 @@ class Dataset:
 
         if len(self.words) != 2:
             raise ConfigError(f"Two datasets are compared, given are {len(self.words)}: demorec dataset diff A B.")
-        a, b = (Path(word) for word in self.words)
+        a, b = (expect(Path(word), "dataset").path for word in self.words)
         try:
             with ProgressBar("reading") as bar:
                 found = diff(a, b, progress=bar.set)
@@ -199,7 +201,7 @@ class Dataset:
 
         if len(self.words) != 1:
             raise ConfigError(f"One dataset is scored, given are {len(self.words)}: demorec dataset score DATASET.")
-        root = Path(self.words[0])
+        root = expect(Path(self.words[0]), "dataset").path
         if self.out is not None:
             refuse_inside([self.out])
             check_target(self.out, source=root, overwrite=self.overwrite)
@@ -253,15 +255,21 @@ class Dataset:
             case "drop-features":
                 return operations.drop_features(source, words)
             case "set-task":
+                if not self.task.strip():
+                    raise ConfigError("Say the new instruction: --task 'pick up the cup'.")
                 return operations.set_task(source, self.task, self._chosen(source))
             case "reorder":
                 return operations.reorder(source, self.by, _numbers(self.order), descending=self.descending)
-            case _:
+            case "shuffle":
                 return operations.shuffle(source, self.seed)
+            case _:
+                raise AssertionError(f"no plan for {self.command}")
 
     def _split(self, source: Source) -> Mapping[str, Plan]:
         from demorec.datasets.editing.operations import split
 
+        if not self.shares:
+            raise ConfigError("Say the parts and their shares: --shares train=0.8 val=0.2.")
         try:
             shares = {name: float(share) for name, share in _pairs(self.shares, "train=0.8").items()}
         except ValueError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
@@ -14,13 +14,9 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
-
-if TYPE_CHECKING:
-    from demorec.sources.frames_writer import FramesImport
+from demorec.sources.formats import FORMATS, SourceFormat
 
 MAX_WORKERS = 1000
-_LEROBOT, _HDF5 = Path("lerobot"), Path("hdf5")
-"""As the first word: what follows is a dataset, or HDF5 files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,38 +67,48 @@ class Import:
         if self.out is not None:
             refuse_inside([self.out])
         check_option("workers", self.workers, 1, MAX_WORKERS)
-        is_hdf5 = self.bags[0] == _HDF5
-        if (is_hdf5 or self.bags[0] == _LEROBOT) and (self.skip_bad or self.workers > 1):
-            raise ConfigError(
-                "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
-            )
-        if self.bags[0] == _LEROBOT:
-            return self._import_dataset()
-        files = self.bags[1:] if is_hdf5 else self.bags
-        if not files:
-            raise ConfigError(
-                "Name HDF5 files after the word hdf5: demorec import hdf5 demo.hdf5 --mapping demo.toml --out "
-                "runs/demo. A bag of that name is given with its folder."
-            )
+        word = str(self.bags[0])
+        if word in FORMATS:
+            return self._import_frames(word, FORMATS[word], self.bags[1:])
         from demorec.sources.bag import bags_in, open_bag
 
         if self.suggest:
-            if is_hdf5:
-                from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
+            from demorec.sources.suggest import suggested_mapping
 
-                say(*suggested_hdf5_mapping(files[0]))
-            else:
-                from demorec.sources.suggest import suggested_mapping
-
-                say(*suggested_mapping(bags_in(files[0])[0], tell))
+            say(*suggested_mapping(bags_in(self.bags[0])[0], tell))
             return 0
         if self.mapping is None or self.out is None:
-            if not is_hdf5:
-                open_bag(bags_in(files[0])[0])  # what is no bag is told what it is first
-            example = f"hdf5 {files[0]} --suggest > demo.toml" if is_hdf5 else f"--suggest {files[0]} > robot.toml"
-            raise ConfigError(f"An import needs --mapping and --out: demorec import {example} writes a mapping.")
+            open_bag(bags_in(self.bags[0])[0])  # what is no bag is told what it is first
+            raise _incomplete(f"--suggest {self.bags[0]} > robot.toml")
         self.video.validate()
-        return (self._import_hdf5 if is_hdf5 else self._import_bags)(files, self.mapping, self.out)
+        return self._import_bags(self.bags, self.mapping, self.out)
+
+    def _import_frames(self, word: str, form: SourceFormat, paths: Sequence[Path]) -> int:
+        if self.skip_bad or self.workers > 1:
+            raise ConfigError(
+                "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
+            )
+        example = f"demorec import {word} {form.example}"
+        if not paths:
+            raise ConfigError(
+                f"Name {form.name} after the word {word}: {example}. A bag of that name is given with its folder."
+            )
+        if form.mapping is None and (self.suggest or self.mapping is not None):
+            raise ConfigError(f"The import of {form.name} needs no mapping: leave --mapping and --suggest out.")
+        if self.suggest:
+            say(*form.suggest(paths[0]))
+            return 0
+        if form.mapping is not None and (self.mapping is None or self.out is None):
+            raise _incomplete(f"{word} {paths[0]} --suggest > demo.toml")
+        if self.out is None:
+            raise ConfigError(f"An import needs --out: {example}.")
+        self.video.validate()
+        result = form.read(paths, self.mapping, self.out, self.video)
+        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *result.left_out_lines())
+        if there := result.num_episodes - result.num_new:
+            tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
+        say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {self.out}")
+        return 0
 
     def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
         from demorec.sources.import_file import report_lines
@@ -139,29 +145,6 @@ class Import:
         say(*(f"  {path}: {reason}" for path, reason in result.skipped.items()))
         return 1
 
-    def _import_dataset(self) -> int:
-        if len(self.bags) != 2 or self.out is None:
-            raise ConfigError(
-                "Name one dataset and --out after the word lerobot: demorec import lerobot datasets/cups --out "
-                "runs/cups. A bag of that name is given with its folder."
-            )
-        if self.suggest or self.mapping is not None:
-            raise ConfigError("A LeRobot dataset names its features itself: leave --mapping and --suggest out.")
-        from demorec.sources.dataset_import import import_lerobot
 
-        self.video.validate()
-        _say_made(import_lerobot(self.bags[1], self.out, video=self.video), self.out)
-        return 0
-
-    def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> int:
-        from demorec.sources.hdf5_import import import_hdf5
-
-        _say_made(import_hdf5(files, mapping, out, video=self.video), out)
-        return 0
-
-
-def _say_made(result: FramesImport, out: Path) -> None:
-    say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *result.left_out_lines())
-    if there := result.num_episodes - result.num_new:
-        tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
-    say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")
+def _incomplete(suggest: str) -> ConfigError:
+    return ConfigError(f"An import needs --mapping and --out: demorec import {suggest} writes a mapping.")

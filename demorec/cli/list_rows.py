@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -57,14 +56,13 @@ def _kinds(registry: Registry[Any], name: str) -> str:
     return f"{sum(kind.count for kind in kinds)} shapes: {', '.join(kind.noun for kind in kinds)}"
 
 
-def _first_line_of_module(registry: Registry[Any], name: str) -> str:
-    module = importlib.import_module(registry.rows[name].partition(":")[0])
-    return (module.__doc__ or "").strip().splitlines()[0]
+def _first_line_of_docstring(registry: Registry[Any], name: str) -> str:
+    return (registry.load(name).__doc__ or "").strip().splitlines()[0]
 
 
 _DESCRIBED: Mapping[str, Callable[[Registry[Any], str], str]] = {
     "robots": _robot,
     "objects": _kinds,
-    "renderers": _first_line_of_module,
+    "renderers": _first_line_of_docstring,
 }
 """How a row is described in one line, where it has no summary of its own."""

@@ -14,6 +14,7 @@ from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import REPORT, check_replaceable
 from demorec.runs.find import EPISODE_FOLDERS, expect
+from demorec.sources.formats import IMPORTED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +63,7 @@ class Report:
             raise ConfigError("--pictures chooses checks, and --no-checks runs none: leave one of them out.")
         read = [self.path]
         if self.against is None:
-            expect(self.path, "recording", "dataset", "hdf5", "rosbag", *EPISODE_FOLDERS)
+            expect(self.path, "recording", "dataset", *IMPORTED, *EPISODE_FOLDERS)
         else:
             read.append(self.against)
             for path in read:

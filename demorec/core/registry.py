@@ -26,6 +26,8 @@ from demorec.core.errors import ConfigError, NotAllowedError
 
 _LONGEST = 100
 """Characters of names that are compared with others, which takes the product of both and of how many there are."""
+_MOST_LISTED = 30
+"""Names that a refusal lists; of more it names the command that does."""
 
 
 def nearest_match(name: str, allowed: Iterable[str]) -> str:
@@ -82,8 +84,9 @@ class Registry[T]:
         parts = split_name(name) if is_open else None
         if parts is None:
             extra = ', or "package.module:Name" for one of your own' if is_open else ""
+            listed = ", ".join(self.rows) if len(self.rows) <= _MOST_LISTED else f"those of demorec list {self.kind}s"
             raise ConfigError(
-                f"Unknown {self.kind} {name!r}.{nearest_match(name, self.rows)} Allowed: {', '.join(self.rows)}{extra}."
+                f"Unknown {self.kind} {name!r}.{nearest_match(name, self.rows)} Allowed: {listed}{extra}."
             )
         if not is_allowed(parts[0], allowed):
             raise NotAllowedError(
@@ -153,13 +156,19 @@ def import_object(kind: str, name: str) -> object:
     module_name, _, attribute = name.partition(":")
     make_importable(module_name)
     try:
-        return getattr(importlib.import_module(module_name), attribute)
+        module = importlib.import_module(module_name)
+        if hasattr(module, attribute):
+            return getattr(module, attribute)
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         reason = str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
         raise ConfigError(
             f"The {kind} {name!r} cannot be imported ({reason}): give it as package.module:Name, with the package "
             "installed, its folder on PYTHONPATH, or the module in the current folder."
         ) from error
+    raise ConfigError(
+        f"The {kind} {name!r} cannot be imported, since the module has no such name."
+        f"{nearest_match(attribute, vars(module))}"
+    )
 
 
 def make_importable(module: str) -> None:

@@ -74,7 +74,7 @@ TOP = CameraPreset(
 # The hand stands behind what it reaches for and hides little of it. The region where objects are placed
 # (demorec.tasks.sampling.WORKSPACE) fills pictures of 7 to 5: 11 mm a pixel at 56 x 40.
 WORKSPACE = CameraPreset(
-    summary="from in front and above, close: sees the objects, the fingers and little else, for small pictures",
+    summary="from in front and above, close: sees the objects, the fingers and little else, for small images",
     eye=(1.05, 0.0, 1.0),
     target=(0.49, 0.0, 0.03),
     fov_y=math.radians(22.5),

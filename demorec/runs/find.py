@@ -19,7 +19,7 @@ from demorec.core.errors import ConfigError, resource_error
 from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
 from demorec.core.replacing import shown
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, UNFINISHED
+from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
 
 PathKind = Literal[
     "recording",
@@ -149,6 +149,11 @@ def expect(path: Path, *kinds: PathKind) -> Found:
         raise ConfigError(f"{found.reason}: {path}")
     if found.kind not in kinds:
         taken, (name, advice) = [_WORDS[kind][0] for kind in kinds], _WORDS[found.kind]
+        if kinds == ("dataset",) and found.kind == "run":
+            inside = path / DATASET
+            advice = (
+                f"; its dataset is {inside}" if _is_there(inside / INFO_PATH) else "; demorec export makes one of it"
+            )
         allowed = " or ".join(filter(None, (", ".join(taken[:-1]), taken[-1])))
         raise ConfigError(f"Expected {allowed}, found {name}{advice}: {path}")
     return found

@@ -1,4 +1,4 @@
-"""Everything that can be imported, opened as recordings: bags, HDF5 files, LeRobot datasets.
+"""Everything that can be imported, opened as recordings: bags and the rows of `demorec.sources.formats`.
 
 Reading is importing, into a temporary run that is removed when the context ends, however it ends. So every command
 reads what `demorec import` reads, by the same mapping, and says the same of it.
@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
 from demorec.runs.find import PathKind, find
 from demorec.sources.bag import bags_in
 from demorec.sources.bag_files import BagError
-from demorec.sources.dataset_import import import_lerobot
-from demorec.sources.hdf5_import import import_hdf5
-from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
+from demorec.sources.formats import FORMATS, IMPORTED, WORD_OF
 from demorec.sources.import_file import dropped_lines
 from demorec.sources.import_run import import_bags
 from demorec.sources.mapping import SourceMapping
@@ -29,7 +28,6 @@ from demorec.sources.suggest import suggested_mapping
 _MB = 1e6
 _MOST_SHOWN = 6
 """Features and cameras of a suggested mapping that are named."""
-_NEEDS_MAPPING: tuple[PathKind, ...] = ("hdf5", "rosbag")
 
 
 @contextmanager
@@ -43,19 +41,20 @@ def opened(
     """Give for each path a run of its episodes, or the path itself where that is read as it is.
 
     Args:
-        paths: Recordings, runs, folders of recordings, datasets, HDF5 files, bags and folders of bags.
-        mapping: Of the bags and HDF5 files; None where the one that `demorec import --suggest` writes leaves nothing to
-            decide.
+        paths: Recordings, runs, folders of recordings, and whatever can be imported.
+        mapping: Of the bags and files that need one; None where the one that `demorec import --suggest` writes leaves
+            nothing to decide.
         imports_datasets: Whether datasets are opened as recordings.
         tell: Called with what was left out, and by which mapping, a line each.
 
     Raises:
         ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
-        DemorecError: As `import_bags`, `import_hdf5` and `import_lerobot`.
+        DemorecError: As `import_bags` and `SourceFormat.read`.
     """
     kinds = [_import_kind(path, imports_datasets) for path in paths]
-    if mapping is not None and not any(kind in _NEEDS_MAPPING for kind in kinds):
-        raise ConfigError(f"Only bags and HDF5 files are read by a mapping: leave --mapping out: {paths[0]}")
+    if mapping is not None and not any(_needs_mapping(kind) for kind in kinds):
+        mapped = " and ".join(["bags", *(form.name for form in FORMATS.values() if form.mapping)])
+        raise ConfigError(f"Only {mapped} are read by a mapping: leave --mapping out: {paths[0]}")
     with tempfile.TemporaryDirectory(prefix="demorec-reading-", ignore_cleanup_errors=True) as folder:
         _check_space([path for path, kind in zip(paths, kinds, strict=True) if kind], Path(folder))
         found = []
@@ -65,12 +64,14 @@ def opened(
                 continue
             run = Path(folder) / str(number) / path.resolve().name
             run.parent.mkdir()
-            if kind == "dataset":
-                for line in import_lerobot(path, run).left_out_lines():
-                    tell(line)
-            else:
+            chosen = None
+            if _needs_mapping(kind):
                 chosen = mapping or _suggested(path, kind, Path(folder) / f"{number}.toml", tell)
-                _import(path, kind, chosen, run, tell)
+            if kind in WORD_OF:
+                for line in FORMATS[WORD_OF[kind]].read([path], chosen, run, VideoConfig()).left_out_lines():
+                    tell(line)
+            elif chosen is not None:
+                _import_bag(path, chosen, run, tell)
             found.append(run)
         yield found
 
@@ -78,9 +79,13 @@ def opened(
 def _import_kind(path: Path, imports_datasets: bool) -> PathKind | None:
     """What a path is to be imported as; None for what is read as it is, and for what no command reads."""
     kind = find(path).kind
-    if kind == "dataset":
-        return kind if imports_datasets else None
-    return kind if kind in _NEEDS_MAPPING else None
+    return kind if kind in IMPORTED or (imports_datasets and kind == "dataset") else None
+
+
+def _needs_mapping(kind: PathKind | None) -> bool:
+    if kind is None or kind not in WORD_OF:
+        return kind == "rosbag"
+    return FORMATS[WORD_OF[kind]].mapping is not None
 
 
 def _check_space(paths: Sequence[Path], folder: Path) -> None:
@@ -101,14 +106,15 @@ def _suggested(path: Path, kind: PathKind, target: Path, tell: Callable[[str], N
         ConfigError: It leaves something to the user.
     """
     doubts: list[str] = []
-    is_hdf5 = kind == "hdf5"
-    lines = suggested_hdf5_mapping(path) if is_hdf5 else suggested_mapping(bags_in(path)[0], doubts.append)
+    word = WORD_OF.get(kind, "")
+    form = FORMATS.get(word)
+    lines = form.suggest(path) if form else suggested_mapping(bags_in(path)[0], doubts.append)
     target.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    suggest = f"demorec import {'hdf5 ' if is_hdf5 else ''}{path} --suggest > mapping.toml"
+    suggest = f"demorec import {f'{word} ' if word else ''}{path} --suggest > mapping.toml"
     try:
         if doubts:
             raise ConfigError(doubts[0])
-        used = read_mapping(target, "hdf5" if is_hdf5 else "bag")
+        used = read_mapping(target, (form and form.mapping) or "bag")
     except ConfigError as error:
         reason = str(error).removesuffix(f": {target}")
         raise ConfigError(
@@ -128,11 +134,7 @@ def _taken(mapping: SourceMapping) -> str:
     return listed([*parts, *(f"camera {name}" for name in mapping.cameras)], _MOST_SHOWN, ", ")
 
 
-def _import(path: Path, kind: PathKind, mapping: Path, run: Path, tell: Callable[[str], None]) -> None:
-    if kind == "hdf5":
-        for line in import_hdf5([path], mapping, run).left_out_lines():
-            tell(line)
-        return
+def _import_bag(path: Path, mapping: Path, run: Path, tell: Callable[[str], None]) -> None:
     result = import_bags([path], mapping, run)
     for report in result.reports:
         for line in dropped_lines(report):

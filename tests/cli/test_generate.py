@@ -171,3 +171,4 @@ def test_list_tells_every_row_in_one_line(capsys: pytest.CaptureFixture[str], wh
     assert [line.split()[0] for line in lines] == list(getattr(tables, what.upper()).rows)
     assert any(line.startswith(names + " ") for line in lines)
     assert all(re.match(r"\S+\s+\S+", line) for line in lines), "a row without a summary"
+    assert len({line.split(maxsplit=1)[1] for line in lines}) == len(lines), "two rows that read the same"

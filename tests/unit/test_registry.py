@@ -23,6 +23,21 @@ def test_unknown_names_get_the_nearest_match() -> None:
         SHAPES.load("conter")
 
 
+def test_a_name_that_the_module_lacks_gets_the_nearest_match() -> None:
+    with pytest.raises(ConfigError, match=r"since the module has no such name\. Did you mean 'Fraction'\?"):
+        SHAPES.load("fractions:Fracton", ["fractions"])
+
+
+def test_of_many_names_the_refusal_names_the_command_that_lists_them() -> None:
+    many: Registry[type] = Registry(kind="law", rows={f"law_{number}": "collections:Counter" for number in range(31)})
+    with pytest.raises(ConfigError) as refused:
+        many.load("law_33")
+    assert str(refused.value).endswith("Allowed: those of demorec list laws.")
+    assert "Did you mean 'law_3" in str(refused.value)
+    with pytest.raises(ConfigError, match=r"Allowed: ordered, counter, or"):
+        SHAPES.load("law")
+
+
 @pytest.mark.parametrize("allowed", [("fractions",), ("decimal", "fractions")])
 def test_somebody_elses_object_loads_when_its_module_is_allowed(allowed: tuple[str, ...]) -> None:
     assert SHAPES.load("fractions:Fraction", allowed) is Fraction

@@ -13,6 +13,7 @@ from demorec.core.replacing import use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
+from demorec.sources.formats import IMPORTED
 
 _PARTS = (EPISODES, FAILED, UNFINISHED)
 
@@ -88,8 +89,8 @@ def reading(
 ) -> Iterator[tuple[Path, ...]]:
     """What to read in the place of each path; until the context is left, all output names the user's paths.
 
-    Bags, HDF5 files and datasets are read through a temporary run (`demorec.sources.opening`). No line that is written
-    names it: its episodes are called "demo.hdf5: episode 3".
+    What is imported (`demorec.sources.formats`) is read through a temporary run (`demorec.sources.opening`). No line
+    that is written names it: its episodes are called "demo.hdf5: episode 3".
 
     Args:
         paths: As the user named them.
@@ -100,7 +101,7 @@ def reading(
         ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
         DemorecError: A path cannot be read.
     """
-    imported = {"hdf5", "rosbag", *(["dataset"] if imports_datasets else [])}
+    imported = {*IMPORTED, *(["dataset"] if imports_datasets else [])}
     if mapping is None and not imported & {find(path).kind for path in paths}:
         yield tuple(paths)  # without loading what reads bags
         return

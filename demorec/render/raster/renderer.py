@@ -33,7 +33,7 @@ CASTER_FACES_PER_METRE = 900.0
 
 
 class RasterRenderer:
-    """Draws on the CPU, compiled with numba: no system package, no GPU. See docs/rendering.md.
+    """The default renderer, on the CPU, compiled with numba: no system package, no GPU. See docs/rendering.md.
 
     Args:
         exact: Draw every triangle of every mesh, for depth that must be exact to the file.
