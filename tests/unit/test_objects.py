@@ -17,8 +17,9 @@ from demorec.core.errors import ConfigError, SceneError
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.objects.antipodal import Hand, antipodal_grasps
-from demorec.objects.folder import load_shelf
+from demorec.objects.folder import load_shelf, read_solid
 from demorec.objects.shelf import Kind
+from demorec.robots.assets import data_folder
 from demorec.sim.parts import with_parts
 from demorec.sim.resting import at_rest
 
@@ -224,8 +225,47 @@ def test_a_mesh_that_cannot_be_handled_is_refused_in_one_sentence(
     assert "thing.stl" in str(error.value)
 
 
+def test_a_glb_file_is_turned_upright_and_a_broken_one_is_refused(tmp_path: Path) -> None:
+    """glTF is in metres and has y up; two boxes at different places of its scene are one solid."""
+    both = trimesh.Scene()
+    both.add_geometry(trimesh.creation.box(extents=(0.03, 0.05, 0.04)))
+    lid = trimesh.transformations.translation_matrix((0.0, 0.03, 0.0))
+    both.add_geometry(trimesh.creation.box(extents=(0.02, 0.01, 0.02)), transform=lid)
+    data = both.export(file_type="glb")
+    (tmp_path / "tin.glb").write_bytes(data)
+    solid = load_shelf(f"{tmp_path}/").kinds[0].shape(0)
+    np.testing.assert_allclose(solid.extents, (0.03, 0.04, 0.06), atol=1e-5)
+    assert solid.mass_properties()[0] == pytest.approx(0.03 * 0.05 * 0.04 + 0.02 * 0.02 * 0.01)
+    top = solid.points[solid.points[:, 2] > solid.points[:, 2].max() - 1e-4]
+    assert float(np.ptp(top[:, 0])) == pytest.approx(0.02, abs=1e-5)  # the lid is on top
+    rng = np.random.default_rng(0)
+    refused = 0
+    for row in rng.integers(20, len(data), 200).tolist():
+        (tmp_path / "tin.glb").write_bytes(data[:row] + bytes([data[row] ^ 0xFF]) + data[row + 1 :])
+        read_solid.cache_clear()
+        try:
+            read_solid(tmp_path / "tin.glb")
+        except ConfigError:
+            refused += 1
+    assert refused > 50
+
+
+def test_the_random_shelf_has_those_of_pybullet_that_a_hand_gets_around() -> None:
+    """About every third of a thousand; which ones, by trimesh's boxes and volumes."""
+    (kind,) = OBJECTS.load("random").kinds
+    assert kind.count == 345
+    volumes = np.array([kind.shape(number).mass_properties()[0] for number in range(kind.count)])
+    fitting = 0
+    for path in sorted(data_folder().glob("random_urdfs/*/*.obj"))[::25]:
+        mesh = trimesh.load(path, force="mesh").apply_scale(0.015)
+        fits = float(mesh.extents[:2].min()) < 0.07
+        assert bool(np.isclose(volumes, mesh.volume, rtol=1e-4, atol=0.0).any()) == fits, path.name
+        fitting += fits
+    assert 5 < fitting < 35
+
+
 def test_a_folder_without_meshes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no \.obj or \.stl"):
+    with pytest.raises(ConfigError, match=r"no \.obj, \.stl or \.glb"):
         load_shelf(f"{tmp_path}/")
     with pytest.raises(ConfigError, match="was not found"):
         load_shelf(f"{tmp_path}/missing/")
