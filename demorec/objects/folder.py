@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 import re
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -17,6 +18,7 @@ from demorec.core.files import open_regular
 from demorec.core.geometry import Array
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import MAX_EXTENT, MAX_POINTS, UNIT, SolidMesh
+from demorec.objects.antipodal import standing_rotation
 from demorec.objects.shelf import Kind, Shelf
 from demorec.robots.assets import data_folder
 from demorec.robots.obj import read_obj
@@ -25,6 +27,8 @@ SUFFIXES = (".obj", ".stl", ".glb")
 MAX_BYTES = 50_000_000
 WIDEST = 0.07
 """Of the narrowest side, metres: what a hand of 8 cm takes."""
+FLAT = 2e-4
+"""Out of plane, metres, up to which points belong to one face."""
 RANDOM_SCALE = 0.015
 """Of the files in `random_urdfs`, as their URDFs have it."""
 
@@ -63,8 +67,8 @@ def folder_shelf(folder: Path) -> Shelf:
     )
 
 
-def _reader(files: list[Path], scale: float = 1.0) -> Callable[[int], SolidMesh]:
-    return lambda number: read_solid(files[number], scale)
+def _reader(files: list[Path]) -> Callable[[int], SolidMesh]:
+    return lambda number: read_solid(files[number])
 
 
 def __getattr__(name: str) -> Shelf:
@@ -87,7 +91,34 @@ def _random_urdfs() -> Shelf:
         sides = RANDOM_SCALE * np.ptp(np.array(rows, dtype=np.float64), axis=0)
         if float(sides.min()) < WIDEST:
             files.append(path)
-    return Shelf(kinds=(Kind(noun="blob", material="plastic", shape=_reader(files, RANDOM_SCALE), count=len(files)),))
+
+    @functools.lru_cache(maxsize=1024)
+    def shape(number: int) -> SolidMesh:
+        return on_steadiest_side(read_solid(files[number], RANDOM_SCALE))
+
+    return Shelf(kinds=(Kind(noun="blob", material="plastic", shape=shape, count=len(files)),))
+
+
+def on_steadiest_side(mesh: SolidMesh) -> SolidMesh:
+    """The solid turned so that it lies on that face of its hull from which it has to be tilted farthest to fall."""
+    from scipy.spatial import ConvexHull  # takes a while to load
+
+    mesh = mesh.centred()
+    hull = ConvexHull(mesh.points)
+    best, down = 0.0, np.array([0.0, 0.0, -1.0])
+    for normal in np.unique(np.round(hull.equations[:, :3], 3), axis=0):
+        out = normal / math.sqrt(float(normal @ normal))
+        heights = mesh.points @ out
+        face = mesh.points[heights > heights.max() - FLAT]
+        across = np.cross(out, np.eye(3)[int(np.argmin(np.abs(out)))])
+        corners = np.stack([face @ across, face @ np.cross(out, across)], axis=1) / math.sqrt(float(across @ across))
+        if np.linalg.matrix_rank(corners - corners[0], tol=FLAT) < 2:
+            continue
+        steady = -float(ConvexHull(corners).equations[:, 2].max()) / float(heights.max())
+        if steady > best:
+            best, down = steady, out
+    x, y, z = (-down).tolist()
+    return mesh.moved(standing_rotation((x, y, z)), np.zeros(3))
 
 
 def _noun(stem: str) -> str:
