@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from demorec.annotate import Statement
 from demorec.annotate.grounding import MIN_PIXELS, Seen, body_labels, pixels_of, project, seen_things
 from demorec.annotate.referring import phrases_for
-from demorec.annotate.situation import NamedThing, Surroundings, situations
+from demorec.annotate.situation import CONTAINERS, NamedThing, Surroundings, situations
 from demorec.core.geometry import Array
 from demorec.episode.episode import Columns
 from demorec.episode.scene import SceneCamera
@@ -198,7 +198,7 @@ def _relation(view: _View, name: str, other: str) -> str:
     """ "on" or "in" by where the things are, else "left_of" or "right_of" by where the picture shows their middles."""
     lower = view.now.thing(other)
     if rests_on(view.now.thing(name), lower):
-        return "in" if lower.noun == "tray" else "on"
+        return "in" if lower.noun in CONTAINERS else "on"
     if rests_on(lower, view.now.thing(name)):
         return ""
     offset = float(view.middles[name][0] - view.middles[other][0]) / view.camera.width

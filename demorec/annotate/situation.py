@@ -21,6 +21,8 @@ _SYNONYMS = {
     "mark": ("mark", "target", "square"),
     "tray": ("tray",),
 }
+CONTAINERS = ("tray", "bowl")
+"""What things go into and are in, not onto and on."""
 _AT_THE_PLACE = 0.01
 """How far, metres, the middle of a mark may be from a goal that is meant to be on it."""
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from demorec.annotate.referring import phrase_for
-from demorec.annotate.situation import Surroundings, nouns_of, place_of
+from demorec.annotate.situation import CONTAINERS, Surroundings, nouns_of, place_of
 from demorec.annotate.tries import Story, Stretch, Try
 from demorec.core.geometry import Array
 from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
@@ -77,10 +77,10 @@ def goal_words(scene: Scene, goal_index: int | None, now: Surroundings) -> GoalW
 
 
 def prepositions(scene: Scene, place: str) -> tuple[str, str]:
-    """("into", "in") for a tray, ("to", "at") for a place without a thing, ("onto", "on") for everything else."""
+    """("into", "in") for a container, ("to", "at") for a place without a thing, ("onto", "on") for everything else."""
     if not place:
         return "to", "at"
-    return ("into", "in") if "tray" in nouns_of(scene.body(place)) else ("onto", "on")
+    return ("into", "in") if nouns_of(scene.body(place))[0] in CONTAINERS else ("onto", "on")
 
 
 def subtask(stretch: Stretch, words: GoalWords, instruction: str, *, is_dropped: bool) -> str:

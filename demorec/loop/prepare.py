@@ -116,7 +116,8 @@ def prepare(plan: EpisodePlan) -> Episode:
         finger_stiffness=FINGER_STIFFNESS,
     )
     scene = replace(scene, physics=physics)
-    scene = vary_looks(vary_physics(scene, ranges, _rng(plan, "physics")), ranges, _rng(plan, "looks"))
+    scene = vary_physics(scene, ranges, _rng(plan, "physics"), distractors=not task.draws_distractors)
+    scene = vary_looks(scene, ranges, _rng(plan, "looks"))
     behaviour = draw_behaviour(ranges, _rng(plan, "behaviour"))
     camera_rng = _rng(plan, "cameras")
     cameras = vary_cameras(tuple(_cameras(task, robot, config)), ranges, camera_rng)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +38,21 @@ def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = (), sides: in
     faces = [face for below, above in pairwise(rings) for face in _band(below, above)]
     parts = [[row for ring in rings[first : last + 1] for row in ring] for first, last in _convex_runs(profile)]
     return _solid(points, _with_ends(faces, rings[0], rings[-1]), parts)
+
+
+def dish(floor: float, rim: float, height: float, *, thickness: float, sides: int = 24) -> SolidMesh:
+    """A vessel with a flat floor and a wall that leans outward, hollow as physics has it too, standing on z = 0.
+
+    Args:
+        floor, rim: Inner radii of its floor and of its rim, metres.
+        height: Of the rim, metres.
+        thickness: Of floor and wall, metres.
+        sides: Of each ring.
+    """
+    solid = lathe([(floor, 0.0), (rim, height)], cavity=[(rim - thickness, height), (floor, thickness)], sides=sides)
+    rings = np.arange(4 * sides).reshape(4, sides)
+    wall = [np.concatenate([rings[:, k], rings[:, (k + 1) % sides]]) for k in range(sides)]
+    return replace(solid, parts=(np.concatenate([rings[0], rings[3]]), *wall))
 
 
 def board(

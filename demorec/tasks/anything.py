@@ -1,18 +1,20 @@
-"""A named thing out of several from a shelf goes onto a mark or into a tray."""
+"""A named thing out of several from a shelf goes onto a mark or a plate, or into a tray or a bowl."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from demorec.annotate.situation import CONTAINERS
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
 from demorec.episode.mesh import decode_mesh, encode_mesh
-from demorec.episode.scene import Body, Goal, Role, Scene, Shape
+from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape
 from demorec.objects.shelf import MATERIALS, Kind
+from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
 from demorec.sim.parts import with_parts
 from demorec.sim.resting import ROLLING_FRICTION, at_rest
@@ -31,20 +33,51 @@ GAP = 0.02
 MOST_THINGS = 6
 MASSES = (0.015, 0.2)
 """Limits, kg: lighter things jump, heavier ones slip."""
+DRAWS = 50
+"""Of a thing until one rests on a table and can be grasped."""
+NEUTRAL_COLORS: Mapping[str, Rgba] = {"grey": (0.5, 0.5, 0.51, 1.0), "black": (0.15, 0.15, 0.16, 1.0)}
+"""Of what lies about: no colour that an instruction names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dish:
+    """A round vessel that stands still, white.
+
+    Attributes:
+        floor, rim: Radii of its flat floor and of its rim, metres.
+        height: Of the rim, metres.
+    """
+
+    floor: float
+    rim: float
+    height: float
+
+
+DISHES: Mapping[str, Dish] = {
+    "bowl": Dish(floor=0.085, rim=0.115, height=0.03),
+    "plate": Dish(floor=0.08, rim=0.105, height=0.012),
+}
+DISH_FLOOR = 0.004
+"""Height of a dish's floor above its lower face, metres."""
+FROM_MIDDLE = 0.01
+"""How far from a dish's middle something is put, metres along x and y at most."""
 
 
 class PickAnything(TableTask):
-    """Pick up the named thing and put it onto the mark or into the tray.
+    """Pick up the named thing and put it onto the mark or the plate, or into the tray or the bowl.
 
-    Task: one to six things from shelves (`--objects`), each of another name or colour; a square mark, or a tray at the
-        robot's left.
+    Task: one to six things from shelves (`--objects`), each of another name or colour; a square mark, or a tray, a bowl
+        or a plate at the robot's left. With `--distractors` as many more things of the same shelves, grey or black.
     Randomised: which things and their shapes (`--object-split`), places, yaws, colours, densities and frictions by
-        material; mark or tray, its place and yaw; where in the tray (3 cm about its middle); the arm's initial joints.
-    Success: the thing's centre within 2 cm of the mark's, or of its place in the tray, standing as it stood within
-        5 degrees, at rest, not touched; everything else within 2 cm of where it was; the gripper open.
+        material; what they go to, its place and yaw; where in it (3 cm about the middle of a tray, 1 cm of a bowl or
+        a plate); the arm's initial joints.
+    Success: the thing's centre within 2 cm of the mark's, or of its place in the tray, bowl or plate, on its floor,
+        standing as it stood within 5 degrees, at rest, not touched; everything else within 2 cm of where it was; the
+        gripper open.
     """
 
-    summary = "the named thing out of one to six, to a mark or into a tray"
+    summary = "the named thing out of one to six, to a mark, a tray, a bowl or a plate"
+    draws_distractors = True
     shelves = ("household", "blocks")
     wordings = (
         "pick up the {thing} and put it {place}",
@@ -64,22 +97,25 @@ class PickAnything(TableTask):
 
     def layout(self, sampler: Sampler) -> Layout:
         """Draw it."""
-        into_tray = sampler.uniform(0.0, 1.0) < 0.5
-        region = BESIDE_TRAY if into_tray else EVERYWHERE
         things = _things(sampler, 1 + int(sampler.rng.integers(MOST_THINGS)))
-        start = sampler.point(BESIDE_TRAY if into_tray else WORKSPACE, what="the wanted thing")
+        low, high = sampler.ranges.range("distractors")
+        things += _things(sampler, int(sampler.rng.integers(int(low), int(high) + 1)), neutral=True)
+        onto = sampler.choice(_targets(things[0]))
+        start = sampler.point(WORKSPACE if onto == "mark" else BESIDE_TRAY, what="the wanted thing")
         wanted = _standing(things[0], start, sampler.yaw())
         room = max(HAND, radius_of(wanted) + GAP)
         taken = [(start, room)]
-        target, goal = _tray_and_goal(sampler, wanted) if into_tray else _mark_and_goal(sampler, wanted, start)
-        if not into_tray:
+        if onto == "mark":
+            target, goal = _mark_and_goal(sampler, wanted, start)
             x, y, _ = goal.onto_from_goal.position.tolist()
             taken.append(((x, y), room))
+        else:
+            target, goal = _container_and_goal(sampler, wanted, onto)
         others: list[Body] = []
         for thing in things[1:]:
             radius = radius_of(thing)
             point = sampler.point(
-                region,
+                EVERYWHERE if onto == "mark" else BESIDE_TRAY,
                 accept=lambda point, radius=radius: all(math.dist(point, at) > r + radius for at, r in taken),  # type: ignore[misc]
                 what="another thing",
             )
@@ -90,7 +126,8 @@ class PickAnything(TableTask):
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
         """One of the wordings, filled in."""
         (goal,) = scene.goals
-        place = f"in the {scene.body(goal.onto).color_name} tray" if goal.onto else "on the green target"
+        name = goal.onto or "green_target"
+        place = f"{'in' if name.endswith(CONTAINERS) else 'on'} the {name.replace('_', ' ')}"
         return wording(rng, *self.wordings, thing=words_for(scene.body(goal.object)), place=place)
 
 
@@ -100,29 +137,41 @@ def radius_of(body: Body) -> float:
     return body.shape.scale * math.sqrt(float((points[:, :2] ** 2).sum(axis=1).max()))
 
 
-def _things(sampler: Sampler, count: int) -> list[Body]:
+def _targets(wanted: Body) -> list[str]:
+    """What a thing can be put to: it has to stand on the flat floor of a dish."""
+    room = radius_of(wanted) + 1.5 * FROM_MIDDLE
+    return ["mark", "mark", "tray", *(name for name, dish in DISHES.items() if room < dish.floor)]
+
+
+def _things(sampler: Sampler, count: int, *, neutral: bool = False) -> list[Body]:
     """Up to so many things at the origin, each of another name or colour; fewer where the shelves have no more.
 
-    The first one can be grasped; SceneError when none can.
+    The first one can be grasped; SceneError when none can. Neutral ones are grey or black and need not.
     """
     kinds = [kind for shelf in sampler.shelves for kind in shelf.kinds if kind.numbers(sampler.object_split)]
     if not kinds:
         raise SceneError(f"The shelves have nothing for --object-split {sampler.object_split}.")
-    left = [(kind, color) for kind in kinds for color in kind.colors or _COLORS]
+    left = [(kind, color) for kind in kinds for color in (NEUTRAL_COLORS if neutral else kind.colors or _COLORS)]
     things: dict[str, Body] = {}
-    while left and len(things) < count:
+    for _ in range(DRAWS * count):
+        if not left or len(things) == count:
+            break
         kind = sampler.choice(list({kind.noun: kind for kind, _ in left}.values()))
         color = sampler.choice([color for other, color in left if other.noun == kind.noun])
-        left = [entry for entry in left if (entry[0].noun, entry[1]) != (kind.noun, color)]
-        thing = make_object(sampler, kind, sampler.choice(kind.numbers(sampler.object_split)), color)
-        if things or sampler.can_grasp(thing.shape):
+        try:
+            thing = make_object(sampler, kind, sampler.choice(kind.numbers(sampler.object_split)), color)
+        except SceneError:  # it does not come to rest
+            continue
+        if neutral or things or sampler.can_grasp(thing.shape):
+            left = [entry for entry in left if (entry[0].noun, entry[1]) != (kind.noun, color)]
             things[thing.name] = thing
-    if not things:
+    if not things and not neutral:
         raise SceneError("The gripper finds no grasp of any thing on the shelves: give others with --objects.")
     return list(things.values())
 
 
 _COLORS = tuple(name for name in COLORS if name != "green")
+_ALL_COLORS = {**COLORS, **NEUTRAL_COLORS}
 
 
 def make_object(sampler: Sampler, kind: Kind, number: int, color_name: str) -> Body:
@@ -140,7 +189,7 @@ def make_object(sampler: Sampler, kind: Kind, number: int, color_name: str) -> B
         mass=min(max(mass, MASSES[0]), MASSES[1]),
         lateral_friction=sampler.uniform(*material.friction),
         rolling_friction=ROLLING_FRICTION,
-        rgba=COLORS[color_name],
+        rgba=_ALL_COLORS[color_name],
         color_name=color_name,
         yaw_symmetry=kind.yaw_symmetry,
     )
@@ -163,9 +212,29 @@ def _mark_and_goal(sampler: Sampler, wanted: Body, start: tuple[float, float]) -
     return target, Goal(object=wanted.name, onto="", onto_from_goal=_resting(wanted, place), yaw_symmetry=0)
 
 
-def _tray_and_goal(sampler: Sampler, wanted: Body) -> tuple[Body, Goal]:
-    point, yaw = sampler.point(TRAYS, what="the tray"), sampler.uniform(-0.25, 0.25)
-    target = tray("blue_tray", point, yaw, color_name="blue")
-    offset = (sampler.uniform(-0.03, 0.03), sampler.uniform(-0.02, 0.02))
-    pose = _resting(wanted, offset, TRAY_FLOOR)
+def _container_and_goal(sampler: Sampler, wanted: Body, onto: str) -> tuple[Body, Goal]:
+    point, yaw = sampler.point(TRAYS, what=f"the {onto}"), sampler.uniform(-0.25, 0.25)
+    if onto == "tray":
+        target, floor, spread = tray("blue_tray", point, yaw, color_name="blue"), TRAY_FLOOR, (0.03, 0.02)
+    else:
+        target, floor, spread = _dish_body(onto, point, yaw), DISH_FLOOR, (FROM_MIDDLE, FROM_MIDDLE)
+    offset = [sampler.uniform(-most, most) for most in spread]
+    pose = _resting(wanted, offset, floor)
     return target, Goal(object=wanted.name, onto=target.name, onto_from_goal=pose, yaw_symmetry=0)
+
+
+def _dish_body(noun: str, point: tuple[float, float], yaw: float) -> Body:
+    """A white bowl or plate, its origin in its lower face."""
+    dimensions = DISHES[noun]
+    mesh = dish(dimensions.floor, dimensions.rim, dimensions.height, thickness=DISH_FLOOR)
+    x, y, z = mesh.extents.tolist()
+    return Body(
+        name=f"white_{noun}",
+        role="target",
+        shape=Shape(kind="mesh", size=(x, y, z), mesh=encode_mesh(mesh)),
+        world_from_body=Pose.from_yaw((*point, 0.0005), yaw),
+        lateral_friction=0.6,
+        rgba=(0.93, 0.92, 0.88, 1.0),
+        color_name="white",
+        yaw_symmetry=0,
+    )

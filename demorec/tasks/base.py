@@ -32,6 +32,8 @@ class Task(ABC):
     """Whether `--fixed` gives one exact layout instead of a random one."""
     shelves: ClassVar[tuple[str, ...]] = ()
     """Rows of `OBJECTS` that it draws from unless --objects names others; empty: it has its own things."""
+    draws_distractors: ClassVar[bool] = False
+    """Whether `sample_scene` itself puts as many distractors among its things as the ranges say."""
     camera_presets: ClassVar[Mapping[str, CameraPreset]] = {}
     """Camera name -> preset in place of the table's, for a scene that the usual view misses."""
 

@@ -49,8 +49,8 @@ def draw_behaviour(ranges: Ranges, rng: np.random.Generator) -> Behaviour:
     )
 
 
-def vary_physics(scene: Scene, ranges: Ranges, rng: np.random.Generator) -> Scene:
-    """Masses, friction, damping, gravity, table height and distractors.
+def vary_physics(scene: Scene, ranges: Ranges, rng: np.random.Generator, *, distractors: bool = True) -> Scene:
+    """Masses, friction, damping, gravity, table height and, unless the scene has its own, distractors.
 
     Raises:
         SceneError: There is no room for the distractors.
@@ -60,7 +60,7 @@ def vary_physics(scene: Scene, ranges: Ranges, rng: np.random.Generator) -> Scen
     physics = replace(scene.physics, gravity=(x, y, z + ranges.draw("gravity_offset", rng)))
     scene = replace(scene, bodies=tuple(bodies), physics=physics)
     scene = _lower_table(scene, -ranges.draw("table_height", rng))
-    low, high = ranges.range("distractors")
+    low, high = ranges.range("distractors") if distractors else (0, 0)
     return _with_distractors(scene, int(rng.integers(int(low), int(high) + 1)), rng)
 
 

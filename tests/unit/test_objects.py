@@ -10,15 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import ConvexHull
 from support.commands import exit_code
 from support.sim import episode, run
 
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
+from demorec.episode.variation import Ranges
+from demorec.loop import ScriptAgent, Session, make_world
 from demorec.objects.antipodal import Hand, antipodal_grasps
-from demorec.objects.folder import load_shelf
+from demorec.objects.folder import load_shelf, on_steadiest_side, read_solid
 from demorec.objects.shelf import Kind
+from demorec.objects.solids import dish
+from demorec.robots.assets import data_folder
 from demorec.sim.parts import with_parts
 from demorec.sim.resting import at_rest
 
@@ -129,6 +134,19 @@ def test_a_grasp_follows_the_direction_that_is_up() -> None:
     assert best.width == pytest.approx(0.05, abs=1e-3)
 
 
+def test_a_hand_that_is_a_little_too_low_meets_no_shoulder_below_what_it_grips() -> None:
+    """A neck of 12 mm radius on a cone: with its tips 7 mm below the TCP the hand stays 3 mm above the cone."""
+    rows = [(0.0, 0.0), (0.03, 0.0), (0.012, 0.02), (0.012, 0.06), (0.0, 0.06)]
+    bottle = trimesh.creation.revolve(np.array(rows), sections=48)
+    points = np.asarray(bottle.vertices) - (0.0, 0.0, 0.03)
+    solid = SolidMesh(points=points, faces=np.asarray(bottle.faces), parts=(np.arange(len(points)),))
+    grasps = antipodal_grasps(encode_mesh(solid), PANDA_HAND, up=UP)
+    assert grasps
+    for grasp in grasps:
+        assert grasp.width == pytest.approx(0.024, abs=1e-3)
+        assert grasp.z - 0.007 > -0.01 + 0.0025  # the neck begins at z = -0.01
+
+
 def test_what_sticks_out_where_a_finger_would_come_down_forbids_the_grasp() -> None:
     """A post is grasped, but not below a plate on it that is nearly as wide as the hand opens."""
     post, plate = trimesh.creation.box(extents=(0.03, 0.03, 0.04)), trimesh.creation.box(extents=(0.076, 0.076, 0.01))
@@ -159,13 +177,64 @@ def test_scenes_name_one_thing_without_doubt_and_take_from_the_shelves_asked_for
         (goal,) = info.scene.goals
         assert goal.object.replace("_", " ") in info.instruction
         assert len(set(names)) == len(names)
+        assert not {"grey", "black"} & {body.color_name for body in info.scene.movable}
         targets.add(goal.onto)
         for body in info.scene.movable:
             kind = KINDS[body.name.split("_")[1]]
             assert kind in OBJECTS.load("blocks").kinds
             assert body.shape.mesh in {at_rest(encode_mesh(kind.shape(n)))[0] for n in kind.numbers("eval")}
     assert set(counts) == set(range(1, 7))
-    assert targets == {"", "blue_tray"}
+    assert targets == {"", "blue_tray", "white_bowl", "white_plate"}
+
+
+def test_distractors_are_of_the_same_shelves_and_grey_or_black() -> None:
+    ranges = Ranges(distractors=(2, 2))
+    for index in range(4):
+        scene = episode(index, task="pick_anything", objects=("household",), ranges=ranges).info.scene
+        others = [body for body in scene.movable if body.color_name in ("grey", "black")]
+        assert len(others) == 2
+        assert len({body.name for body in scene.bodies}) == len(scene.bodies)
+        for body in others:
+            assert body.role == "distractor"
+            assert body.name.split("_")[1] in {kind.noun for kind in OBJECTS.load("household").kinds}
+        assert scene.body(scene.goals[0].object) not in others
+
+
+@pytest.mark.parametrize("target", ["white_bowl", "white_plate"])
+def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> None:
+    """Judged by PyBullet's contacts and by the thing's points, which are all inside of the rim."""
+    made = next(
+        made
+        for made in (episode(number, task="pick_anything") for number in range(100, 140))
+        if made.info.scene.goals[0].onto == target
+    )
+    scene = made.info.scene
+    goal, vessel = scene.goals[0], scene.body(target)
+    assert f"the {target.replace('_', ' ')}" in made.info.instruction
+    with make_world(made.info) as world:
+        session = Session.of_episode(world, made)
+        for _ in session.run(ScriptAgent(made)):
+            pass
+        assert session.outcome.success, session.outcome.failure_reason
+        assert world.touches(goal.object, target)
+        points = world.pose(goal.object).apply(decode_mesh(scene.body(goal.object).shape.mesh).points)
+    inside = vessel.world_from_body.inverse().apply(points)
+    assert inside[:, 2].min() == pytest.approx(0.004, abs=2e-3)
+    assert np.hypot(inside[:, 0], inside[:, 1]).max() < vessel.shape.size[0] / 2
+
+
+def test_a_dish_is_hollow_for_physics_too() -> None:
+    bowl = dish(0.08, 0.11, 0.03, thickness=0.004)
+    assert bowl.is_closed()
+    hulls = [ConvexHull(bowl.points[part]) for part in bowl.parts]
+    assert sum(hull.volume for hull in hulls) == pytest.approx(as_trimesh(bowl).volume, rel=0.03)
+    for point, is_solid in (
+        ((0.0, 0.0, 0.002), True),
+        ((0.0, 0.0, 0.01), False),
+        ((0.07, 0.0, 0.02), False),
+        ((0.098, 0.0, 0.02), True),
+    ):
+        assert any((hull.equations @ (*point, 1.0) <= 0).all() for hull in hulls) is is_solid
 
 
 def test_a_thing_goes_down_at_another_yaw_where_the_present_one_is_out_of_reach() -> None:
@@ -224,8 +293,56 @@ def test_a_mesh_that_cannot_be_handled_is_refused_in_one_sentence(
     assert "thing.stl" in str(error.value)
 
 
+def test_a_glb_file_is_turned_upright_and_a_broken_one_is_refused(tmp_path: Path) -> None:
+    """glTF is in metres and has y up; two boxes at different places of its scene are one solid."""
+    both = trimesh.Scene()
+    both.add_geometry(trimesh.creation.box(extents=(0.03, 0.05, 0.04)))
+    lid = trimesh.transformations.translation_matrix((0.0, 0.03, 0.0))
+    both.add_geometry(trimesh.creation.box(extents=(0.02, 0.01, 0.02)), transform=lid)
+    data = both.export(file_type="glb")
+    (tmp_path / "tin.glb").write_bytes(data)
+    solid = load_shelf(f"{tmp_path}/").kinds[0].shape(0)
+    np.testing.assert_allclose(solid.extents, (0.03, 0.04, 0.06), atol=1e-5)
+    assert solid.mass_properties()[0] == pytest.approx(0.03 * 0.05 * 0.04 + 0.02 * 0.02 * 0.01)
+    top = solid.points[solid.points[:, 2] > solid.points[:, 2].max() - 1e-4]
+    assert float(np.ptp(top[:, 0])) == pytest.approx(0.02, abs=1e-5)  # the lid is on top
+    rng = np.random.default_rng(0)
+    refused = 0
+    for row in rng.integers(20, len(data), 200).tolist():
+        (tmp_path / "tin.glb").write_bytes(data[:row] + bytes([data[row] ^ 0xFF]) + data[row + 1 :])
+        read_solid.cache_clear()
+        try:
+            read_solid(tmp_path / "tin.glb")
+        except ConfigError:
+            refused += 1
+    assert refused > 50
+
+
+def test_the_random_shelf_has_those_of_pybullet_that_a_hand_gets_around() -> None:
+    """About every third of a thousand; which ones, by trimesh's boxes, whichever side they lie on."""
+    (kind,) = OBJECTS.load("random").kinds
+    assert kind.count == 345
+    shapes = [as_trimesh(kind.shape(number)) for number in range(kind.count)]
+    sizes = np.array([(shape.volume, shape.area) for shape in shapes])
+    fitting = 0
+    for path in sorted(data_folder().glob("random_urdfs/*/*.obj"))[::25]:
+        mesh = trimesh.load(path, force="mesh").apply_scale(0.015)
+        fits = float(mesh.extents[:2].min()) < 0.07
+        found = np.isclose(sizes, (mesh.volume, mesh.area), rtol=1e-3, atol=0.0).all(axis=1)
+        assert bool(found.any()) == fits, path.name
+        fitting += fits
+    assert 5 < fitting < 35
+
+
+def test_a_slab_on_edge_is_laid_on_its_steadiest_side() -> None:
+    laid = on_steadiest_side(block(0.09, 0.03, 0.12))
+    assert laid.extents[2] == pytest.approx(0.03, abs=2e-5)
+    assert sorted(laid.extents.tolist()) == pytest.approx([0.03, 0.09, 0.12], abs=2e-5)
+    assert laid.is_closed()
+
+
 def test_a_folder_without_meshes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no \.obj or \.stl"):
+    with pytest.raises(ConfigError, match=r"no \.obj, \.stl or \.glb"):
         load_shelf(f"{tmp_path}/")
     with pytest.raises(ConfigError, match="was not found"):
         load_shelf(f"{tmp_path}/missing/")
