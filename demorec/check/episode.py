@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
@@ -21,6 +20,7 @@ from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
 from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size
 from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
+from demorec.check.films import Films, films_of_recording, likeness_of_films
 from demorec.check.full_size import FullSize, compare_full_size, encoded_again, frames_to_compare, share_off, with_lead
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
@@ -272,11 +272,15 @@ class CheckedEpisode(ExitStack):
             self._pictures[camera.name, kind] = summarise(self.recording, camera, kind, keep)
         return self._pictures[camera.name, kind]
 
+    @cached_property
+    def films(self) -> Films:
+        """Those of the cameras of a recording that demorec did not simulate: each image once, beside its frame."""
+        return films_of_recording(self.recording, self.columns)
+
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
-        """(two cameras in different places, correlation of their images); where nobody knows the places, whether the
-        encoded images are the same."""
+        """(two cameras, in different places as far as these are known, correlation of their images)."""
         if self.form == "external":
-            yield from self._equal_cameras()
+            yield from likeness_of_films(self.films)
             return
         poses = self.columns.world_from_camera
         for camera, other in combinations(self.cameras, 2):
@@ -285,14 +289,6 @@ class CheckedEpisode(ExitStack):
             is_near = np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3
             if first.shape[1:] == second.shape[1:] and count >= 2 and not is_near:
                 yield f"{camera.name} and {other.name}", correlation(first[:count], second[:count])
-
-    def _equal_cameras(self) -> Iterator[tuple[str, float]]:
-        digests = dict.fromkeys(self.recording.cameras, 0)
-        for camera in digests:
-            for packet in self.recording.packets(camera):
-                digests[camera] = zlib.crc32(packet.data, digests[camera])
-        for one, other in combinations(sorted(digests), 2):
-            yield f"{one} and {other}", float(digests[one] == digests[other] != 0)
 
     @cached_property
     def _drawn(self) -> DrawnEpisode | NotMeasured:
