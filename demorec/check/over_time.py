@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, picture_check
+from demorec.check.evidence import Flags
 from demorec.check.films import BLANK_LEVELS, Film, Filmed, contrast, difference
 from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
@@ -52,7 +53,7 @@ def stray_images(subject: Filmed) -> Iterator[Found]:
         yield Measurement(value=len(wrong), frame=frame, detail=named or f"{count} images")
 
 
-def _alien(film: Film) -> Array:
+def _alien(film: Film) -> Flags:
     """(N,) images unlike both of their neighbours, which are like each other, where the state goes no such way."""
     alien = np.zeros(len(film.cells), dtype=np.bool_)
     if len(alien) < 3:
@@ -71,8 +72,8 @@ def _alien(film: Film) -> Array:
     return alien
 
 
-def _moves(speed: Array) -> Array:
-    return np.asarray(speed > _MOVING * float(np.sqrt((speed**2).mean()))) if len(speed) else speed > 0
+def _moves(speed: Array) -> Flags:
+    return np.asarray(speed > _MOVING * float(np.sqrt((speed**2).sum() / max(len(speed), 1))))
 
 
 @film_check(

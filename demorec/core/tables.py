@@ -127,7 +127,7 @@ CHECKS: Registry[Check] = Registry(
         ("over_time", "stray_images", "frozen_images", "images_follow_state", "steady_exposure", "exchanged_cameras"),
         ("dataset_pictures", "dataset_picture_statistics", "dataset_pictures_as_drawn", "dataset_picture_lag"),
         ("targets", "state_follows_action", "actions_in_order", "state_reaches_action"),
-        ("targets", "action_is_no_observation", "gripper_waits_for_action"),
+        ("targets", "action_is_no_observation", "gripper_waits_for_action", "dead_band"),
         ("run", "duplicates", "coverage"),
         ("alignment", "dataset_action_lag"),
         ("dataset_files", "dataset_sidecar"),
