@@ -17,8 +17,9 @@ from demorec.check.base import (
 )
 from demorec.check.cells import ImageKind
 from demorec.check.drawn import PictureComparison, judge_lag
-from demorec.check.episode import CheckedEpisode, at_full_size, of_each_camera
+from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
+from demorec.check.pictures import at_full_size, of_each_camera
 from demorec.check.rows import displacement, matrices
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,13 +13,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.check.base import Form, NotMeasured
-from demorec.check.cells import Cells, correlation
+from demorec.check.cells import Cells
 from demorec.check.coverage import motion_vector
 from demorec.check.dataset_video import EpisodePictures, episode_pictures
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw, frames_to_draw
 from demorec.check.dynamics import Dynamics
 from demorec.check.episode_drawn import drawable_scene
 from demorec.check.evidence import Motion, motions_of_dataset
+from demorec.check.films import Film, Films, likeness_of_films
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices
 from demorec.core.errors import ConfigError, ExportError, in_words
@@ -151,10 +151,8 @@ class Dataset:
         return point_masses(motion)
 
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
-        """(two cameras, correlation of their images in an episode), the first three episodes alone."""
-        for one, other in combinations(self.colour_keys, 2):
-            for number, (a, b) in enumerate(zip(self.pictures(one)[:3], self.pictures(other)[:3], strict=True)):
-                yield f"{one} and {other}, episode {number}", correlation(a.cells, b.cells)
+        """(two cameras, correlation of their images in an episode)."""
+        return likeness_of_films(self.films)
 
     @property
     def colour_keys(self) -> list[str]:
@@ -166,6 +164,24 @@ class Dataset:
         if key not in self._pictures:
             self._pictures[key] = episode_pictures(self.path, self.info, self.places, key)
         return self._pictures[key]
+
+    @cached_property
+    def films(self) -> Films:
+        """Those of its cameras, beside the states."""
+        known = STATE in self.info.features
+        return {
+            key: [
+                Film(
+                    where=f"{key}, episode {number}",
+                    fps=self.info.fps,
+                    cells=pictures.cells,
+                    frames=np.arange(pictures.count),
+                    state=self.rows[number][STATE].astype(np.float64) if known else None,
+                )
+                for number, pictures in enumerate(self.pictures(key))
+            ]
+            for key in self.colour_keys
+        }
 
     @cached_property
     def compared(self) -> list[tuple[int, str, PictureComparison | NotMeasured]]:

@@ -18,10 +18,6 @@ from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.datasets.lerobot.reader import EpisodePlace
 
-_FLAT_LEVELS = 1.0
-"""Standard deviation over a picture, of 255: less is a black, green or otherwise empty one."""
-_ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
-"""A picture from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
 _PARTS = 16
 """Parts along the shorter side, about, whose mean colours stand for a picture."""
 _FEWEST_PARTS, _MOST_PARTS = 8, 32
@@ -35,15 +31,11 @@ class EpisodePictures:
     Attributes:
         count: How many there are.
         mean: (3,) mean red, green and blue, of 1.
-        flat: Frames whose picture is of one colour.
-        alien: Frames whose picture is unlike both of its neighbours, which are like each other.
         cells: (count, rows, columns, 3) mean colours of the parts of each picture, 0 to 255.
     """
 
     count: int
     mean: Array
-    flat: tuple[int, ...]
-    alien: tuple[int, ...]
     cells: NDArray[np.uint8]
 
 
@@ -67,7 +59,9 @@ def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlac
             raise ExportError(
                 f"Episode {place.episode_index} has {place.length} frames, {len(pictures)} pictures decode: {path}"
             )
-        found.append(_summary(np.stack(pictures)))
+        cells = np.stack(pictures)
+        mean = cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255
+        found.append(EpisodePictures(count=len(cells), mean=mean, cells=cells))
     return found
 
 
@@ -97,22 +91,3 @@ def part_counts(width: int, height: int) -> tuple[int, int]:
     if not _FEWEST_PARTS <= shorter // side <= _MOST_PARTS:
         return _PARTS, _PARTS
     return width // side, height // side
-
-
-def _summary(cells: NDArray[np.uint8]) -> EpisodePictures:
-    """Of the parts (T, rows, columns, 3) of an episode's pictures."""
-    parts = cells.astype(np.float64)
-    flat = parts.std(axis=(1, 2)).max(axis=1) < _FLAT_LEVELS
-    alien = np.zeros(len(parts), dtype=np.bool_)
-    if len(parts) > 2:
-        step = np.abs(np.diff(parts, axis=0)).mean(axis=(1, 2, 3))
-        across = np.abs(parts[2:] - parts[:-2]).mean(axis=(1, 2, 3))
-        least = np.minimum(step[:-1], step[1:])
-        alien[1:-1] = (least > _ALIEN_LEVELS) & (least > _ALIEN_TIMES * across)
-    return EpisodePictures(
-        count=len(parts),
-        mean=parts.mean(axis=(0, 1, 2)) / 255,
-        flat=tuple(np.flatnonzero(flat).tolist()),
-        alien=tuple(np.flatnonzero(alien).tolist()),
-        cells=cells,
-    )

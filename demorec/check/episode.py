@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, field, replace
-from functools import cached_property, wraps
+from dataclasses import replace
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Any, cast
@@ -16,15 +14,18 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Form, Found, NotMeasured
-from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells, correlation
+from demorec.check.base import Form, NotMeasured
+from demorec.check.cells import ImageKind, correlation
 from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
 from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size
 from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
+from demorec.check.films import Films, films_of_recording, likeness_of_films
 from demorec.check.full_size import FullSize, compare_full_size, encoded_again, frames_to_compare, share_off, with_lead
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
+from demorec.check.summary import PictureSummary, summarise
+from demorec.check.topic_scan import TopicScan, scan_topics
 from demorec.core.errors import RecordingError, SceneError
 from demorec.core.geometry import Array
 from demorec.episode.camera_error import told_error
@@ -35,37 +36,6 @@ from demorec.mcap import Recording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
-
-_STAMP_FIRST = {
-    "sensor_msgs/msg/JointState",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/WrenchStamped",
-    "sensor_msgs/msg/CompressedImage",
-    "sensor_msgs/msg/Image",
-    "foxglove_msgs/msg/CompressedVideo",
-    "rcl_interfaces/msg/Log",
-}
-"""Types whose first field is a time stamp, alone or in a header."""
-_STAMP = np.dtype([("seconds", "<i4"), ("nanoseconds", "<u4")])
-_STAMP_BYTES = 4 + _STAMP.itemsize
-"""A stamp with the four bytes of CDR's head before it."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TopicScan:
-    """What was found on one topic, in the order of the file.
-
-    Attributes:
-        schema: Its type.
-        time_ns: (N,) time of each message.
-        stamp_ns: (N,) time stamp inside each message; None for types without one.
-        first: Bytes of the first message.
-    """
-
-    schema: str
-    time_ns: NDArray[np.int64]
-    stamp_ns: NDArray[np.int64] | None
-    first: bytes
 
 
 class CheckedEpisode(ExitStack):
@@ -132,27 +102,7 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
         """Every message of every topic, read once: every chunk's checksum is verified on the way."""
-        container = self.container
-        schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
-        found = {topic: _scan(schemas[topic], block) for topic, block in self.blocks.items()}
-        pictures = [topic for topic in schemas if topic not in found]
-        times: dict[str, list[int]] = {topic: [] for topic in pictures}
-        stamps: dict[str, list[int]] = {topic: [] for topic in pictures}
-        first: dict[str, bytes] = {}
-        for topic, time_ns, data in container.messages(pictures):
-            times[topic].append(time_ns)
-            stamps[topic].append(_stamp(data))
-            first.setdefault(topic, data)
-        for name in container.attachment_names:
-            container.attachment(name)
-        for topic in pictures:
-            found[topic] = TopicScan(
-                schema=schemas[topic],
-                time_ns=np.array(times[topic], dtype=np.int64),
-                stamp_ns=np.array(stamps[topic], dtype=np.int64) if schemas[topic] in _STAMP_FIRST else None,
-                first=first.get(topic, b""),
-            )
-        return {topic: found[topic] for topic in schemas}
+        return scan_topics(self.container, self.blocks)
 
     @cached_property
     def blocks(self) -> dict[str, Block]:
@@ -322,11 +272,15 @@ class CheckedEpisode(ExitStack):
             self._pictures[camera.name, kind] = summarise(self.recording, camera, kind, keep)
         return self._pictures[camera.name, kind]
 
+    @cached_property
+    def films(self) -> Films:
+        """Those of the cameras of a recording that demorec did not simulate: each image once, beside its frame."""
+        return films_of_recording(self.recording, self.columns)
+
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
-        """(two cameras in different places, correlation of their images); where nobody knows the places, whether the
-        encoded images are the same."""
+        """(two cameras, in different places as far as these are known, correlation of their images)."""
         if self.form == "external":
-            yield from self._equal_cameras()
+            yield from likeness_of_films(self.films)
             return
         poses = self.columns.world_from_camera
         for camera, other in combinations(self.cameras, 2):
@@ -335,14 +289,6 @@ class CheckedEpisode(ExitStack):
             is_near = np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3
             if first.shape[1:] == second.shape[1:] and count >= 2 and not is_near:
                 yield f"{camera.name} and {other.name}", correlation(first[:count], second[:count])
-
-    def _equal_cameras(self) -> Iterator[tuple[str, float]]:
-        digests = dict.fromkeys(self.recording.cameras, 0)
-        for camera in digests:
-            for packet in self.recording.packets(camera):
-                digests[camera] = zlib.crc32(packet.data, digests[camera])
-        for one, other in combinations(sorted(digests), 2):
-            yield f"{one} and {other}", float(digests[one] == digests[other] != 0)
 
     @cached_property
     def _drawn(self) -> DrawnEpisode | NotMeasured:
@@ -438,107 +384,3 @@ class CheckedEpisode(ExitStack):
             shift = compared.shift + self._drawn.shift.get(camera.name, 0.0)
             self._comparisons[camera.name, kind] = replace(compared, shift=shift)
         return self._comparisons[camera.name, kind]
-
-
-def of_each_camera(
-    judge: Callable[[CheckedEpisode, SceneCamera, PictureComparison], Found],
-) -> Callable[[CheckedEpisode], Iterator[Found]]:
-    """A check of the colour pictures of one camera, against what the recorded numbers make of them, as one of all."""
-
-    @wraps(judge)
-    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
-        for camera in episode.cameras:
-            compared = episode.compared(camera)
-            yield compared if isinstance(compared, NotMeasured) else judge(episode, camera, compared)
-
-    return judge_all
-
-
-def at_full_size(judge: Callable[[SceneCamera, FullSize], Found]) -> Callable[[CheckedEpisode], Iterator[Found]]:
-    """A check of some colour images of one camera at their full size, as one of all cameras."""
-
-    @wraps(judge)
-    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
-        for camera in episode.cameras:
-            compared = episode.full_size(camera)
-            yield compared if isinstance(compared, NotMeasured) else judge(camera, compared)
-
-    return judge_all
-
-
-def _scan(schema: str, block: Block) -> TopicScan:
-    stamps = None
-    if schema in _STAMP_FIRST and len(block) and int(block.lengths.min()) >= _STAMP_BYTES:
-        told = np.ascontiguousarray(block.heads(_STAMP_BYTES)[:, 4:]).view(_STAMP).reshape(-1)
-        stamps = told["seconds"] * np.int64(1_000_000_000) + told["nanoseconds"]
-    elif schema in _STAMP_FIRST:
-        stamps = np.array([_stamp(data) for data in block.messages()], dtype=np.int64)
-    first = next(block.messages(), b"")
-    return TopicScan(schema=schema, time_ns=block.time_ns, stamp_ns=stamps, first=first)
-
-
-def _stamp(data: bytes) -> int:
-    with suppress(struct.error):
-        seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
-        return int(seconds) * 1_000_000_000 + int(nanoseconds)
-    return -1
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PictureSummary:
-    """What is known of N pictures of a camera after decoding them.
-
-    Attributes:
-        error: Why decoding ended early, or "".
-        mean: (N, 3) mean colour, 0..255; of the brightnesses that stand for depth and labels, (N, channels).
-        dark, bright: (N,) share of pixels that are nearly black or nearly white.
-        cells: (N, h, w, channels) means over small areas, 0..255.
-        detail: (N,) how much fine structure colours have.
-        kept: Frame -> some of the pictures as they are.
-    """
-
-    error: str
-    mean: Array
-    dark: Array
-    bright: Array
-    cells: Cells
-    detail: NDArray[np.float32]
-    kept: Mapping[int, NDArray[Any]] = field(default_factory=dict)
-
-    @property
-    def num_pictures(self) -> int:
-        """N: how many could be decoded."""
-        return len(self.cells)
-
-
-def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind, keep: Collection[int] = ()) -> PictureSummary:
-    """Decode all pictures of a camera once, and keep those of some frames."""
-    from demorec.check import kernels
-
-    read: dict[ImageKind, Callable[[str], Iterator[NDArray[Any]]]] = {
-        "color": recording.images,
-        "depth": recording.depth,
-        "labels": recording.segmentation,
-    }
-    grid = CellGrid(camera.width, camera.height)
-    found: list[PictureCells] = []
-    detail: list[float] = []
-    kept: dict[int, NDArray[Any]] = {}
-    error = ""
-    try:
-        for frame, picture in enumerate(read[kind](camera.name)):
-            found.append(grid.read(kind, picture))  # what came before the damage counts
-            detail.append(kernels.amount_of_detail(picture) if kind == "color" else 0.0)
-            if frame in keep:
-                kept[frame] = picture
-    except RecordingError as problem:
-        error = str(problem)
-    return PictureSummary(
-        error=error,
-        mean=np.array([picture.mean for picture in found]),
-        dark=np.array([picture.dark for picture in found]),
-        bright=np.array([picture.bright for picture in found]),
-        cells=np.array([picture.cells for picture in found]) if found else np.empty((0, 2, 2, 1), dtype=np.float32),
-        detail=np.array(detail, dtype=np.float32),
-        kept=kept,
-    )

@@ -11,12 +11,10 @@ import numpy as np
 
 from demorec.check.base import IMAGES, Found, Measurement, NotMeasured, external_check, worst_frame
 from demorec.check.episode import CheckedEpisode
+from demorec.check.films import BLANK_LEVELS, contrast
 from demorec.episode.episode import NO_PICTURE
-from demorec.mcap.video import decode
 
 _NANOSECONDS = 1_000_000_000
-_BLANK_LEVELS = 2.0
-"""Standard deviation, of 255 levels, below which an image shows nothing."""
 
 
 @external_check(
@@ -125,10 +123,8 @@ def images_show_something(subject: CheckedEpisode) -> Found:
         shares = [float(np.mean(np.isfinite(values) & (values > 0))) for values in recording.distances(camera)]
         if shares and float(np.median(shares)) == 0:
             unmeasured.append(camera)
-    for camera in recording.cameras:
-        images = decode(recording.video_settings(camera), recording.packets(camera))
-        deviations = [float(image[::4, ::4].std()) for image in images]
-        if deviations and float(np.median(deviations)) < _BLANK_LEVELS:
+    for camera, films in subject.films.items():
+        if any(len(film.cells) and np.median(contrast(film)) < BLANK_LEVELS for film in films):
             blank.append(camera)
     blank += unmeasured
     return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))

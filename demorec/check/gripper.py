@@ -12,6 +12,11 @@ from demorec.check.objects import top_of
 
 CARRIED_HEIGHT = 0.03
 """Metres above its start from which on an object counts as carried."""
+_MOST_LAG = 4
+"""Frames up to which contact force and fingers are shifted against each other."""
+_PRESSES, _APART, _STANDS = 0.25, 0.02, 0.15
+"""Share of the usual force from which on fingers press, of the opening that keeps them from where they were sent, and
+of it a second below which they stand."""
 
 
 @alignment_check(
@@ -48,6 +53,37 @@ def grip_force(episode: CheckedEpisode) -> Found:
     return Measurement(
         value=abs(force / expected - 1), frame=frame, detail=f"{force:.1f} N, the motors give {expected:.3g} N"
     )
+
+
+@alignment_check(
+    measures="frames by which the contact force is off the fingers' stop at what is between them",
+    warn=0.75,
+    fail=1.5,
+)
+def contact_lag(episode: CheckedEpisode) -> Found:
+    """Fingers press from where something stops them to where they open again: catches forces that are late or early.
+
+    Of all shifts of the force those count at which it is there in the frames in which the fingers stand apart from
+    where they were sent; of several the middle one.
+    """
+    c, fps = episode.columns, episode.info.fps
+    span = episode.info.robot.gripper.max_width
+    if c.num_frames < 4 * _MOST_LAG or not (c.contact_force > 0).any():
+        return NotMeasured(why="nothing is taken or let go of")
+    presses = c.contact_force > _PRESSES * np.median(c.contact_force[c.contact_force > 0])
+    sent = np.concatenate([c.command_gripper[:1], c.command_gripper[:-1]])
+    stands = np.abs(np.gradient(c.gripper_width)) * fps < _STANDS * span
+    stopped = stands & (c.gripper_width - sent > _APART * span)
+    core = slice(_MOST_LAG, -_MOST_LAG)
+    edges = int((presses[core][1:] != presses[core][:-1]).sum())
+    if not edges:
+        return NotMeasured(why="nothing is taken or let go of")
+    lags = np.arange(-_MOST_LAG, _MOST_LAG + 1)
+    off = np.array([int((np.roll(presses, -lag)[core] != stopped[core]).sum()) for lag in lags])
+    if off.min() > 2 * edges:
+        return NotMeasured(why="the fingers press without being stopped")
+    lag = float(lags[off == off.min()].mean())
+    return Measurement(value=abs(lag), detail=f"{lag:+.1f} frames, taken and let go of {edges} times")
 
 
 @physics_check(

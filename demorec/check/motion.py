@@ -340,7 +340,11 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
         return NotMeasured(why="the gripper's command never lasts")
     gap = opening - command
     is_open = command > command.min() + 0.5 * reach
-    holds = ~is_open if motion.contact is None else motion.contact > 0
+    holds = ~is_open
+    if motion.contact is not None:
+        holds = motion.contact > 0
+        for back in range(1, wait + 1):  # what was let go of has as much time, from then on
+            holds[back:] |= motion.contact[:-back] > 0
     beyond = np.where(is_open, gap, -gap)  # things keep fingers from closing between them, and from opening beside them
     off = np.where(holds, np.maximum(beyond, 0.0), np.abs(gap)) / reach
     where = f", {motion.where}" if motion.where else ""

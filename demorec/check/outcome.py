@@ -18,6 +18,9 @@ from demorec.episode.conditions import DISTURBED, LIMITS, OPEN, PLACED
 from demorec.episode.episode import gave_up
 from demorec.episode.scene import Body, Scene
 
+_PLACES = ("target", "mark", "marks", "tray")
+"""What the tasks call bodies of the role "target"."""
+
 
 @outcome_check(
     measures="contradictions within the outcome",
@@ -52,7 +55,11 @@ def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
     measures="colours that the instruction names and the scene lacks, or the other way round",
 )
 def instruction_fits_scene(episode: CheckedEpisode) -> Found:
-    """The instruction speaks of colours that are in the scene, and of those of the objects that have a goal."""
+    """The instruction speaks of colours that are in the scene, and of those of the objects that have a goal.
+
+    In demorec's tasks the first thing that it names is the one that is moved first; only a tower is told of from the
+    bottom. What it calls a target, mark or tray is one.
+    """
     scene, instruction = episode.info.scene, episode.info.instruction
     if not instruction.strip():
         return Measurement(value=1, detail="there is no instruction")
@@ -63,7 +70,20 @@ def instruction_fits_scene(episode: CheckedEpisode) -> Found:
     goals = dict.fromkeys(name for goal in scene.goals if (name := scene.body(goal.object).color_name))
     wrong = [f"nothing is {word}" for word in dict.fromkeys(words) if word not in known]
     wrong += [f"{color} is not named" for color in goals if color not in words]
+    if episode.info.task in TASKS.rows:
+        wrong += _exchanged(scene, re.findall(r"[a-z]+", instruction.lower()))
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or instruction)
+
+
+def _exchanged(scene: Scene, words: Sequence[str]) -> Iterator[str]:
+    """Colours that the instruction gives to what has another one."""
+    followed = [(word, after) for word, after in zip(words, [*words[1:], ""], strict=True) if word in COLOR_WORDS]
+    places = {body.color_name for body in scene.bodies if body.role == "target"}
+    yield from (f"no {place} is {color}" for color, place in followed if place in _PLACES and color not in places)
+    things = [color for color, after in followed if after not in _PLACES]
+    first = next((scene.body(goal.object).color_name for goal in scene.goals), "")
+    if things and first and "bottom" not in words and things[0] != first:
+        yield f"the {things[0]} one is named first, the {first} one is moved first"
 
 
 @outcome_check(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import wraps
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ from demorec.check.base import (
     worst_frame,
 )
 from demorec.check.drawn import PictureComparison, judge_unlike
-from demorec.check.episode import CheckedEpisode, at_full_size, of_each_camera
+from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
 from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
@@ -31,6 +32,32 @@ STALE_SHARE, STALE_EXCESS = 0.3, 2.5
 picture by more than this, of 255: a predicted picture may leave a small motion to the next keyframe."""
 _PREDICTED_WEIGHT = 0.25
 """Of the difference of a predicted picture of AV1, which leaves whole motions to the next keyframe (15 levels seen)."""
+
+
+def of_each_camera(
+    judge: Callable[[CheckedEpisode, SceneCamera, PictureComparison], Found],
+) -> Callable[[CheckedEpisode], Iterator[Found]]:
+    """A check of the colour pictures of one camera, against what the recorded numbers make of them, as one of all."""
+
+    @wraps(judge)
+    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
+        for camera in episode.cameras:
+            compared = episode.compared(camera)
+            yield compared if isinstance(compared, NotMeasured) else judge(episode, camera, compared)
+
+    return judge_all
+
+
+def at_full_size(judge: Callable[[SceneCamera, FullSize], Found]) -> Callable[[CheckedEpisode], Iterator[Found]]:
+    """A check of some colour images of one camera at their full size, as one of all cameras."""
+
+    @wraps(judge)
+    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
+        for camera in episode.cameras:
+            compared = episode.full_size(camera)
+            yield compared if isinstance(compared, NotMeasured) else judge(camera, compared)
+
+    return judge_all
 
 
 @picture_check(

@@ -53,6 +53,8 @@ RENAMED = {
     "pictures_exposed": "exposure",
     "effort_bears_the_arm": "effort_matches_dynamics",
     "wrench_holds_the_hand": "wrench_bears_the_hand",
+    "dataset_pictures": "stray_images",
+    "dataset_frozen": "frozen_images",
     **dict.fromkeys(
         ("latched_messages", "metadata_agrees", "phase_events", "picture_messages", "moving_frames", "derived_values",
          "joint_sample_times", "end_values", "story", "deliberate_misses", "phases_match_motion", "config_agrees",

@@ -15,6 +15,7 @@ from demorec.check.dataset import Dataset
 from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
 from demorec.core.files import open_regular, read_json_limited
 from demorec.core.geometry import Array
+from demorec.core.plain import digest
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.episode import Outcome
@@ -179,7 +180,7 @@ def run_files(run: CheckedRun) -> Measurement:
     measures="recordings whose own account differs from run.json or the run",
 )
 def run_agrees(run: CheckedRun) -> Measurement:
-    """Number, attempt, seed and config of each recording are those of its line and of the run."""
+    """Number, attempt, seed and config, value by value, of each recording are those of its line and of the run."""
     wrong = [text for line in run.lines for text in _contradictions(run, line)]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(run.lines)} lines")
 
@@ -196,6 +197,7 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
         yield f"{file} is episode {info.episode_index}, attempt {info.attempt}"
     if info.config_digest != run.run.get("config_digest"):
         yield f"{file} was made with another config"
+    yield from (f"{name} of {file} is another in run.json" for name in _config_off(run.run.get("config"), info))
     if line["success"] != file.startswith("episodes/"):
         yield f"{file} lies in the wrong folder"
     versions = run.run.get("versions", {})
@@ -218,6 +220,19 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
     for name, value in found.items():
         if line.get(name, value) != value:
             yield f"{name} of {file} is {str(value)[:40]!r}, run.json says {str(line[name])[:40]!r}"
+
+
+def _config_off(config: Any, info: EpisodeInfo) -> Iterator[str]:
+    """What a run's config, value by value, says otherwise than a recording's, and that otherwise than its digest."""
+    if not isinstance(config, dict):
+        yield "config"
+        return
+    own = info.config
+    yield from (name for name in sorted({*config, *own}) if config.get(name) != own.get(name))
+    known = {"task": info.task, "fps": info.fps, "physics_hz": info.physics_hz, "seed": info.root_seed}
+    yield from (name for name, value in known.items() if own.get(name, value) != value)
+    if digest(own) != info.config_digest:
+        yield "config_digest"
 
 
 @run_check(

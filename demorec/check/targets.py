@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from demorec.check.base import ACTIONS, GRIPPER, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.base import ACTIONS, GRIPPER, URDF, Found, Lacking, Measurement, NotMeasured, check
 from demorec.check.evidence import Motion
 from demorec.check.motion import FEWEST, Moving, correlations
 from demorec.check.rows import finest_lag
@@ -25,6 +25,8 @@ _COPIED = 1e-6
 """Share of the state's range within which an action is a state."""
 _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
+_STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
+"""rad, m: by how much a state that stays changes at most, and an action that goes on at least; how often."""
 _NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
 
 target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
@@ -137,6 +139,38 @@ def action_is_no_observation(subject: Moving) -> Found:
         copied = np.abs(state[1:] - action[:-1]).max(axis=1, initial=0.0) < near
         same, count = same + int((copied & moves).sum()), count + int(moves.sum())
     return Measurement(value=same / count, detail=f"of {count} frames") if count else NotMeasured(why="nothing moves")
+
+
+@target_check(
+    group="physics",
+    measures="how far the action of a joint goes while its state stays at one value, median of all such times",
+    unit="rad, m",
+    warn=0.015,
+    fail=float("inf"),
+    needs=f"{ACTIONS}, and {URDF}",
+)
+def dead_band(subject: Moving) -> Found:
+    """A joint's state changes when its action does: catches play between encoder and joint, and coarse encoders.
+
+    An encoder has a thousandth of a turn or finer, 0.006 rad. A joint that waits once, or is blocked, has no dead band.
+    """
+    if not subject.motions.targets:
+        return NotMeasured(why=_NO_TARGETS)
+    ways: dict[str, list[float]] = {}
+    for motion in subject.motions.all:
+        known = np.isfinite(motion.lower) & (np.arange(len(motion.names)) != motion.gripper)
+        for element in np.flatnonzero(known).tolist():
+            if motion.action is None or not np.isfinite(action := motion.action[:, element]).all():
+                continue
+            changes = np.flatnonzero(np.abs(np.diff(motion.state[:, element])) > _STAYS) + 1
+            begins, ends = np.append(0, changes), np.append(changes, len(action)) - 1
+            way = np.abs(action[ends] - action[begins])
+            ways.setdefault(motion.names[element], []).extend(way[way > _GOES].tolist())
+    if not ways:
+        return Lacking(need=URDF)
+    of_joint = {name: float(np.median(way)) for name, way in ways.items() if len(way) >= _FEWEST_TIMES}
+    name = max(of_joint, key=lambda key: of_joint[key], default="")
+    return Measurement(value=of_joint.get(name, 0.0), detail=f"{name}, {len(ways[name])} times" if name else "")
 
 
 @check(

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Found, Lacking, Measurement, NotMeasured, alignment_check, physics_check, worst
-from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, Dynamics
+from demorec.check.base import (
+    Found,
+    Lacking,
+    Measurement,
+    NotMeasured,
+    alignment_check,
+    physics_check,
+    worst,
+    worst_frame,
+)
+from demorec.check.dynamics import LEAST_LOAD, LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics
 from demorec.check.episode import CheckedEpisode
+from demorec.check.gripper import CARRIED_HEIGHT
 from demorec.core.geometry import Array
 
 _LEVER = 0.2
@@ -134,6 +145,54 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     core = slice(_MOST_LAG, -_MOST_LAG)
     off = [float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags]
     return Measurement(value=abs(lags[int(np.argmin(off))]), detail=f"{lags[int(np.argmin(off))]:+d} frames")
+
+
+@physics_check(
+    measures="peak of a single frame in wrench or efforts that the other does not show, or of the force on what is "
+    "carried, in units of what is borne",
+)
+def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
+    """No single frame is far from both of its neighbours: catches lost bits and glitches of an amplifier.
+
+    Where the hand is free and moves smoothly, what an impact adds shows in wrench and motors alike; of the motors,
+    those count that bear weight. The force on what is carried is that of the gripper's motors in each frame.
+    """
+    yield _peak_of_grip(episode)
+    hand = episode.shared(_hand)
+    if not isinstance(hand, _Hand):
+        yield hand
+        return
+    free = hand.dynamics.is_judged
+    weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
+    off = np.hstack([hand.force - hand.loads_force, (hand.torque - hand.loads_torque) / _LEVER]) / weight
+    of_wrench = _peaks(off).max(axis=1)
+    of_motors, of_loaded = np.zeros((2, len(free)))
+    for index, name in enumerate(episode.info.robot.arm_joints):
+        joint = next(joint for joint in episode.urdf.joints if joint.name == name)
+        torque = hand.dynamics.torque(joint)
+        load = float(np.sqrt(np.median(torque[free] ** 2))) if free.any() else 0.0
+        peaks = _peaks((episode.columns.joint_effort[:, index] - torque)[:, None])[:, 0] / max(load, LEAST_LOAD)
+        of_motors = np.maximum(of_motors, peaks)
+        of_loaded = np.maximum(of_loaded, peaks * (load >= MIN_LOAD))
+    yield worst_frame(np.where(free, np.maximum(of_wrench - of_motors, 0.0), 0.0), "wrench")
+    yield worst_frame(np.where(free, np.maximum(of_loaded - of_wrench, 0.0), 0.0), "efforts")
+
+
+def _peak_of_grip(episode: CheckedEpisode) -> Found:
+    force = episode.columns.contact_force
+    carried = [episode.is_carried(body.name, CARRIED_HEIGHT) for body in episode.info.scene.movable]
+    rows = np.any([*carried, np.zeros(len(force), dtype=np.bool_)], axis=0)
+    if rows.sum() < MIN_FRAMES or not (usual := float(np.median(force[rows]))):
+        return NotMeasured(why="nothing is carried for long")
+    return worst_frame(np.where(rows, _peaks(force[:, None])[:, 0], 0.0) / usual, "contact force")
+
+
+def _peaks(table: Array) -> Array:
+    """(T, n) by how much each value is above both of its neighbours, or below both."""
+    peaks = np.zeros_like(table)
+    before, after = table[1:-1] - table[:-2], table[1:-1] - table[2:]
+    peaks[1:-1] = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
+    return peaks
 
 
 def _of_joint(episode: CheckedEpisode, hand: _Hand, name: str) -> tuple[Array, Array]:

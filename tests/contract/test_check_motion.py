@@ -106,7 +106,7 @@ def test_a_good_one_has_nothing_that_is_odd(strange: Path) -> None:
     report = checked(strange, "dataset", pictures=True)
     assert [result for result in report.results if result.level in ("warn", "fail")] == []
     passed = {result.check for result in report.results if result.level == "pass"}
-    assert {check for _, _, check in FAULTS.values()} | {"joint_speed", "dataset_frozen"} <= passed
+    assert {check for _, _, check in FAULTS.values()} | {"joint_speed", "frozen_images"} <= passed
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -237,7 +237,7 @@ def test_faults_in_a_dataset_that_lerobot_wrote(run: Path, tmp_path: Path) -> No
     edit_json(spoilt / "meta/info.json", slower)
     assert level(spoilt, "velocity_matches_position") == "fail"
     frozen = make_by_lerobot(run, tmp_path / "frozen", frozen=range(20, 80))
-    assert level(frozen, "dataset_frozen", pictures=True) == "fail"
+    assert level(frozen, "frozen_images", pictures=True) == "fail"
 
 
 LAWS = ("joint_limits", "joint_speed", "velocity_matches_position", "gripper_follows")

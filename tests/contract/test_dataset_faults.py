@@ -191,12 +191,12 @@ PICTURES: dict[str, Callable[[list[Any]], list[Any]]] = {
 def test_a_single_picture(name: str, dataset: Path) -> None:
     shutil.rmtree(dataset / "demorec")
     rewrite_video(dataset, CAMERA, PICTURES[name])
-    assert level_of(dataset, "dataset_pictures", "dataset") == "fail"
+    assert level_of(dataset, "stray_images", "dataset") == "fail"
 
 
 def test_pictures_coded_anew_are_no_fault(dataset: Path) -> None:
     rewrite_video(dataset, CAMERA, lambda pictures: [*pictures[:-1], pictures[-2]])
-    assert level_of(dataset, "dataset_pictures", "dataset") == "pass"
+    assert level_of(dataset, "stray_images", "dataset") == "pass"
     assert level_of(dataset, "dataset_picture_statistics", "dataset") == "pass"
 
 
@@ -286,7 +286,7 @@ def test_the_sidecar_contradicts_it(name: str, dataset: Path) -> None:
 def test_the_good_ones_pass(run: Path) -> None:
     report = checked(run / "dataset", "dataset", pictures=False)
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
-    for check in ("dataset_pictures", "dataset_picture_statistics"):
+    for check in ("stray_images", "dataset_picture_statistics"):
         assert level_of(run / "dataset", check, "dataset") == "pass"
     assert level_of(run, "run_dataset_content", "run") == "pass"
     shutil.copytree(run / "dataset", run.parent / "bare")

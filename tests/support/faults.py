@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from demorec.check.base import Result
 from demorec.check.cells import CellGrid, ImageKind
 from demorec.check.drawn import PictureComparison
-from demorec.check.episode import CheckedEpisode, PictureSummary
+from demorec.check.episode import CheckedEpisode
+from demorec.check.summary import PictureSummary
 from demorec.core.tables import CHECKS
 from demorec.episode.episode import Columns, Outcome
 from demorec.episode.info import EpisodeInfo

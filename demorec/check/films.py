@@ -1,0 +1,112 @@
+"""The colour images of a camera in one episode beside what the robot does, whoever recorded them.
+
+Nothing is drawn: laws of images over time hold where neither scene nor calibration is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.check.cells import correlation
+from demorec.check.dataset_video import part_counts
+from demorec.core.geometry import Array
+from demorec.episode.episode import NO_PICTURE, Columns
+from demorec.episode.features import STATE
+from demorec.mcap import Recording
+from demorec.mcap.video import decode
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Film:
+    """N images of one camera.
+
+    Attributes:
+        where: Camera and episode, for people.
+        fps: Frames per second.
+        cells: (N, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
+        frames: (N,) frame that each image belongs to.
+        state: (N, D) observation.state in these frames, None where there is none.
+    """
+
+    where: str
+    fps: float
+    cells: NDArray[np.uint8]
+    frames: NDArray[np.intp]
+    state: Array | None
+
+    @cached_property
+    def step(self) -> Array:
+        """(N - 1,) mean difference of each image from the one before, of 255."""
+        return difference(self.cells[1:], self.cells[:-1])
+
+
+BLANK_LEVELS = 1.0
+"""Contrast, of 255, below which an image is of one colour: black, green or otherwise empty."""
+
+
+def contrast(film: Film) -> Array:
+    """(N,) standard deviation over an image's parts, of the colour that varies most."""
+    return np.asarray(film.cells.std(axis=(1, 2)).max(axis=1, initial=0.0))
+
+
+Films = Mapping[str, Sequence[Film]]
+"""Camera -> its film in each episode."""
+
+
+class Filmed(Protocol):
+    """What has cameras."""
+
+    @property
+    def films(self) -> Films:
+        """Of all its cameras that show colours."""
+        ...
+
+
+def difference(one: NDArray[Any], other: NDArray[Any]) -> Array:
+    """(N,) mean difference of images in parts."""
+    return np.asarray(np.abs(one.astype(np.float32) - other).mean(axis=(1, 2, 3), dtype=np.float64))
+
+
+def films_of_recording(recording: Recording, columns: Columns) -> Films:
+    """Of a recording that demorec did not simulate: each image once, beside the first frame that holds it."""
+    state = columns.features[STATE].astype(np.float64) if STATE in columns.features else None
+    found = {}
+    for camera in recording.cameras:
+        cells = _cells_of(decode(recording.video_settings(camera), recording.packets(camera)))
+        held, frames = np.unique(columns.pictures[camera], return_index=True)
+        shown = (held != NO_PICTURE) & (held < len(cells))
+        rows = frames[shown]
+        film = Film(
+            where=f"camera {camera}",
+            fps=recording.info.fps,
+            cells=cells[held[shown]],
+            frames=rows,
+            state=None if state is None else state[rows],
+        )
+        found[camera] = [film]
+    return found
+
+
+def _cells_of(images: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    found = []
+    for image in images:
+        counts = part_counts(image.shape[1], image.shape[0])
+        found.append(np.asarray(Image.fromarray(image).resize(counts, Image.Resampling.BOX)))
+    return np.stack(found) if found else np.zeros((0, 1, 1, 3), dtype=np.uint8)
+
+
+def likeness_of_films(films: Films) -> Iterator[tuple[str, float]]:
+    """(two cameras and the episode, correlation of their images), of the first three episodes."""
+    for one, other in combinations(films, 2):
+        for a, b in zip(films[one][:3], films[other][:3], strict=False):
+            count = min(len(a.cells), len(b.cells))
+            if count and a.cells.shape[1:] == b.cells.shape[1:]:
+                yield f"{a.where} and {other}", correlation(a.cells[:count], b.cells[:count])

@@ -1,0 +1,225 @@
+"""Do a camera's images go together over time, and with what the robot does, in recordings and datasets of anybody's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, picture_check
+from demorec.check.evidence import Flags
+from demorec.check.films import BLANK_LEVELS, Film, Filmed, contrast, difference
+from demorec.check.rows import longest_run
+from demorec.core.geometry import Array
+
+_ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
+"""An image from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
+_EXPLAINED = 2.0
+"""Times what the camera shows of such a motion at most (in nine of ten moving frames) that no motion explains. Wrist
+cameras that exploration noise shakes at 10 and 15 frames a second show 1.1, images of another moment 2 and more."""
+_MOVING = 0.3
+"""Of the root mean square step of the state: more is a moving frame."""
+_REACH_S = 0.7
+"""How far apart in time motions of images and state are compared, seconds."""
+_SHOWN = 0.35
+"""The least usual correlation from which anything is told."""
+_FEWEST_EPISODES = 3
+_FEWEST_IMAGES = 20
+_STANDS = 0.02
+"""Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
+
+film_check = partial(picture_check, on=("external", "dataset"), needs=IMAGES)
+
+
+def _all(subject: Filmed) -> Iterator[Film]:
+    for films in subject.films.values():
+        yield from films
+
+
+@film_check(
+    measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
+)
+def stray_images(subject: Filmed) -> Iterator[Found]:
+    """No image is empty, and none is from another moment or place than those around it."""
+    wrong, count = [], 0
+    for film in _all(subject):
+        wrong += [(film, row) for row in np.flatnonzero((contrast(film) < BLANK_LEVELS) | _alien(film)).tolist()]
+        count += len(film.cells)
+    if count:
+        named = "; ".join(f"{film.where}, frame {film.frames[row]}" for film, row in wrong[:3])
+        frame = int(wrong[0][0].frames[wrong[0][1]]) if wrong else None
+        yield Measurement(value=len(wrong), frame=frame, detail=named or f"{count} images")
+
+
+def _alien(film: Film) -> Flags:
+    """(N,) images unlike both of their neighbours, which are like each other, where the state goes no such way."""
+    alien = np.zeros(len(film.cells), dtype=np.bool_)
+    if len(alien) < 3:
+        return alien
+    least = np.minimum(film.step[:-1], film.step[1:])
+    alien[1:-1] = (least > _ALIEN_LEVELS) & (least > _ALIEN_TIMES * difference(film.cells[2:], film.cells[:-2]))
+    if not alien.any() or film.state is None:
+        return alien
+    state = film.state / (film.state.std(axis=0) + 1e-3)
+    speed = np.linalg.norm(np.diff(state, axis=0), axis=1)
+    if not (moves := _moves(speed)).any():
+        return alien
+    shown = float(np.quantile(film.step[moves] / speed[moves], 0.9))
+    there_and_back = np.linalg.norm(state[1:-1] - (state[2:] + state[:-2]) / 2, axis=1)
+    alien[1:-1] &= least > _EXPLAINED * shown * there_and_back
+    return alien
+
+
+def _moves(speed: Array) -> Flags:
+    return np.asarray(speed > _MOVING * float(np.sqrt((speed**2).sum() / max(len(speed), 1))))
+
+
+@film_check(
+    measures="longest time for which a camera gives one and the same image while the robot moves",
+    unit="s",
+    warn=0.25,
+    fail=1.0,
+)
+def frozen_images(subject: Filmed) -> Iterator[Found]:
+    """A camera that sees the robot move shows it: catches a stream that hangs.
+
+    A camera that shows the same in more than a fifth of the other moving frames does not see the robot, and tells
+    nothing.
+    """
+    for camera, films in subject.films.items():
+        known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
+        steps = [np.linalg.norm(np.diff(state, axis=0), axis=1) for _, state in known]
+        if not known:
+            continue
+        limit = _MOVING * float(np.sqrt((np.concatenate(steps) ** 2).mean()))
+        found, hidden, others = [], 0, 0
+        for (film, _), step in zip(known, steps, strict=True):
+            same, moves = (film.cells[1:] == film.cells[:-1]).all(axis=(1, 2, 3)), step > limit
+            # Where nothing moves, the same image again says nothing, and ends no run.
+            length, start = longest_run(same | ~moves)
+            run = np.zeros(len(same), dtype=np.bool_)
+            run[start : start + length] = True
+            frames = np.diff(film.frames)[same & moves & run].sum()
+            found.append(Measurement(value=frames / film.fps, frame=int(film.frames[start]) + 1, detail=film.where))
+            hidden, others = hidden + int((same & moves & ~run).sum()), others + int((moves & ~run).sum())
+        if hidden > 0.2 * others:
+            yield NotMeasured(why=f"{camera} hardly sees the robot move")
+        else:
+            yield from found
+
+
+@film_check(
+    measures="by how much less than usual an episode's images move when its state does, as a correlation",
+    warn=0.35,
+    fail=0.45,
+)
+def images_follow_state(subject: Filmed) -> Iterator[Found]:
+    """Images move when the robot does: catches those of another episode, late, backwards or frozen ones.
+
+    How much an image changes is correlated with the speed of the state. What counts is how far that is below the
+    camera's usual correlation (of few episodes nobody knows it) and below that at another lag, added.
+    """
+    for camera, films in subject.films.items():
+        known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
+        if not known:
+            continue
+        scale = np.concatenate([state for _, state in known]).std(axis=0) + 1e-3
+        tables: list[tuple[Film, Array]] = []
+        for film, state in known:
+            reach = max(2, round(_REACH_S * film.fps))
+            speed = np.linalg.norm(np.diff(state / scale, axis=0), axis=1)
+            if len(speed) >= 4 * reach and (np.diff(film.frames) == 1).all():
+                tables.append((film, _correlations(film.step, speed, reach)))
+        usual = float(np.median([_near(table) for _, table in tables])) if tables else 0.0
+        if len(tables) < _FEWEST_EPISODES:
+            usual = max((float(table.max()) for _, table in tables), default=0.0)
+        if usual < _SHOWN:
+            yield NotMeasured(why=f"{camera} hardly shows when the robot moves")
+            continue
+        for film, table in tables:
+            below = max(usual - _near(table), 0.0) if len(tables) >= _FEWEST_EPISODES else 0.0
+            yield Measurement(value=below + float(table.max()) - _near(table), detail=film.where)
+
+
+def _correlations(steps: Array, speed: Array, reach: int) -> Array:
+    """(2 reach + 1,) of the roots of two courses (T,), smoothed over three frames, with `steps` so much later."""
+    a, b = (np.convolve(np.sqrt(values), np.ones(3) / 3, mode="same") for values in (steps, speed))
+    b = b[reach : len(b) - reach] - b[reach : len(b) - reach].mean()
+    found = np.zeros(2 * reach + 1)
+    for lag in range(2 * reach + 1):
+        c = a[lag : lag + len(b)] - a[lag : lag + len(b)].mean()
+        found[lag] = (c * b).sum() / max(float(np.sqrt((c * c).sum() * (b * b).sum())), 1e-9)
+    return found
+
+
+def _near(table: Array) -> float:
+    """The best correlation within a frame of no lag."""
+    middle = len(table) // 2
+    return float(table[middle - 1 : middle + 2].max())
+
+
+@film_check(
+    measures="by how much the brightness of what stands still drifts within an episode, share",
+    warn=0.06,
+    fail=float("inf"),
+)
+def steady_exposure(subject: Filmed) -> Iterator[Found]:
+    """What stands still before a fixed camera keeps its colours: catches exposure and white balance that drift or hunt.
+
+    The gain of an image is the median over its parts; where half of them do not stay what they are but for that gain,
+    the camera moves, and nothing is told.
+    """
+    for camera, films in subject.films.items():
+        for film in films:
+            if len(film.cells) < _FEWEST_IMAGES:
+                continue
+            usual = np.median(film.cells, axis=0)
+            lit = (usual > 20) & (usual < 235)  # (rows, columns, 3)
+            if (lit.mean(axis=(0, 1)) < 0.3).any():
+                yield NotMeasured(why=f"most of what {camera} shows is black or white")
+                continue
+            gains, stays = [], []
+            for channel in range(3):
+                ratio = film.cells[..., channel][:, lit[..., channel]] / usual[..., channel][lit[..., channel]]
+                gain = np.median(ratio, axis=1)
+                gains.append(gain)
+                stays.append(np.median(np.abs(ratio / gain[:, None] - 1), axis=1))
+            if np.quantile(np.max(stays, axis=0), 0.9) > _STANDS:
+                yield NotMeasured(why=f"{camera} moves")
+                continue
+            drift = np.ptp(gains, axis=1)
+            yield Measurement(value=float(drift.max()), detail=film.where)
+
+
+@film_check(
+    measures="images that look like another camera's, while that one's look like this one's",
+    needs="two cameras",
+)
+def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
+    """Each camera shows its own view: catches two that change places, within an episode or from one to another.
+
+    A view is the median of the first fifth of an episode's images, of all episodes together: half as far from the
+    other's view as from its own are only images of the other.
+    """
+    pairs = list(combinations(subject.films, 2))
+    if not pairs:
+        yield Lacking(need="two cameras")
+    for one, other in pairs:
+        films = list(zip(subject.films[one], subject.films[other], strict=False))
+        films = [(a, b) for a, b in films if len(a.cells) >= _FEWEST_IMAGES <= len(b.cells)]
+        if not films or films[0][0].cells.shape[1:] != films[0][1].cells.shape[1:]:
+            continue
+        views = [
+            np.median([np.median(film.cells[: max(len(film.cells) // 5, 1)], axis=0) for film in side], axis=0)
+            for side in zip(*films, strict=True)
+        ]
+        for a, b in films:
+            count = min(len(a.cells), len(b.cells))
+            wrong = np.ones(count, dtype=np.bool_)
+            for film, own, others in ((a, views[0], views[1]), (b, views[1], views[0])):
+                cells = film.cells[:count]
+                wrong &= difference(cells, others[None]) < 0.5 * difference(cells, own[None])
+            frame = int(a.frames[int(np.argmax(wrong))]) if wrong.any() else None
+            yield Measurement(value=int(wrong.sum()), frame=frame, detail=f"{a.where} and {other}")
