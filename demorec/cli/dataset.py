@@ -14,17 +14,16 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, ExportError, check_option
 from demorec.core.registry import check_choice
-from demorec.runs.find import expect
+from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
     from demorec.check.scoring.score import EpisodeScore
     from demorec.datasets.editing.plan import Plan, Source
 
-_EDITS = (
+_COMMANDS = (
     "select", "drop", "trim", "split", "merge", "rename", "drop-features", "set-task", "reorder", "shuffle",
+    "diff", "score",
 )  # fmt: skip
-"""Commands that make a plan of a new dataset (`Dataset._plan`)."""
-_COMMANDS = (*_EDITS, "diff", "score")
 _FLAGS = {
     "where": ("select", "drop", "set-task"),
     "episodes": ("select", "drop", "set-task"),
@@ -40,8 +39,8 @@ _FLAGS = {
     "images": ("score",),
     "workers": ("score",),
     "scores": ("select", "drop", "set-task", "split", "reorder"),
-    **dict.fromkeys(("out", "overwrite"), (*_EDITS, "score")),
-    **dict.fromkeys(("decode", "dry_run"), _EDITS),
+    **dict.fromkeys(("out", "overwrite"), tuple(name for name in _COMMANDS if name != "diff")),
+    **dict.fromkeys(("decode", "dry_run"), _COMMANDS[:-2]),
 }
 """The commands that each flag is for."""
 _SHOWN = 20
@@ -77,7 +76,8 @@ class Dataset:
     command: Annotated[Positional[str], arg(metavar="COMMAND")]
     """What to do."""
     words: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET")]
-    """The dataset, of merge two or more, of diff two; behind it the features of rename (OLD=NEW) and drop-features."""
+    """The dataset, or the run whose dataset it is; of merge two or more, of diff two; behind it the features of rename
+    (OLD=NEW) and drop-features."""
     out: Path | None = None
     """Folder of the new dataset; of split the folder in which each part gets one; of score a JSON file."""
     where: str = ""
@@ -132,6 +132,9 @@ class Dataset:
             if self.command not in commands and getattr(self, flag) != getattr(Dataset, flag):
                 name = flag.replace("_", "-")
                 raise ConfigError(f"--{name} means nothing to {self.command}: it is for {', '.join(commands)}.")
+        from demorec.datasets.lerobot.files import leave_pandas_out
+
+        leave_pandas_out()
         if self.command == "diff":
             return self._diff()
         if self.command == "score":
@@ -149,7 +152,7 @@ class Dataset:
         takes_words = self.command in ("rename", "drop-features")
         if len(self.words) > num_sources and not takes_words:
             raise ConfigError(f"demorec dataset {self.command} takes one dataset; demorec dataset merge joins several.")
-        sources = [Source(expect(Path(word), "dataset").path) for word in self.words[:num_sources]]
+        sources = [Source(_dataset(word)) for word in self.words[:num_sources]]
         self._add_scores(sources[0])
         plans = self._split(sources[0]) if self.command == "split" else {"": self._plan(sources)}
         for name, plan in plans.items():
@@ -179,7 +182,7 @@ class Dataset:
 
         if len(self.words) != 2:
             raise ConfigError(f"Two datasets are compared, given are {len(self.words)}: demorec dataset diff A B.")
-        a, b = (expect(Path(word), "dataset").path for word in self.words)
+        a, b = map(_dataset, self.words)
         try:
             with ProgressBar("reading") as bar:
                 found = diff(a, b, progress=bar.set)
@@ -201,7 +204,7 @@ class Dataset:
 
         if len(self.words) != 1:
             raise ConfigError(f"One dataset is scored, given are {len(self.words)}: demorec dataset score DATASET.")
-        root = expect(Path(self.words[0]), "dataset").path
+        root = _dataset(self.words[0])
         if self.out is not None:
             refuse_inside([self.out])
             check_target(self.out, source=root, overwrite=self.overwrite)
@@ -255,21 +258,15 @@ class Dataset:
             case "drop-features":
                 return operations.drop_features(source, words)
             case "set-task":
-                if not self.task.strip():
-                    raise ConfigError("Say the new instruction: --task 'pick up the cup'.")
                 return operations.set_task(source, self.task, self._chosen(source))
             case "reorder":
                 return operations.reorder(source, self.by, _numbers(self.order), descending=self.descending)
-            case "shuffle":
-                return operations.shuffle(source, self.seed)
             case _:
-                raise AssertionError(f"no plan for {self.command}")
+                return operations.shuffle(source, self.seed)
 
     def _split(self, source: Source) -> Mapping[str, Plan]:
         from demorec.datasets.editing.operations import split
 
-        if not self.shares:
-            raise ConfigError("Say the parts and their shares: --shares train=0.8 val=0.2.")
         try:
             shares = {name: float(share) for name, share in _pairs(self.shares, "train=0.8").items()}
         except ValueError as error:
@@ -289,6 +286,19 @@ class Dataset:
             length = plan.sources[cut.source].places[cut.episode].length
             if (cut.first, cut.last) != (0, length):
                 say(f"episode {cut.episode}: {cut.first} frames cut at the beginning, {length - cut.last} at the end")
+
+
+def _dataset(word: str) -> Path:
+    """The dataset that is named, a run's own where a run is; ConfigError for anything else."""
+    from demorec.runs.find import expect
+    from demorec.runs.run_file import DATASET
+
+    path = Path(word)
+    if expect(path, "dataset", "run").kind == "dataset":
+        return path
+    if not is_dataset(path / DATASET):
+        raise ConfigError(f"This run has no dataset in {DATASET}/, make one (demorec export lerobot): {path}")
+    return path / DATASET
 
 
 def scored(root: Path, *, images: bool = True, workers: int | None = None) -> list[EpisodeScore]:
