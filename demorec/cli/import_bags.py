@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
+from demorec.robots.motors import Motors, MotorUnits
 
 if TYPE_CHECKING:
     from demorec.sources.frames_writer import FramesImport
@@ -61,6 +63,12 @@ class Import:
     """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
     """Write a mapping for the first bag or HDF5 file to standard output instead of importing."""
+    motor_units: MotorUnits | None = None
+    """Of a dataset that LeRobot recorded of an SO-101 (shoulder_pan.pos to gripper.pos): the joints are in degrees, its
+    default, or from -100 to 100 of their ranges. Its recordings then have the arm's URDF and joints."""
+    calibration: Path | None = None
+    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
+    says)."""
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
     """How images are encoded that come as pixels."""
 
@@ -76,8 +84,11 @@ class Import:
             raise ConfigError(
                 "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
             )
+        motors = named_motors(self.motor_units, self.calibration)
         if self.bags[0] == _LEROBOT:
-            return self._import_dataset()
+            return self._import_dataset(motors)
+        if motors is not None:
+            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
         files = self.bags[1:] if is_hdf5 else self.bags
         if not files:
             raise ConfigError(
@@ -139,7 +150,7 @@ class Import:
         say(*(f"  {path}: {reason}" for path, reason in result.skipped.items()))
         return 1
 
-    def _import_dataset(self) -> int:
+    def _import_dataset(self, motors: Motors | None) -> int:
         if len(self.bags) != 2 or self.out is None:
             raise ConfigError(
                 "Name one dataset and --out after the word lerobot: demorec import lerobot datasets/cups --out "
@@ -150,7 +161,7 @@ class Import:
         from demorec.sources.dataset_import import import_lerobot
 
         self.video.validate()
-        _say_made(import_lerobot(self.bags[1], self.out, video=self.video), self.out)
+        _say_made(import_lerobot(self.bags[1], self.out, video=self.video, motors=motors), self.out)
         return 0
 
     def _import_hdf5(self, files: Sequence[Path], mapping: Path, out: Path) -> int:
