@@ -44,10 +44,6 @@ def import_lerobot(
     """
     expect(root, "dataset")
     dataset = LeRobotDataset(root, motors)
-    if motors is not None and motors.names not in [feature.names for feature in dataset.features]:
-        raise ConfigError(
-            f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
-        )
     if not dataset.places:
         raise ConfigError(f"The dataset has no episodes: {root}")
     if empty := [place.episode_index for place in dataset.places if place.length < 1]:

@@ -77,16 +77,21 @@ class LeRobotDataset:
         features: What its recordings have of numbers.
         keys: Camera, as recordings call it -> feature.
         left_out: What no recording can hold, by its name in the dataset -> why.
-        motors: The servos whose values its state and actions are, where the user says so and they fit.
+        motors: The servos whose values its state and actions are, where the user says so.
 
     Raises:
         ExportError: There is none, or it is damaged.
-        ConfigError: Two cameras would get one name.
+        ConfigError: Two cameras would get one name, or it has no state of the servos.
     """
 
     def __init__(self, root: Path, motors: Motors | None = None) -> None:
         self.root, self.motors = root, motors
         self.info = DatasetInfo.load(root)
+        state = self.info.features.get(STATE)
+        if motors is not None and (state is None or state.names != motors.names):
+            raise ConfigError(
+                f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
+            )
         self.places = list(episode_places(root, self.info))
         self.features: tuple[Feature, ...] = ()
         self.keys: dict[str, str] = {}
@@ -258,7 +263,8 @@ class DatasetRecording:
     @cached_property
     def info(self) -> EpisodeInfo:
         """What is known of it; its robot and cameras as the sidecar describes them."""
-        robot = self.robot if self.dataset.has_one_robot and self.known.get("robot_digest") is not None else None
+        is_told = self.known.get("robot_digest") is not None or self.dataset.motors is not None
+        robot = self.robot if self.dataset.has_one_robot and is_told else None
         links = set() if robot is None else {robot.model.root, *(joint.child for joint in robot.model.joints)}
         described = {camera["name"]: camera for camera in self.known.get("cameras") or () if camera is not None}
         cameras = [
@@ -290,15 +296,13 @@ class DatasetRecording:
 
     @cached_property
     def robot(self) -> DatasetRobot | None:
-        """The arm that the sidecar keeps, or one of ours that has joints of these names; None for neither."""
+        """The arm that the sidecar keeps, that of the named servos, or one of ours that has joints of these names."""
         if (name := self.known.get("robot_digest")) is not None:
             return self.dataset.robot(str(name))
         state = self.dataset.info.features.get(STATE)
-        if state is None or not state.names or self.known:
-            return None
-        if (motors := self.dataset.motors) is not None and state.names == motors.names:
-            return robot_of_motors(motors)
-        return recognised_robot(state.names)
+        if self.dataset.motors is not None:
+            return robot_of_motors(self.dataset.motors)
+        return recognised_robot(state.names) if state is not None and state.names and not self.known else None
 
     @cached_property
     def outcome(self) -> Outcome:
