@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,12 @@ def actions(dataset: Path) -> Array:
 def test_what_the_expert_did_succeeds_again_through_lerobots_interface(
     run: Path, dataset: Path, tmp_path: Path
 ) -> None:
-    home = {"calibration_dir": tmp_path / "calibration", "cameras": ["front"], "width": 64, "height": 48}
+    home: dict[str, Any] = {
+        "calibration_dir": tmp_path / "calibration",
+        "cameras": ["front"],
+        "width": 64,
+        "height": 48,
+    }
     config = DemorecSO101Config(**home, seed=SEED, variation="none", record=tmp_path / "recorded")
     robot = DemorecSO101(config)
     robot.connect()
@@ -63,7 +69,7 @@ def test_what_the_expert_did_succeeds_again_through_lerobots_interface(
     assert np.abs(np.array(seen) - state).max() < 0.1  # degrees, per cent; the dataset has float32
     recording = tmp_path / "recorded" / "episode_000000.mcap"
     with Recording(recording) as recorded:
-        assert recorded.outcome.success
+        assert recorded.success
         assert recorded.num_frames == len(state)
         assert recorded.info.origin == "teleoperation by LeRobot"
     assert {"fail", "warn"}.isdisjoint(result.level for result in checked(recording).results)
@@ -74,7 +80,7 @@ def test_an_own_calibration_and_other_units(dataset: Path, tmp_path: Path) -> No
     own = json.loads(CALIBRATION.read_text())
     own["elbow_flex"] |= {"range_min": 1047, "range_max": 3047}
     (tmp_path / "mine.json").write_text(json.dumps(own))
-    home = {"calibration_dir": tmp_path, "cameras": []}
+    home: dict[str, Any] = {"calibration_dir": tmp_path, "cameras": []}
     robot = DemorecSO101(DemorecSO101Config(**home, id="mine", use_degrees=False))
     robot.connect()
     robot.send_action({"elbow_flex.pos": 1.0})
@@ -125,6 +131,8 @@ def ran(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     again = ["--dataset.repo_id=local/simulated", f"--dataset.root={folder / 'simulated'}", "--dataset.episode=0"]
     pair = f"['{dataset}', '{folder / 'real'}']"
     merge = ["--operation.type=merge", "--operation.repo_ids=['local/ours', 'local/real']", f"--operation.roots={pair}"]
+    merged = ["--dataset.repo_id=local/both", f"--dataset.root={folder / 'both'}", "--dataset.episode=1"]
+    merged += ["--play_sounds=false"]
     stub = {"STUB_CALIBRATION": str(CALIBRATION)}
     run_commands(
         [
@@ -143,6 +151,7 @@ def ran(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 command="lerobot_edit_dataset",
                 args=[*merge, "--new_repo_id=local/both", f"--new_root={folder / 'both'}"],
             ),
+            Command(command="lerobot_replay", args=[*real, *merged], env=stub),
             Command(command="lerobot_replay", args=[*real, *ours], env={**stub, "STUB_LOG": str(folder / "goals.txt")}),
         ],
         folder,
@@ -156,7 +165,7 @@ slow = pytest.mark.slow
 @slow
 def test_lerobot_replay_plays_our_dataset_in_the_simulator(ran: Path, dataset: Path) -> None:
     with Recording(ran / "replayed" / "episode_000000.mcap") as recording:
-        assert recording.outcome.success
+        assert recording.success
         assert recording.num_frames == len(actions(dataset))
 
 
@@ -182,7 +191,6 @@ def test_lerobot_record_writes_what_the_recording_has(ran: Path) -> None:
         radians = recording.columns().joint_position
     assert len(state) == len(radians) > 1
     assert np.abs(state[:, :5] - np.degrees(radians[:, :5])).max() < 0.1
-    assert checked(ran / "simulated", "dataset", only=["dataset_opens"]).level == "pass"
 
 
 @slow
@@ -191,7 +199,6 @@ def test_ours_and_a_real_arms_merge_unedited(ran: Path, dataset: Path) -> None:
     assert real["robot_type"] == both["robot_type"] == info(dataset)["robot_type"] == "so101_follower"
     assert both["total_episodes"] == 2
     assert both["total_frames"] == len(actions(dataset)) + real["total_frames"]
-    assert checked(ran / "both", "dataset", only=["dataset_opens"]).level == "pass"
 
 
 @slow
