@@ -100,7 +100,7 @@ class Motors:
     """The calibrated servos of an arm.
 
     Attributes:
-        robot_type: What LeRobot calls the arm.
+        robot_type: What LeRobot calls the arm in datasets.
         motors: In LeRobot's order: those of the arm's joints, then that of the gripper's.
     """
 
@@ -138,7 +138,7 @@ class RealArm:
     """An arm as LeRobot drives it.
 
     Attributes:
-        robot_type: What LeRobot calls it.
+        robot_type: What LeRobot calls it in datasets.
         middles: Joint of the URDF, in LeRobot's order, the gripper's last -> its position, rad, in the middle of the
             range that `lerobot-calibrate` finds.
         calibration: Name of the file in `CALIBRATIONS` of an arm that is built as its URDF says.

@@ -54,7 +54,7 @@ SO101 = RobotSpec(
 )
 
 SO101_FOLLOWER = RealArm(
-    robot_type="so101_follower",
+    robot_type="so_follower",
     middles={
         "shoulder_pan": 0.0,
         "shoulder_lift": 0.0,
@@ -65,6 +65,7 @@ SO101_FOLLOWER = RealArm(
     },
     calibration="so101_urdf.json",
 )
-"""The URDF's zeros lie in the middle of what its joints can turn, between the stops that `lerobot-calibrate` (0.6.1)
+"""`lerobot-record --robot.type=so101_follower` (0.6.1) writes this robot type, the name of the class that drives SO-100
+and SO-101 alike. The URDF's zeros lie in the middle of what its joints can turn, between the stops that `lerobot-calibrate`
 finds; the roll turns all around, and is set to its zero by hand. LeRobot's own kinematics take such degrees for angles
 of this URDF. Of an arm that is built so, the servos are set to 2047 there, and their ranges are the URDF's limits."""

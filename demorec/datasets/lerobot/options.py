@@ -23,7 +23,7 @@ class ExportOptions(CommonOptions):
     """What observation.state holds: joint (joint positions, gripper opening), joint_ee (behind them the TCP's pose, for
     policies that look at this vector alone, such as LeRobot's ACT)."""
     motor_units: MotorUnits | None = None
-    """Of the SO-101: what LeRobot records of the real arm (robot type so101_follower), and nothing else: images, and as
+    """Of the SO-101: what lerobot-record writes of the real arm (so101_follower), and nothing else: images, and as
     state and action the joints in degrees, or from -100 to 100 of their ranges (range_m100_100, as LeRobot without
     use_degrees), and the gripper from 0 to 100 (docs/robots.md)."""
     calibration: Path | None = None
