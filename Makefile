@@ -42,7 +42,7 @@ lint: $(STAMP)
 setup: $(STAMP)
 
 # What is installed stays; a change of what it was made from, or of PYBULLET, sets up again.
-$(STAMP): pyproject.toml constraints.txt .python-version
+$(STAMP): pyproject.toml constraints.txt .python-version $(wildcard plugins/*/pyproject.toml)
 	@tools/setup.sh $(@:.venv/.stamp-%=%)
 
 # The versions that are installed now become the pinned ones (names and versions only).

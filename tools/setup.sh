@@ -66,11 +66,13 @@ if [ -z "$uv" ]; then
   fi
 fi
 echo "Setting up .venv/ (the first time 7 GB with PyTorch and LeRobot; $how)"
+plugins=()
+for folder in plugins/*/; do plugins+=(-e "$folder"); done
 [ -x .venv/bin/python ] || quietly "$uv" venv --allow-existing .venv
 rm -f .venv/.stamp*
 # Both have the same files: one that is there would take those of the other along when it goes.
 quietly "$uv" pip uninstall -p .venv $other
-quietly "$uv" pip install -p .venv -c constraints.txt -e . --group dev "${arguments[@]}"
+quietly "$uv" pip install -p .venv -c constraints.txt -e . --group dev "${arguments[@]}" "${plugins[@]}"
 quietly .venv/bin/python -c "import pybullet"
 echo "Compiling the renderer for this machine"
 echo "Warming" >>"$log"

@@ -30,7 +30,7 @@ from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode, spoken_of
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, RowStream, episode_places, read_tasks
-from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
+from demorec.datasets.lerobot.robots import DatasetRobot, read_robot, robot_of_motors
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.episode.features import (
     ACTION,
@@ -47,6 +47,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 from demorec.render.recorded import RecordedWorld
 from demorec.robots.assets import asset_path
+from demorec.robots.motors import Motors
 from demorec.robots.urdf import Urdf
 
 Rows = Mapping[str, NDArray[Any]]
@@ -88,14 +89,15 @@ class Dataset:
     Args:
         path: Its folder.
         urdf: Text of its robot's description that the user names, "" for none.
+        motors: The servos whose values its state and actions are, if the user says so.
     """
 
     form: ClassVar[Form] = "dataset"
     has_equal_starts: ClassVar[bool] = False
     """Nobody says so."""
 
-    def __init__(self, path: Path, urdf: str = "") -> None:
-        self.path, self.urdf = path, urdf
+    def __init__(self, path: Path, urdf: str = "", motors: Motors | None = None) -> None:
+        self.path, self.urdf, self.motors = path, urdf, motors
         self._pictures: dict[str, list[EpisodePictures]] = {}
 
     @cached_property
@@ -143,7 +145,10 @@ class Dataset:
 
     @property
     def _arms(self) -> dict[int, DatasetRobot]:
-        """Episode -> its arm, where the sidecar has it."""
+        """Episode -> its arm, where the sidecar has it or the user has named its servos."""
+        names = self.info.features[STATE].names if STATE in self.info.features else None
+        if self.motors is not None and names == self.motors.names:
+            return dict.fromkeys(range(len(self.places)), robot_of_motors(self.motors))
         return {number: self.robots[name] for number, name in self.robot_digests.items() if name is not None}
 
     def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:

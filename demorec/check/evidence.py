@@ -21,7 +21,7 @@ from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
 from demorec.episode.episode import Columns
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.info import EpisodeInfo, Feature
 from demorec.robots.urdf import Urdf
 
 EFFORT = "observation.effort"
@@ -139,8 +139,7 @@ def motion_of_recording(info: EpisodeInfo, columns: Columns, urdf: str) -> Motio
         "",
         info.fps,
         columns.features,
-        {name: feature.names for name, feature in described.items()},
-        units={name: feature.units for name, feature in described.items()},
+        described,
         arm=_arm(state.names, urdf or info.urdf, state.joints),
         time_ns=columns.time_ns,
     )
@@ -153,21 +152,22 @@ def motions_of_dataset(
     features = info.features
     if STATE not in features or features[STATE].dtype not in ("float32", "float64"):
         return
-    names = {
-        name: feature.names or tuple(map(str, range(feature.shape[0])))
+    described = {
+        name: Feature(name=name, names=feature.names or tuple(map(str, range(feature.shape[0]))))
         for name, feature in features.items()
         if feature.is_numeric and len(feature.shape) == 1
     }
-    stranger = _arm(names[STATE], urdf)
+    stranger = _arm(described[STATE].names, urdf)
     for number, rows in enumerate(rows_of):
         robot = robots.get(number)
         where = f"episode {number}"
         if robot is None:
-            yield _motion(where, info.fps, rows, names, arm=stranger)
+            yield _motion(where, info.fps, rows, described, arm=stranger)
             continue
         spec, arm = robot.record.spec, _Arm.of(robot)
         opening = math.inf if spec is None else spec.gripper.max_width
-        motion = _motion(where, info.fps, rows, names, units=robot.record.units, arm=arm, opening=opening)
+        known = {name: robot.record.described(feature) for name, feature in described.items()}
+        motion = _motion(where, info.fps, rows, known, arm=arm, opening=opening)
         yield motion if spec is None else replace(motion, tcp_link=spec.tcp_link)
 
 
@@ -175,7 +175,8 @@ def motion_of_features(
     features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]], fps: float, urdf: str = ""
 ) -> Motion:
     """Of arrays alone, one an element of `names`; by the URDF, or by the robot whose joints the state's names are."""
-    return _motion("", fps, features, names, arm=_arm(names[STATE], urdf))
+    described = {name: Feature(name=name, names=tuple(elements)) for name, elements in names.items()}
+    return _motion("", fps, features, described, arm=_arm(names[STATE], urdf))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,14 +215,14 @@ def _motion(
     where: str,
     fps: float,
     features: Mapping[str, NDArray[Any]],
-    names: Mapping[str, Sequence[str]],
+    described: Mapping[str, Feature],
     *,
     arm: _Arm,
-    units: Mapping[str, Sequence[str]] | None = None,
     opening: float = math.inf,
     time_ns: NDArray[np.int64] | None = None,
 ) -> Motion:
-    state, elements = features[STATE].astype(np.float64), names[STATE]
+    names = {name: feature.names for name, feature in described.items()}
+    elements = names[STATE]
     tree = {} if arm.urdf is None else {joint.name: joint for joint in arm.urdf.joints}
     found = [tree.get(joint) for joint in arm.joints] or [None] * len(elements)
     lower = np.array([-math.inf if joint is None else joint.lower for joint in found])
@@ -230,17 +231,17 @@ def _motion(
         place = list(elements).index(GRIPPER)
         lower[place], upper[place] = 0.0, opening
 
-    def factor(feature: str) -> Array:
-        """(D,) from the feature's own units: a leader may tell degrees of an arm that tells rad."""
-        known = (units or {}).get(feature, ())
-        degrees = [math.radians(1) if unit in ("deg", "degree") else 1.0 for unit in known]
-        return np.array(degrees if len(degrees) == len(names[feature]) else [1.0] * len(names[feature]))
+    def in_si(feature: str) -> Array:
+        """By the feature's own units: a leader may tell degrees of an arm that tells rad."""
+        return described[feature].in_si(features[feature])
+
+    state = in_si(STATE)
 
     def alike(feature: str) -> Array | None:
         """The elements of another feature that have the names of the state's, or all of as many without names."""
         if feature not in features or feature not in names:
             return None
-        values, theirs = features[feature].astype(np.float64) * factor(feature), names[feature]
+        values, theirs = in_si(feature), names[feature]
         places = {_SUFFIX.sub("", name): index for index, name in enumerate(theirs)}
         columns = [places.get(_SUFFIX.sub("", name)) for name in elements]
         if all(column is None for column in columns):
@@ -253,7 +254,7 @@ def _motion(
         fps=fps,
         steps_s=np.full(len(state) - 1, 1 / fps) if time_ns is None else np.maximum(np.diff(time_ns) / 1e9, 0.5 / fps),
         names=tuple(elements),
-        state=state * factor(STATE),
+        state=state,
         velocity=alike(VELOCITY),
         action=alike(ACTION),
         effort=alike(EFFORT),

@@ -18,6 +18,7 @@ from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
 from demorec.episode.info import EpisodeInfo
 from demorec.robots.assets import allow_models, modules_of_models
+from demorec.robots.motors import Motors
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
@@ -76,6 +77,7 @@ class CheckOptions:
         workers: Processes; 1 works in this one.
         allowed: The user's own modules beside which models of robots may be read.
         urdf: Text of the description of the robot, for recordings and datasets that do not have one; "" for none.
+        motors: The servos whose values LeRobot recorded in datasets with elements of their names.
     """
 
     pictures: bool = True
@@ -83,6 +85,7 @@ class CheckOptions:
     workers: int = 1
     allowed: tuple[str, ...] = ()
     urdf: str = ""
+    motors: Motors | None = None
 
     def validate(self) -> None:
         """Raise ConfigError for unknown names or impossible numbers."""
@@ -213,7 +216,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         found = _run(options, run, (), lambda: None)
         scene = ("run",) if run.form == "external run" else ()
     else:
-        dataset = Dataset(subject.path, options.urdf)
+        dataset = Dataset(subject.path, options.urdf, options.motors)
         found = _run(options, dataset, ("dataset_readable",), lambda: dataset.rows)
         if any(result.needs_allow for result in found):
             infos = [info for info in dataset.infos if info]

@@ -13,11 +13,13 @@ from tyro.conf import Positional
 
 from demorec.cli.replay import demonstrations, told
 from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths, places_read, reading, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, OptionError, in_words
 from demorec.core.replacing import PICTURE, check_replaceable
+from demorec.robots.motors import MotorUnits
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
@@ -44,6 +46,7 @@ class Check:
       demorec check recordings/cubes --no-pictures --strict
       demorec check datasets/cubes --json
       demorec check monday.mcap --mapping robot.toml
+      demorec check datasets/so101_cups --motor-units degrees
       demorec check recordings/cubes --replay 5
       demorec check recordings/cubes/episodes/episode_000007.mcap --deep
     """
@@ -60,6 +63,12 @@ class Check:
     urdf: Path | None = None
     """The robot's description, for recordings and datasets that lack one: its joints are the state's elements by
     their names, or by their order."""
+    motor_units: MotorUnits | None = None
+    """Of datasets that LeRobot recorded of an SO-101 (shoulder_pan.pos to gripper.pos): the joints are in degrees, its
+    default, or from -100 to 100 of their ranges. It does not say so itself."""
+    calibration: Path | None = None
+    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
+    says)."""
     strict: bool = False
     """Warnings count as failures."""
     replay: int = 0
@@ -104,7 +113,12 @@ class Check:
         if workers is None:
             workers = useful_workers(subjects, pictures=self.pictures, cores=available_cores())
         options = CheckOptions(
-            pictures=self.pictures, only=self.only, workers=workers, allowed=allowed, urdf=self._description()
+            pictures=self.pictures,
+            only=self.only,
+            workers=workers,
+            allowed=allowed,
+            urdf=self._description(),
+            motors=named_motors(self.motor_units, self.calibration),
         )
         options.validate()
         reports, replays = [], []

@@ -9,11 +9,13 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
+from demorec.robots.motors import MotorUnits
 from demorec.sources.formats import FORMATS, SourceFormat
 
 MAX_WORKERS = 1000
@@ -57,6 +59,12 @@ class Import:
     """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
     """Write a mapping for the first bag or HDF5 file to standard output instead of importing."""
+    motor_units: MotorUnits | None = None
+    """Of a dataset that LeRobot recorded of an SO-101 (shoulder_pan.pos to gripper.pos): the joints are in degrees, its
+    default, or from -100 to 100 of their ranges. Its recordings then have the arm's URDF and joints."""
+    calibration: Path | None = None
+    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
+    says)."""
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
     """How images are encoded that come as pixels."""
 
@@ -70,6 +78,8 @@ class Import:
         word = str(self.bags[0])
         if word in FORMATS:
             return self._import_frames(word, FORMATS[word], self.bags[1:])
+        if self.motor_units is not None or self.calibration is not None:
+            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
         from demorec.sources.bag import bags_in, open_bag
 
         if self.suggest:
@@ -88,6 +98,9 @@ class Import:
             raise ConfigError(
                 "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
             )
+        motors = named_motors(self.motor_units, self.calibration)
+        if motors is not None and not form.has_motor_units:
+            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
         example = f"demorec import {word} {form.example}"
         if not paths:
             raise ConfigError(
@@ -103,7 +116,7 @@ class Import:
         if self.out is None:
             raise ConfigError(f"An import needs --out: {example}.")
         self.video.validate()
-        result = form.read(paths, self.mapping, self.out, self.video)
+        result = form.read(paths, self.mapping, self.out, self.video, motors)
         say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:
             tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")

@@ -32,6 +32,7 @@ from demorec.episode.features import (
     observation_names,
     observation_vectors,
 )
+from demorec.episode.info import Feature
 from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.mcap import Recording, channels
 
@@ -139,18 +140,15 @@ class ExportEpisode:
         is_described = not self.info.urdf and channels.description_topic() in recording.topics
         return recording.description() if is_described else self.info.urdf
 
-    def joints(self) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
-        """Of features that have any: for each element the joint of the URDF of which it is the position, "" for none;
-        and the units of the elements, where they are known.
-        """
+    def moving(self) -> tuple[Feature, ...]:
+        """The features that have joints of the URDF: which of their elements are the positions of which, and units."""
         if self.info.simulation is None:
-            moving = [feature for feature in self.info.features if any(feature.joints)]
-            units = {feature.name: feature.units for feature in moving if feature.units}
-            return {feature.name: feature.joints for feature in moving}, units
+            return tuple(feature for feature in self.info.features if any(feature.joints))
         arm = self.info.robot.arm_joints
         pose = ("m",) * 3 + ("",) * 4 if self._state == "joint_ee" else ()
-        joints = (*arm, *("" for _ in self.names[STATE][len(arm) :]))
-        return {STATE: joints}, {STATE: (*("rad" for _ in arm), "m", *pose)}
+        names = self.names[STATE]
+        joints = (*arm, *("" for _ in names[len(arm) :]))
+        return (Feature(name=STATE, names=names, joints=joints, units=(*("rad" for _ in arm), "m", *pose)),)
 
     def described_cameras(self) -> list[dict[str, Any]]:
         """What is known of each camera of the recording: name, width, height, intrinsics (K, row by row), mount,

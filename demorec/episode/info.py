@@ -6,15 +6,17 @@ is known but what came: vectors and images, each with the stamp of its own clock
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.errors import NotSimulatedError
-from demorec.core.geometry import Pose
-from demorec.core.plain import PartValue, write_optional_part
+from demorec.core.geometry import Array, Pose
+from demorec.core.plain import PartValue, leave_out_defaults, write_optional_part
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
 
@@ -39,8 +41,10 @@ class Feature:
         names: Of its elements; there are D.
         units: Of its elements ("rad", "deg", "m"), or none where they are unknown.
         joints: For each element the joint of the URDF of which it is the position ("" for none); empty where none is.
-            Positions are in rad and m, or in degrees where the unit is "deg".
+            Positions are in rad and m, or in degrees where the unit is "deg", unless there is a calibration.
         source: Where it came from, in words: "/joint_states position, latest before, header stamps".
+        calibration: For each element a factor and an offset: factor times the value plus offset is rad or m, of servos
+            that say something else; empty where the unit says it.
     """
 
     name: str
@@ -49,6 +53,18 @@ class Feature:
     units: tuple[str, ...] = ()
     joints: tuple[str, ...] = ()
     source: str = ""
+    calibration: tuple[tuple[float, float], ...] = ()
+
+    def in_si(self, values: NDArray[Any]) -> Array:
+        """(..., D) float64 of values (..., D): positions in rad and m, the rest as it is."""
+        degree = (math.radians(1.0), 0.0)
+        units = self.units or ("",) * len(self.names)
+        scale = self.calibration or [degree if unit in ("deg", "degree") else (1.0, 0.0) for unit in units]
+        factor, offset = np.array(scale).T
+        return np.asarray(values.astype(np.float64) * factor + offset)
+
+
+leave_out_defaults(Feature, "calibration")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -247,7 +247,8 @@ def _feature(feature: Feature, joints: frozenset[str]) -> Iterator[str]:
     if not 1 <= count <= _MAX_ELEMENTS:
         yield f"the feature {name!r} has {count} elements, allowed are 1 to {_MAX_ELEMENTS}"
     yield from _unique(f"elements of the feature {name!r}", feature.names, commas=False)
-    for what, words in (("units", feature.units), ("joints", feature.joints)):
+    parts = (("units", feature.units), ("joints", feature.joints), ("calibrations", feature.calibration))
+    for what, words in parts:
         if words and len(words) != count:
             yield f"the feature {name!r} has {count} elements, but {len(words)} {what}"
     named = [joint for joint in feature.joints if joint]

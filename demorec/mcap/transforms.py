@@ -153,19 +153,18 @@ class JointPositions:
     """
 
     def __init__(self, features: Sequence[Feature]) -> None:
-        places: dict[str, tuple[str, int, float]] = {}
+        places: dict[str, tuple[Feature, int]] = {}
         for feature in features:
             if feature.name.partition(".")[0] != "observation":
                 continue
-            units = feature.units or ("",) * len(feature.names)
-            for index, (joint, unit) in enumerate(zip(feature.joints, units, strict=False)):
+            for index, joint in enumerate(feature.joints):
                 if joint:
-                    factor = math.radians(1.0) if unit == "deg" else 1.0
-                    places.setdefault(joint, (feature.name, index, factor))
+                    places.setdefault(joint, (feature, index))
         self.joints = tuple(places)
         self._places = tuple(places.values())
+        self._features = tuple({feature.name: feature for feature, _ in self._places}.values())
 
     def of(self, features: Mapping[str, Vector]) -> Array:
         """(..., n) rad or m, from features (..., D)."""
-        columns = [features[name][..., index] * factor for name, index, factor in self._places]
-        return np.stack(columns, axis=-1).astype(np.float64)
+        values = {feature.name: feature.in_si(features[feature.name]) for feature in self._features}
+        return np.stack([values[feature.name][..., index] for feature, index in self._places], axis=-1)

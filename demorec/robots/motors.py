@@ -1,56 +1,106 @@
 """What the servos of a real arm say: their calibration, and from positions of joints to the values that LeRobot gives.
 
-LeRobot reads counts of a servo's encoder and makes degrees of them, centred on the servo's calibrated range, or the
-share of that range in per cent (`MotorsBus` with `DEGREES` and `RANGE_0_100`).
+LeRobot reads counts of a servo's encoder and makes degrees of them, centred on the servo's calibrated range, or a share
+of that range: from -100 to 100, of grippers from 0 to 100 (`MotorsBus._normalize`, `MotorNormMode`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from demorec.core.errors import ConfigError, in_words
+from demorec.core.files import read_text_limited
 from demorec.core.geometry import Array
+from demorec.core.plain import from_plain, listed, parse_json
 
 COUNTS = 4096
 """Of the encoder in a turn."""
+MotorUnits = Literal["degrees", "range_m100_100"]
+"""Of an arm's joints, as LeRobot calls them: with `use_degrees` (its default) and without."""
+CALIBRATIONS = Path(__file__).with_name("calibration")
+"""Where the calibrations are that come with the robots."""
+_MAX_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorCalibration:
+    """What `lerobot-calibrate` finds of a servo: its entry in the file that LeRobot saves.
+
+    Attributes:
+        id: On the bus.
+        drive_mode: 1 where shares of the range run against the encoder, else 0.
+        homing_offset: What the servo itself takes off its counts.
+        range_min, range_max: Calibrated range, counts.
+    """
+
+    id: int
+    drive_mode: int
+    homing_offset: int
+    range_min: int
+    range_max: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motor:
-    """A servo and its calibration.
+    """A servo in a real arm.
 
     Attributes:
         joint: Of the URDF; also the servo's name.
-        zero: Count at the joint's zero; counts grow with the joint's position.
-        range_min, range_max: Calibrated range, counts, as in LeRobot's file of a calibration.
-        unit: Degrees from the middle of the range, or per cent of it, which never leave 0 to 100.
+        middle: Position of the joint in the middle of the calibrated range, rad; counts grow with the position.
+        units: How LeRobot gives its position.
+        calibration: Of it.
     """
 
     joint: str
-    zero: int
-    range_min: int
-    range_max: int
-    unit: Literal["deg", "%"] = "deg"
+    middle: float
+    units: MotorUnits | Literal["range_0_100"]
+    calibration: MotorCalibration
+
+    @property
+    def to_position(self) -> tuple[float, float]:
+        """Factor and offset: factor times what LeRobot says, plus the offset, is the joint's position, rad."""
+        zero, unit = self._scale
+        step = 2 * math.pi / COUNTS
+        return step / unit, step * (zero - self._count_at_zero)
 
     def value(self, position: Array) -> Array:
-        """What LeRobot says of positions (...), rad, before the encoder rounds them: degrees or per cent."""
-        count = self.zero + position * (COUNTS / (2 * math.pi))
-        if self.unit == "deg":
+        """What LeRobot says of positions (...), rad, before the encoder rounds them."""
+        zero, unit = self._scale
+        value = (self._count_at_zero + position * (COUNTS / (2 * math.pi)) - zero) * unit
+        if self.units == "degrees":
+            return np.asarray(value)
+        return np.clip(value, 0.0 if self.units == "range_0_100" else -100.0, 100.0)
+
+    @property
+    def _count_at_zero(self) -> int:
+        """Count at the joint's zero."""
+        return (self.calibration.range_min + self.calibration.range_max) // 2 - round(self.middle / math.tau * COUNTS)
+
+    @property
+    def _scale(self) -> tuple[float, float]:
+        """At which count LeRobot says 0, and how much each count adds."""
+        low, high = self.calibration.range_min, self.calibration.range_max
+        if self.units == "degrees":
             # A turn has one step less here than it has counts: so LeRobot has it.
-            return np.asarray((count - (self.range_min + self.range_max) / 2) * (360 / (COUNTS - 1)))
-        share = (count - self.range_min) / (self.range_max - self.range_min)
-        return np.asarray(np.clip(share, 0.0, 1.0) * 100)
+            return (low + high) / 2, 360 / (COUNTS - 1)
+        sign = -1 if self.calibration.drive_mode else 1
+        if self.units == "range_m100_100":
+            return (low + high) / 2, sign * 200 / (high - low)
+        return (high if sign < 0 else low), sign * 100 / (high - low)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RealArm:
-    """An arm as LeRobot drives it.
+class Motors:
+    """The calibrated servos of an arm.
 
     Attributes:
-        robot_type: What LeRobot calls it.
+        robot_type: What LeRobot calls the arm in datasets.
         motors: In LeRobot's order: those of the arm's joints, then that of the gripper's.
     """
 
@@ -62,7 +112,81 @@ class RealArm:
         """Of the elements of state and action."""
         return tuple(f"{motor.joint}.pos" for motor in self.motors)
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Of the URDF, in the same order."""
+        return tuple(motor.joint for motor in self.motors)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of the elements: "deg", or "%" of the calibrated range or of its half."""
+        return tuple("deg" if motor.units == "degrees" else "%" for motor in self.motors)
+
+    @property
+    def to_positions(self) -> tuple[tuple[float, float], ...]:
+        """Factor and offset of each, as `Motor.to_position`."""
+        return tuple(motor.to_position for motor in self.motors)
+
     def values(self, joint_position: Array) -> Array:
-        """(T, D) degrees and per cent of (T, D) positions, rad, in the order of the motors."""
+        """(T, D) values of LeRobot of (T, D) positions, rad, in the order of the motors."""
         columns = zip(self.motors, joint_position.T, strict=True)
         return np.stack([motor.value(position) for motor, position in columns], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealArm:
+    """An arm as LeRobot drives it.
+
+    Attributes:
+        robot_type: What LeRobot calls it in datasets.
+        middles: Joint of the URDF, in LeRobot's order, the gripper's last -> its position, rad, in the middle of the
+            range that `lerobot-calibrate` finds.
+        calibration: Name of the file in `CALIBRATIONS` of an arm that is built as its URDF says.
+    """
+
+    robot_type: str
+    middles: Mapping[str, float]
+    calibration: str
+
+    def motors(self, units: MotorUnits = "degrees", calibration: Path | None = None) -> Motors:
+        """The servos, by a calibration that LeRobot saved, or by that of an arm that is built as its URDF says.
+
+        Raises:
+            ConfigError: The file is no calibration of such an arm.
+        """
+        path = calibration or CALIBRATIONS / self.calibration
+        found, (*_, gripper) = read_calibration(path, tuple(self.middles)), self.middles
+        motors = [
+            Motor(
+                joint=joint,
+                middle=middle,
+                units="range_0_100" if joint == gripper else units,
+                calibration=found[joint],
+            )
+            for joint, middle in self.middles.items()
+        ]
+        return Motors(robot_type=self.robot_type, motors=tuple(motors))
+
+
+def read_calibration(path: Path, names: tuple[str, ...]) -> dict[str, MotorCalibration]:
+    """Motor -> its entry in a file that LeRobot saved; ConfigError for what is no calibration of motors so called."""
+    try:
+        entries = parse_json(read_text_limited(path, _MAX_BYTES))
+        if not isinstance(entries, dict) or set(entries) != set(names):
+            had = listed(map(repr, entries), separator=", ") if isinstance(entries, dict) and entries else "none"
+            raise ValueError(f"it has the motors {had}, expected are {', '.join(names)}")
+        found = {name: from_plain(entries[name], MotorCalibration) for name in names}
+        for name, motor in found.items():
+            if not 0 <= motor.range_min < motor.range_max < COUNTS:
+                raise ValueError(
+                    f"the range of {name} is {motor.range_min} to {motor.range_max}, expected are two counts from 0 to "
+                    f"{COUNTS - 1} that rise"
+                )
+            if motor.drive_mode not in (0, 1):
+                raise ValueError(f"the drive_mode of {name} is {motor.drive_mode}, allowed are 0 and 1")
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"This is no calibration that LeRobot saved ({in_words(error)}): {path}; lerobot-calibrate writes one, "
+            "below ~/.cache/huggingface/lerobot/calibration/robots."
+        ) from error
+    return found

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from demorec.robots.motors import Motor, RealArm
+from demorec.robots.motors import RealArm
 from demorec.robots.robot import JawGripper, RobotSpec
 
 STALL_TORQUE = 19.5e-2 * 9.80665
@@ -54,16 +54,18 @@ SO101 = RobotSpec(
 )
 
 SO101_FOLLOWER = RealArm(
-    robot_type="so101_follower",
-    motors=(
-        Motor(joint="shoulder_pan", zero=2047, range_min=795, range_max=3299),
-        Motor(joint="shoulder_lift", zero=2047, range_min=909, range_max=3185),
-        Motor(joint="elbow_flex", zero=2047, range_min=945, range_max=3149),
-        Motor(joint="wrist_flex", zero=2047, range_min=966, range_max=3128),
-        Motor(joint="wrist_roll", zero=2047, range_min=0, range_max=4095),
-        Motor(joint="gripper", zero=1535, range_min=1421, range_max=2673, unit="%"),
-    ),
+    robot_type="so_follower",
+    middles={
+        "shoulder_pan": 0.0,
+        "shoulder_lift": 0.0,
+        "elbow_flex": 0.0,
+        "wrist_flex": 0.0,
+        "wrist_roll": 0.0,
+        "gripper": math.pi / 4,
+    },
+    calibration="so101_urdf.json",
 )
-"""The calibration of an arm that is built as the URDF says, as `lerobot-calibrate` (0.6.1) would find it: in the middle
-of their ranges, where the URDF has the arm's zeros (0.785 rad of the jaw), all servos are set to 2047; ranges are the
-URDF's limits, but a whole turn of the roll. LeRobot's own kinematics take such degrees for angles of this URDF."""
+"""`lerobot-record --robot.type=so101_follower` (0.6.1) writes this robot type, the name of the class that drives SO-100
+and SO-101 alike. The URDF's zeros lie in the middle of what its joints can turn, between the stops that
+`lerobot-calibrate` finds; the roll turns all around, and is set to its zero by hand. LeRobot's own kinematics take such degrees for angles
+of this URDF. Of an arm that is built so, the servos are set to 2047 there, and their ranges are the URDF's limits."""

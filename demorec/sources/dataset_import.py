@@ -18,27 +18,32 @@ from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.videos import why_transcoded
 from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
+from demorec.robots.motors import Motors
 from demorec.runs.external import open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
 from demorec.sources.frames_writer import FramesImport, Picture, importing_versions, write_frames
 
 
-def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -> FramesImport:
+def import_lerobot(
+    root: Path, out: Path, *, video: VideoConfig | None = None, motors: Motors | None = None
+) -> FramesImport:
     """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, whoever wrote it, into a run.
 
     Args:
         root: The dataset's folder.
         out: The run's folder; one that the same dataset began is continued.
         video: How images are encoded whose packets cannot pass through.
+        motors: The servos whose values LeRobot recorded as state and action.
 
     Raises:
-        ConfigError: This is no dataset, it has what no recording can hold, or the folder holds something else.
+        ConfigError: This is no dataset, not one of these servos, it has what no recording can hold, or the folder holds
+            something else.
         ExportError: It is damaged, or not at its rate.
         RecordingError: A number is not finite, or the disk is full.
     """
     expect(root, "dataset")
-    dataset = LeRobotDataset(root)
+    dataset = LeRobotDataset(root, motors)
     if not dataset.places:
         raise ConfigError(f"The dataset has no episodes: {root}")
     if empty := [place.episode_index for place in dataset.places if place.length < 1]:

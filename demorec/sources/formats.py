@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
+from demorec.robots.motors import Motors
 from demorec.runs.find import PathKind
 from demorec.sources.mapping import SourceKind
 
@@ -27,29 +28,35 @@ class SourceFormat:
         kind: What `demorec.runs.find` takes them for.
         name: In a sentence.
         example: What follows `demorec import` and the format's word.
-        read: (paths, mapping, out, how pixels are encoded) -> what was made. The run `out` is made or continued.
-            Heavy imports stand in it. Raises DemorecError.
+        read: (paths, mapping, out, how pixels are encoded, what its numbers are) -> what was made. The run `out` is
+            made or continued. Heavy imports stand in it. Raises DemorecError.
         mapping: Whose keys its mappings have; None where it needs none.
+        has_motor_units: Whether its numbers may be those of an arm's servos.
         suggest: Path -> the lines of a mapping, where it needs one.
     """
 
     kind: PathKind
     name: str
     example: str
-    read: Callable[[Sequence[Path], Path | None, Path, VideoConfig], FramesImport]
+    read: Callable[[Sequence[Path], Path | None, Path, VideoConfig, Motors | None], FramesImport]
     mapping: SourceKind | None = None
+    has_motor_units: bool = False
     suggest: Callable[[Path], list[str]] = lambda path: []
 
 
-def _read_lerobot(paths: Sequence[Path], mapping: Path | None, out: Path, video: VideoConfig) -> FramesImport:
+def _read_lerobot(
+    paths: Sequence[Path], mapping: Path | None, out: Path, video: VideoConfig, motors: Motors | None
+) -> FramesImport:
     from demorec.sources.dataset_import import import_lerobot
 
     if len(paths) != 1:
         raise ConfigError(f"One dataset becomes one run, given are {len(paths)}: import them one by one.")
-    return import_lerobot(paths[0], out, video=video)
+    return import_lerobot(paths[0], out, video=video, motors=motors)
 
 
-def _read_hdf5(paths: Sequence[Path], mapping: Path | None, out: Path, video: VideoConfig) -> FramesImport:
+def _read_hdf5(
+    paths: Sequence[Path], mapping: Path | None, out: Path, video: VideoConfig, motors: Motors | None
+) -> FramesImport:
     from demorec.sources.hdf5_import import import_hdf5
 
     assert mapping is not None, "whoever calls asks for it"
@@ -68,6 +75,7 @@ FORMATS: Mapping[str, SourceFormat] = {
         name="a LeRobot dataset",
         example="datasets/cups --out runs/cups",
         read=_read_lerobot,
+        has_motor_units=True,
     ),
     "hdf5": SourceFormat(
         kind="hdf5",

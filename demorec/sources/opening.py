@@ -68,7 +68,7 @@ def opened(
             if _needs_mapping(kind):
                 chosen = mapping or _suggested(path, kind, Path(folder) / f"{number}.toml", tell)
             if kind in WORD_OF:
-                for line in FORMATS[WORD_OF[kind]].read([path], chosen, run, VideoConfig()).left_out_lines():
+                for line in FORMATS[WORD_OF[kind]].read([path], chosen, run, VideoConfig(), None).left_out_lines():
                     tell(line)
             elif chosen is not None:
                 _import_bag(path, chosen, run, tell)

@@ -31,6 +31,7 @@ def checkout(tmp_path: Path) -> Path:
     (tmp_path / "tools").mkdir()
     for name in ("Makefile", "pyproject.toml", "constraints.txt", ".python-version", "tools/setup.sh"):
         shutil.copy(ROOT / name, tmp_path / name)
+    shutil.copytree(ROOT / "plugins", tmp_path / "plugins")
     programs = tmp_path / "programs"
     programs.mkdir()
     for name in (*PROGRAMS, "chmod"):
@@ -55,6 +56,8 @@ def test_without_a_compiler_a_fork_takes_pybullets_place(checkout: Path) -> None
     assert uninstalled.split()[:2] == ["pip", "uninstall"]
     assert uninstalled.split()[-1] == "pybullet"  # whose files the fork has, too
     assert "pybullet-arm64==3.2.8" in installed.split()
+    for plugin in (ROOT / "plugins").iterdir():
+        assert f"-e plugins/{plugin.name}/" in installed
     needed = Requirement((checkout / "override").read_text())  # instead of what demorec itself asks for
     assert needed.name == "pybullet"
     assert needed.marker is not None

@@ -27,6 +27,7 @@ from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import decoded_images, frames_of
+from demorec.robots.motors import Motors
 from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
 from support.mcap import metadata_of
 
@@ -69,9 +70,17 @@ def simulate_run(folder: Path, num_episodes: int, **config: Any) -> Path:
     return folder
 
 
-def checked(path: Path, kind: str = "recording", *, only: Sequence[str] = (), pictures: bool = True) -> SubjectReport:
+def checked(
+    path: Path,
+    kind: str = "recording",
+    *,
+    only: Sequence[str] = (),
+    pictures: bool = True,
+    motors: Motors | None = None,
+) -> SubjectReport:
     """The report of some checks, or of all."""
-    return check_subject(Subject(path=path, kind=kind), CheckOptions(only=tuple(only), pictures=pictures))  # type: ignore[arg-type]
+    options = CheckOptions(only=tuple(only), pictures=pictures, motors=motors)
+    return check_subject(Subject(path=path, kind=kind), options)  # type: ignore[arg-type]
 
 
 def level_of(path: Path, check: str, kind: str = "recording") -> str:

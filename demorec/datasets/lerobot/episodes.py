@@ -33,7 +33,7 @@ from demorec.datasets.lerobot.language import COLUMNS, PERSISTENT, SpokenEpisode
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, RowStream, episode_places, read_tasks
-from demorec.datasets.lerobot.robots import DatasetRobot, read_robot, recognised_robot
+from demorec.datasets.lerobot.robots import DatasetRobot, read_robot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages, codec_of, opened_video
 from demorec.episode.episode import Columns, Outcome, frame_time_ns
@@ -41,6 +41,7 @@ from demorec.episode.features import DEPTH_SUFFIX, IMAGE_PREFIX, STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Kept, Origin
 from demorec.mcap.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
+from demorec.robots.motors import Motors
 
 _SUCCESS, _EPISODE = "next.success", "episode_index"
 _TIME_TOLERANCE_S = 1e-4
@@ -76,15 +77,21 @@ class LeRobotDataset:
         features: What its recordings have of numbers.
         keys: Camera, as recordings call it -> feature.
         left_out: What no recording can hold, by its name in the dataset -> why.
+        motors: The servos whose values its state and actions are, where the user says so.
 
     Raises:
         ExportError: There is none, or it is damaged.
-        ConfigError: Two cameras would get one name.
+        ConfigError: Two cameras would get one name, or it has no state of the servos.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    def __init__(self, root: Path, motors: Motors | None = None) -> None:
+        self.root, self.motors = root, motors
         self.info = DatasetInfo.load(root)
+        state = self.info.features.get(STATE)
+        if motors is not None and (state is None or state.names != motors.names):
+            raise ConfigError(
+                f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
+            )
         self.places = list(episode_places(root, self.info))
         self.features: tuple[Feature, ...] = ()
         self.keys: dict[str, str] = {}
@@ -256,7 +263,8 @@ class DatasetRecording:
     @cached_property
     def info(self) -> EpisodeInfo:
         """What is known of it; its robot and cameras as the sidecar describes them."""
-        robot = self.robot if self.dataset.has_one_robot and self.known.get("robot_digest") is not None else None
+        is_told = self.known.get("robot_digest") is not None or self.dataset.motors is not None
+        robot = self.robot if self.dataset.has_one_robot and is_told else None
         links = set() if robot is None else {robot.model.root, *(joint.child for joint in robot.model.joints)}
         described = {camera["name"]: camera for camera in self.known.get("cameras") or () if camera is not None}
         cameras = [
@@ -288,10 +296,12 @@ class DatasetRecording:
 
     @cached_property
     def robot(self) -> DatasetRobot | None:
-        """The arm that the sidecar keeps, or one of ours that has joints of these names; None for neither."""
+        """The arm that the sidecar keeps, that of the named servos, or one of ours that has joints of these names."""
         if (name := self.known.get("robot_digest")) is not None:
             return self.dataset.robot(str(name))
         state = self.dataset.info.features.get(STATE)
+        if self.dataset.motors is not None:
+            return robot_of_motors(self.dataset.motors)
         return recognised_robot(state.names) if state is not None and state.names and not self.known else None
 
     @cached_property
@@ -428,16 +438,7 @@ class DatasetRecording:
 
 def with_robot(info: EpisodeInfo, robot: DatasetRobot) -> EpisodeInfo:
     """The description with an arm, and which of its joints the features move."""
-    joints, units = robot.record.joints, robot.record.units
-
-    def fitting(found: Mapping[str, tuple[str, ...]], feature: Feature) -> tuple[str, ...]:
-        values = found.get(feature.name, ())
-        return values if len(values) == len(feature.names) else ()
-
-    features = tuple(
-        replace(feature, joints=fitting(joints, feature), units=fitting(units, feature)) for feature in info.features
-    )
-    return replace(info, urdf=robot.urdf, features=features)
+    return replace(info, urdf=robot.urdf, features=tuple(map(robot.record.described, info.features)))
 
 
 def _described(camera: Camera, found: Mapping[str, Any] | None, links: set[str]) -> Camera:

@@ -235,7 +235,7 @@ class _Export:
             "fps": options.fps,
             "depth": options.depth,
             **({} if options.state == "joint" else {"state": options.state}),
-            **({"motor_units": True} if options.motor_units else {}),
+            **({"motor_units": options.motor_units} if options.motor_units else {}),
             **({"boxes": True} if options.boxes else {}),
             **({"progress": True} if options.progress else {}),
             **({} if options.language is None else {"language": options.spoken}),

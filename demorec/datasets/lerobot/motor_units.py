@@ -11,11 +11,11 @@ import numpy as np
 from demorec.core.errors import ConfigError
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS
+from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS, motor_features
 from demorec.episode.episode import Columns
 from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
-from demorec.episode.info import Feature
 from demorec.mcap import Recording, open_recording
+from demorec.robots.motors import MotorUnits
 
 NO_PLACE = (VELOCITY, EE_POSE, REWARD, DONE, SUCCESS)
 """Features that LeRobot does not record of a real arm."""
@@ -26,13 +26,15 @@ class MotorRecording(Recording):
 
     Args:
         path: Of the file.
+        units: Of the arm's joints.
+        calibration: File that LeRobot saved of the arm's servos; None: of an arm that is built as its URDF says.
 
     Raises:
-        ConfigError: It is of a robot that LeRobot does not have.
+        ConfigError: It is of a robot that LeRobot does not have, or the calibration is none of its servos.
         RecordingError: As `Recording`.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, units: MotorUnits, calibration: Path | None = None) -> None:
         super().__init__(path)
         simulated = self.info
         arm = IN_MOTOR_UNITS.get(simulated.robot_name) if simulated.simulation is not None else None
@@ -42,21 +44,19 @@ class MotorRecording(Recording):
                 f"Motor units are asked for, which simulated episodes of {', '.join(IN_MOTOR_UNITS)} have, not those "
                 f"of {simulated.robot_name or 'an unnamed robot'}: leave --motor-units out: {path}"
             )
-        self._arm, self._spec = arm, simulated.robot
-        units = tuple(motor.unit for motor in arm.motors)
-        joints = (*self._spec.arm_joints, "")  # the gripper is no angle here
+        self._motors, self._spec = arm.motors(units, calibration), simulated.robot
         self.info = replace(
             simulated,
             format_version=0,
             robot_name=arm.robot_type,
             urdf=self.description(),
-            features=tuple(Feature(name=name, names=arm.names, units=units, joints=joints) for name in (STATE, ACTION)),
+            features=motor_features(self._motors),
             origin=f"simulated: {simulated.task}, seed {simulated.root_seed}, configuration {simulated.config_digest}",
             simulation=None,
         )
 
     def columns(self) -> Columns:
-        """As of `Recording`: state and action in degrees and per cent."""
+        """As of `Recording`: state and action as the servos say them."""
         return self._converted
 
     @cached_property
@@ -65,7 +65,7 @@ class MotorRecording(Recording):
             columns = simulated.columns()
         jaw = self._spec.gripper.joint_position(columns.action_gripper)
         targets = np.concatenate([columns.action_joint_target, jaw], axis=1)
-        values = {STATE: self._arm.values(columns.joint_position), ACTION: self._arm.values(targets)}
+        values = {STATE: self._motors.values(columns.joint_position), ACTION: self._motors.values(targets)}
         return replace(columns, features=values, stamps=dict.fromkeys(values, columns.time_ns))
 
 
@@ -73,7 +73,9 @@ def recording_of(path: Path, options: ExportOptions) -> Recording:
     """What a dataset with these options is made of; opens it.
 
     Raises:
-        ConfigError: Motor units are asked for, and it has none.
+        ConfigError: Motor units are asked for, and it has none, or not by this calibration.
         RecordingError: It is no recording, or damaged.
     """
-    return MotorRecording(path) if options.motor_units else open_recording(path)
+    if options.motor_units is None:
+        return open_recording(path)
+    return MotorRecording(path, options.motor_units, options.calibration)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from demorec.annotate import KINDS, LanguageKind
@@ -11,6 +12,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, OptionError
 from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
+from demorec.robots.motors import MotorUnits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,9 +22,13 @@ class ExportOptions(CommonOptions):
     state: StateKind = "joint"
     """What observation.state holds: joint (joint positions, gripper opening), joint_ee (behind them the TCP's pose, for
     policies that look at this vector alone, such as LeRobot's ACT)."""
-    motor_units: bool = False
-    """Of the SO-101: what LeRobot records of the real arm (robot type so101_follower), and nothing else: images, joints
-    in degrees and the gripper from 0 to 100 as state and action (docs/robots.md)."""
+    motor_units: MotorUnits | None = None
+    """Of the SO-101: what lerobot-record writes of the real arm (so101_follower), and nothing else: images, and as
+    state and action the joints in degrees, or from -100 to 100 of their ranges (range_m100_100, as LeRobot without
+    use_degrees), and the gripper from 0 to 100 (docs/robots.md)."""
+    calibration: Path | None = None
+    """With --motor-units: the file that LeRobot saved of your arm's servos (auto: an arm that is built as its URDF
+    says)."""
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
     (subtask plan memory motion task_aug vqa trace interjection), or all that the recordings support."""
@@ -85,6 +91,8 @@ class ExportOptions(CommonOptions):
             raise OptionError("workers", f"is {self.workers}, it must be 0 (as many as pay) or more.")
         if self.state not in STATE_KINDS:
             raise OptionError("state", f"is {self.state!r}, allowed are {', '.join(STATE_KINDS)}.")
+        if self.calibration is not None and self.motor_units is None:
+            raise ConfigError("--calibration belongs to --motor-units.")
         if unknown := [kind for kind in self.language or () if kind not in KINDS]:
             raise OptionError("language", f"names {unknown[0]!r}, its kinds are {', '.join(KINDS)}.")
         check_repo_id(self.repo_id)

@@ -11,21 +11,23 @@ import hashlib
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from demorec.core.errors import DemorecError, ExportError, in_words
 from demorec.core.files import read_text_limited
-from demorec.core.plain import digest, from_json, to_json
+from demorec.core.plain import digest, from_json, leave_out_defaults, to_json
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import MAX_JSON_BYTES
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.writer import write_text
-from demorec.episode.features import STATE
+from demorec.episode.features import ACTION, STATE
+from demorec.episode.info import Feature
 from demorec.robots.assets import asset_path
+from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
-from demorec.robots.so101 import SO101_FOLLOWER
+from demorec.robots.so101 import SO101, SO101_FOLLOWER
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml, read_links
 
 if TYPE_CHECKING:
@@ -54,6 +56,7 @@ class RobotRecord:
         urdf_sha256: SHA-256 (hex) of the URDF's file.
         joints: Feature -> for each of its elements the joint of the URDF of which it is the position, "" for none.
         units: Feature -> of its elements, where they are known; positions are in rad and m otherwise.
+        calibration: Feature -> of its elements, as `Feature` has it; only of servos that say something else.
         spec: Of a simulated arm: TCP link, limits, gripper, and `urdf`, the model that the meshes belong to.
         meshes: Link -> the mesh files that this model draws it with, as its URDF names them, where it is installed;
             the URDF here has boxes, balls and cylinders in their place.
@@ -65,6 +68,24 @@ class RobotRecord:
     units: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     spec: RobotSpec | None = None
     meshes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    calibration: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+
+    def described(self, feature: Feature) -> Feature:
+        """A feature with what is known of it here, as far as that fits its elements."""
+
+        def fitting[T](found: Mapping[str, tuple[T, ...]]) -> tuple[T, ...]:
+            values = found.get(feature.name, ())
+            return values if len(values) == len(feature.names) else ()
+
+        return replace(
+            feature,
+            joints=fitting(self.joints),
+            units=fitting(self.units),
+            calibration=fitting(self.calibration),
+        )
+
+
+leave_out_defaults(RobotRecord, "calibration")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,12 +116,13 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     if not (text := episode.urdf):
         return None
     urdf = portable_urdf(text) if spec is None else text
-    joints, units = episode.joints()
+    moving = episode.moving()
     record = RobotRecord(
         name=episode.recording.info.robot_name,
         urdf_sha256=_sha256(urdf),
-        joints=joints,
-        units=units,
+        joints={feature.name: feature.joints for feature in moving},
+        units={feature.name: feature.units for feature in moving if feature.units},
+        calibration={feature.name: feature.calibration for feature in moving if feature.calibration},
         spec=spec,
         meshes={} if spec is None else _mesh_names(spec.urdf),
     )
@@ -112,7 +134,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     """The arm of ours whose joints the elements of observation.state are called after, "panda_joint1.pos" or the like.
 
     Of a dataset that does not say what its robot is; lengths are those of the model. LeRobot's own arms are left out:
-    their joints are called the same in degrees and in per cent.
+    their joints are called the same in degrees and in shares of their ranges.
     """
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
@@ -127,6 +149,29 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
             record = RobotRecord(name=robot.name, urdf_sha256=_sha256(urdf), joints={STATE: joints})
             return DatasetRobot(record=record, urdf=urdf)
     return None
+
+
+def motor_features(motors: Motors) -> tuple[Feature, ...]:
+    """State and action as LeRobot records them of a real arm."""
+    known: Any = {"units": motors.units, "joints": motors.joints, "calibration": motors.to_positions}
+    return tuple(Feature(name=name, names=motors.names, **known) for name in (STATE, ACTION))
+
+
+@functools.cache
+def robot_of_motors(motors: Motors) -> DatasetRobot:
+    """The arm that has these servos."""
+    from demorec.mcap.description import robot_description  # loads all that reads recordings
+
+    urdf = robot_description(SO101.urdf, 1.0)
+    features = motor_features(motors)
+    record = RobotRecord(
+        name=motors.robot_type,
+        urdf_sha256=_sha256(urdf),
+        joints={feature.name: feature.joints for feature in features},
+        units={feature.name: feature.units for feature in features},
+        calibration={feature.name: feature.calibration for feature in features},
+    )
+    return DatasetRobot(record=record, urdf=urdf)
 
 
 @functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run

@@ -1,0 +1,214 @@
+"""Our simulated arms as robots of LeRobot, which its own commands drive with any of its teleoperators.
+
+    lerobot-teleoperate --robot.type=demorec_so101 --robot.task=stack --fps=30 --teleop.type=so101_leader ...
+
+Each action is one control step of 1/fps s, however long it took to come. LeRobot has no word for a new scene, so that
+a connection has one; `--robot.record=DIR` writes it as an ordinary recording.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from lerobot.robots import Robot
+
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Array
+from demorec.episode.episode import Outcome
+from demorec.episode.features import state_names
+from demorec.gym_env import DemorecEnv
+from demorec.lerobot_robot.config import DemorecPandaConfig, DemorecSO101Config, SimulatedArmConfig
+from demorec.mcap import EpisodeWriter
+from demorec.robots.motors import Motors
+from demorec.robots.robot import RobotSpec
+from demorec.robots.so101 import SO101_FOLLOWER
+
+__all__ = ["DemorecPanda", "DemorecPandaConfig", "DemorecSO101", "DemorecSO101Config"]
+
+
+class SimulatedArm(Robot):  # type: ignore[misc]
+    """A row of `demorec list robots` in a scene of a task: its state and actions are those of our datasets."""
+
+    row: ClassVar[str]
+    """Of the arm."""
+
+    def __init__(self, config: SimulatedArmConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self.cameras = dict.fromkeys(config.cameras)  # LeRobot counts them
+        self._env = DemorecEnv(
+            config.task,
+            split="train",
+            robot=self.row,
+            seed=config.seed,
+            variation=config.variation,  # type: ignore[arg-type]  # which is checked there
+            cameras=tuple(config.cameras),
+            width=config.width,
+            height=config.height,
+            fps=config.fps,
+            privileged=False,
+        )
+        self._target: dict[str, float] = {}
+        self._writer: EpisodeWriter | None = None
+
+    @property
+    def spec(self) -> RobotSpec:
+        """The arm."""
+        return self._env.info.robot
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the elements of state and action."""
+        return state_names(self.spec, "joint")
+
+    def told(self, joint_position: Array) -> Array:
+        """(D,) values of (n_joints,) positions, rad and m."""
+        arm = len(self.spec.arm_joints)
+        return np.append(joint_position[:arm], self.spec.gripper.width(joint_position[arm:]))
+
+    def meant(self, values: Array) -> Array:
+        """(n_arm + 1,) joint targets, rad, and opening, m, of (D,) values."""
+        return values
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        """See `Robot`."""
+        size = (self.config.height, self.config.width, 3)
+        return {**self.action_features, **dict.fromkeys(self.config.cameras, size)}
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        """See `Robot`."""
+        return dict.fromkeys(self.names, float)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a scene."""
+        return bool(self._target)
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Build the scene; SceneError where that is not possible."""
+        del calibrate
+        self._env.reset(seed=self.config.scene)
+        self._target = self._state()
+
+    @property
+    def is_calibrated(self) -> bool:
+        """It always is."""
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing to do."""
+
+    def configure(self) -> None:
+        """Nothing to do."""
+
+    def get_observation(self) -> dict[str, Any]:
+        """State and images now."""
+        images = self._env.situation.images
+        return {**self._state(), **{name: found.color for name, found in images.items()}}
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, float]:
+        """One control step towards it; elements that it lacks stay. Returns what was sent within the arm's limits.
+
+        Raises:
+            ConfigError: It has no element of this arm.
+        """
+        if not action.keys() & set(self.names):
+            raise ConfigError(
+                f"The teleoperator says {', '.join(map(str, action)) or 'nothing'}; the arm takes "
+                f"{', '.join(self.names)}: choose one for this arm."
+            )
+        self._target |= {name: float(action[name]) for name in self.names if name in action}
+        *_, about = self._env.step(self.meant(np.array([self._target[name] for name in self.names])))
+        self._record()
+        command = about["command"]
+        joints = np.append(command[:-1], self.spec.gripper.joint_position(command[-1]))
+        return self._named(self.told(joints))
+
+    def disconnect(self) -> None:
+        """Finish the recording and free the simulator."""
+        if self._writer is not None:
+            checks = self._env.situation.checks
+            failed = [check.name for check in checks if not check.passed]
+            self._writer.finish(
+                Outcome(
+                    success=not failed,
+                    checks=checks,
+                    failure_reason=failed[0] if failed else "",
+                    num_frames=self._env.situation.frame_index,
+                    final_state_digest=self._env.world.state_digest(),
+                )
+            )
+            self._writer = None
+        self._target = {}
+        self._env.close()
+
+    def _state(self) -> dict[str, float]:
+        return self._named(self.told(self._env.situation.observation.joint_position))
+
+    def _named(self, values: Array) -> dict[str, float]:
+        return dict(zip(self.names, values.tolist(), strict=True))
+
+    def _record(self) -> None:
+        """Write the frame of the last step, the first of a scene into a new file."""
+        frame = self._env.situation.last_frame
+        if self.config.record is None or frame is None:
+            return
+        if self._writer is None:
+            info = replace(self._env.info, origin="teleoperation by LeRobot")
+            self._writer = EpisodeWriter(_free_place(self.config.record), info, video=self._env.config.video)
+        self._writer.write(frame)
+
+
+class DemorecSO101(SimulatedArm):
+    """The SO-101 in the units of LeRobot's own `so101_follower`, by the calibration of `--robot.id` where it has one.
+
+    The jaw opens as far as the expert opens it, 22 per cent of the way.
+    """
+
+    config_class = DemorecSO101Config
+    name = "demorec_so101"
+    row = "so101"
+
+    @cached_property
+    def motors(self) -> Motors:
+        """The servos of the real arm; ConfigError for a calibration that is none of theirs."""
+        own = self.calibration_fpath if self.calibration_fpath.is_file() else None
+        return SO101_FOLLOWER.motors("degrees" if self.config.use_degrees else "range_m100_100", own)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """As of the real arm."""
+        return self.motors.names
+
+    def told(self, joint_position: Array) -> Array:
+        """(6,) values of (6,) positions, rad."""
+        return np.asarray(self.motors.values(joint_position[np.newaxis])[0])
+
+    def meant(self, values: Array) -> Array:
+        """(6,) joint targets, rad, and opening, m, of (6,) values."""
+        factor, offset = np.array(self.motors.to_positions).T
+        position = values * factor + offset
+        return np.append(position[:-1], self.spec.gripper.width(position[-1:]))
+
+
+class DemorecPanda(SimulatedArm):
+    """The Panda: joints in rad, the opening in metres, as in our datasets."""
+
+    config_class = DemorecPandaConfig
+    name = "demorec_panda"
+    row = "panda"
+
+
+def _free_place(folder: Path) -> Path:
+    """The next episode's file in a folder, which is made."""
+    folder.mkdir(parents=True, exist_ok=True)
+    number = 0
+    while (path := folder / f"episode_{number:06d}.mcap").exists():
+        number += 1
+    return path
