@@ -1,8 +1,8 @@
 """How a training went: every checkpoint of lerobot-train or demorec train tried on held-out scenes, and where it fails.
 
-    demorec train --config_path=examples/act_pictures.json 2>&1 | tee outputs/act_pictures.log
-    python benchmarks/checkpoints.py outputs/act_pictures --scenes 50 --last 100 --plot outputs/act_pictures.png \\
-        --log outputs/act_pictures.log
+    demorec train --config_path=examples/act_images.json 2>&1 | tee outputs/act_images.log
+    python benchmarks/checkpoints.py outputs/act_images --scenes 50 --last 100 --plot outputs/act_images.png \\
+        --log outputs/act_images.log
 
 Each checkpoint is one row: strict success with its 95 % interval, and the loss that the log tells of the updates before
 it. The last one is also cut by cell of the randomised ranges. Evaluations are those of `demorec evaluate`, kept below

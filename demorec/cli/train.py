@@ -22,8 +22,7 @@ class Train:
 
     Examples:
       demorec train --config_path=examples/act_numbers.json
-      demorec train --config_path=examples/act_pictures.json \\
-          --policy.path=outputs/eye --freeze-encoder
+      demorec train --config_path=examples/act_images.json --policy.path=outputs/eye
       demorec train --dataset.repo_id=lerobot/pusht --policy.type=diffusion
     """
 
@@ -31,8 +30,6 @@ class Train:
     """Cache of decoded frames in each process, in MiB; a small dataset is then decoded only once."""
     expert_only: bool = False
     """In corrected episodes (demorec correct, export --intervention), learn from the expert's frames only."""
-    freeze_encoder: bool = False
-    """Do not train the image encoder of an ACT policy (see demorec pretrain): each image is encoded only once."""
     others: tuple[str, ...] = ()
     """Flags for lerobot-train."""
 
@@ -46,14 +43,13 @@ class Train:
             frame_cache_bytes=self.frame_cache_mb << 20,
             on_replaced=lambda: tell(replaced),
             expert_only=self.expert_only,
-            freeze_encoder=self.freeze_encoder,
         )
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain:
-    """Pretrain the image encoder of an ACT policy before the policy is trained.
+    """Pretrain the image encoder of a policy of type act_keypoints before the policy is trained.
 
     From the images, it learns to predict where the hand will be when the gripper is next commanded to close or open.
     The targets come from the dataset's own poses and commands; no object poses are needed. The result is a policy
@@ -61,9 +57,8 @@ class Pretrain:
     dataset, the policy and the seed matter. Run the same command again to continue where it stopped.
 
     Examples:
-      demorec pretrain --config_path=examples/act_pictures.json --out outputs/eye
-      demorec train --config_path=examples/act_pictures.json \\
-          --policy.path=outputs/eye --freeze-encoder
+      demorec pretrain --config_path=examples/act_images.json --out outputs/eye
+      demorec train --config_path=examples/act_images.json --policy.path=outputs/eye
     """
 
     out: Path
@@ -72,7 +67,7 @@ class Pretrain:
     """Number of updates of the encoder's weights."""
     frames_per_update: int = 64
     """Frames per update, each with the images of all cameras."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Peak learning rate; it decays along a cosine."""
     frame_cache_mb: int = 256
     """Cache of decoded frames, in MiB; a small dataset is then decoded only once."""

@@ -18,6 +18,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 
+import demorec.lerobot_policy  # noqa: F401  # so that lerobot-eval knows its policy, too
 from demorec.episode import features
 from demorec.gym_env import DemorecEnv, env_id
 

@@ -110,6 +110,8 @@ class Policy:
             from lerobot.configs import PreTrainedConfig
             from lerobot.envs.utils import preprocess_observation
             from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+            import demorec.lerobot_policy  # noqa: F401  # which registers its policy's type
         except ImportError as error:
             raise MissingDependencyError(
                 "Running a policy", error.name or "lerobot", "pip install 'demorec[train]'"

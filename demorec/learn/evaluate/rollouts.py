@@ -141,16 +141,16 @@ def settings_for(
     plain, digest = policy_summary(checkpoint)
     try:
         inputs = {name: _shape(value["shape"]) for name, value in (plain.get("input_features") or {}).items()}
-        pictures = {name.removeprefix(IMAGE_PREFIX): shape for name, shape in inputs.items()
+        images = {name.removeprefix(IMAGE_PREFIX): shape for name, shape in inputs.items()
                     if name.startswith(IMAGE_PREFIX)}  # fmt: skip
-        if any(len(shape) != 3 for shape in pictures.values()):
+        if any(len(shape) != 3 for shape in images.values()):
             raise ValueError("an image of other than three dimensions")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"The inputs of the policy cannot be used ({in_words(error)}): {checkpoint}") from error
-    if pictures:
-        (_, height, width), *_ = pictures.values()
+    if images:
+        (_, height, width), *_ = images.values()
         own = {camera_name(name): name for name in config.cameras}
-        of_policy = replace(config, cameras=tuple(own.get(name, name) for name in pictures), width=width, height=height)
+        of_policy = replace(config, cameras=tuple(own.get(name, name) for name in images), width=width, height=height)
         of_policy.check_names((*config.modules, *allowed))
         config = of_policy
     action = action or trained_action(checkpoint)

@@ -1,6 +1,6 @@
 """Reading LeRobot datasets for training: the items of LeRobot's own reader, to the bit, for a fraction of its time.
 
-`FastDataset` takes the place of `LeRobotDataset`. `columns` has the numbers, `pictures` the decoded frames of the
+`FastDataset` takes the place of `LeRobotDataset`. `columns` has the numbers, `images` the decoded frames of the
 video files, `reader` makes items of them and is the dataset; `command` runs lerobot-train with it.
 """
 

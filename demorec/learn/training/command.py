@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, resource_error
+
+if TYPE_CHECKING:
+    from demorec.learn.training.reader import FastDataset
 
 PROGRAM = "lerobot-train"
 
@@ -23,19 +26,17 @@ def train(
     frame_cache_bytes: int,
     on_replaced: Callable[[], None],
     expert_only: bool = False,
-    freeze_encoder: bool = False,
 ) -> None:
     """Run lerobot-train in this process.
 
     Args:
         arguments: As for lerobot-train.
-        frame_cache_bytes: Limit of the decoded frames that each process keeps; of a frozen encoder's maps as well.
+        frame_cache_bytes: Limit of the decoded frames that each process keeps.
         expert_only: As of `FastDataset`.
-        freeze_encoder: Do not train an ACT policy's encoder of pictures (`freeze_encoder`).
         on_replaced: Called when the first dataset is opened by `FastDataset`: streamed ones are not.
 
     Raises:
-        ConfigError: The limit is negative, the file of --config_path is missing, or there is no encoder to freeze.
+        ConfigError: The limit is negative, the file of --config_path is missing, or the encoder is not taught.
         TrainingError: lerobot-train ended with an error.
         MissingDependencyError: LeRobot, or what it needs for training, is not installed.
         SystemExit: lerobot-train refused its arguments (2), and said why, or told its help (0).
@@ -46,11 +47,13 @@ def train(
     try:
         import accelerate  # noqa: F401  # which lerobot-train asks for late
         from lerobot.scripts import lerobot_train
+
+        import demorec.lerobot_policy  # noqa: F401  # which registers its policy's type
     except ImportError as error:
         raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
     with (
-        _reading_fast(frame_cache_bytes, on_replaced, expert_only=expert_only, is_frozen=freeze_encoder),
-        _freezing(frame_cache_bytes) if freeze_encoder else nullcontext(),
+        _reading_fast(frame_cache_bytes, on_replaced, expert_only=expert_only) as opened,
+        _encoding_once(opened),
         _called_with(arguments),
     ):
         try:
@@ -84,6 +87,8 @@ def training_config(arguments: Sequence[str]) -> Any:
         import draccus
         from lerobot.configs.train import TrainPipelineConfig
         from lerobot.policies import factory  # noqa: F401  # which registers the policies' types
+
+        import demorec.lerobot_policy  # noqa: F401  # so does this
     except ImportError as error:
         raise MissingDependencyError("Training", error.name or "lerobot", "pip install 'demorec[train]'") from error
     with _called_with(arguments):
@@ -93,45 +98,52 @@ def training_config(arguments: Sequence[str]) -> Any:
             raise ConfigError(f"{PROGRAM} does not take these settings ({type(error).__name__}: {error}).") from error
 
 
+@contextmanager
 def _reading_fast(
-    frame_cache_bytes: int, on_replaced: Callable[[], None], *, expert_only: bool, is_frozen: bool
-) -> AbstractContextManager[None]:
-    """LeRobot's factory of datasets makes `FastDataset`s meanwhile."""
+    frame_cache_bytes: int, on_replaced: Callable[[], None], *, expert_only: bool
+) -> Iterator[list[FastDataset]]:
+    """LeRobot's factory of datasets makes `FastDataset`s meanwhile, which come into the list."""
     from lerobot.datasets import factory
 
     from demorec.learn.training.reader import FastDataset
 
-    is_told = False
+    opened: list[FastDataset] = []
 
     def open_dataset(*args: Any, **kwargs: Any) -> FastDataset:
-        nonlocal is_told
-        if is_frozen and kwargs.get("image_transforms") is not None:
-            raise ConfigError(
-                "--freeze-encoder keeps what the encoder made of each picture, so pictures must not change: leave out "
-                "--dataset.image_transforms.enable."
-            )
-        if not is_told:
+        if not opened:
             on_replaced()
-            is_told = True
-        return FastDataset(*args, frame_cache_bytes=frame_cache_bytes, expert_only=expert_only, **kwargs)
+        opened.append(FastDataset(*args, frame_cache_bytes=frame_cache_bytes, expert_only=expert_only, **kwargs))
+        return opened[-1]
 
-    return _replaced(factory, "LeRobotDataset", open_dataset)
+    with _replaced(factory, "LeRobotDataset", open_dataset):
+        yield opened
 
 
-def _freezing(limit_bytes: int) -> AbstractContextManager[None]:
-    """Policies that lerobot-train makes have a frozen encoder meanwhile."""
+def _encoding_once(opened: Sequence[FastDataset]) -> AbstractContextManager[None]:
+    """Policies of ours that lerobot-train makes meanwhile encode each frame of the dataset once."""
     from lerobot.scripts import lerobot_train
 
-    from demorec.learn.training.frozen import freeze_encoder
+    from demorec.learn.training.encodings import Encodings
 
     make_policy = lerobot_train.make_policy
 
-    def frozen(*args: Any, **kwargs: Any) -> Any:
+    def made(*args: Any, **kwargs: Any) -> Any:
         policy = make_policy(*args, **kwargs)
-        freeze_encoder(policy, num_frames=kwargs["ds_meta"].total_frames, limit_bytes=limit_bytes)
+        if policy.config.type != "act_keypoints":
+            return policy
+        if not policy.config.pretrained_path:
+            raise ConfigError(
+                "The encoder of a policy of type act_keypoints learns before the policy does: demorec pretrain, then "
+                "--policy.path with its --out."
+            )
+        for dataset in opened:
+            if dataset.image_transforms is None:  # else an image is another one each time
+                encodings = Encodings(dataset.meta.total_frames)
+                encodings.serve(policy)
+                dataset.leave_out_images(encodings.known)
         return policy
 
-    return _replaced(lerobot_train, "make_policy", frozen)
+    return _replaced(lerobot_train, "make_policy", made)
 
 
 @contextmanager

@@ -1,8 +1,8 @@
-"""Teaching the encoder of a policy's pictures to see, before the policy is trained.
+"""Teaching the encoder of a policy's images to see, before the policy is trained.
 
     OUT/pretraining.json    what decides the result; at the end also what came out
     OUT/unfinished.pt       weights and optimizer, until it is done
-    OUT/config.json, ...    an ACT policy whose encoder has been taught: for --policy.path=OUT of lerobot-train
+    OUT/config.json, ...    a policy whose encoder has been taught: for --policy.path=OUT of lerobot-train
 
 The same command goes on where the last one stopped.
 """
@@ -14,7 +14,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,18 +23,13 @@ import numpy as np
 import torch
 from lerobot.policies import make_policy, make_pre_post_processors
 from numpy.typing import NDArray
+from torch.nn import functional
 from torch.utils.data import default_collate
 
 from demorec.core.errors import ConfigError, DemorecError, in_words
 from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
 from demorec.learn.training.columns import numbers
-from demorec.learn.training.keyframes import (
-    KeyframeEncoder,
-    KeyframeTargets,
-    find_keyframes,
-    keyframe_targets,
-    loss_of,
-)
+from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
 from demorec.learn.training.reader import FastDataset
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
@@ -42,7 +37,7 @@ _STATE, _EE_POSE, _ACTION = "observation.state", "observation.ee_pose", "action"
 _TCP = ("tcp.x", "tcp.y", "tcp.z", "tcp.qx", "tcp.qy", "tcp.qz", "tcp.qw")
 _OPENING = "gripper.width"
 _HELD_OUT_SHARE, _JUDGED_FRAMES = 0.05, 1000
-_WARM_UP, _WEIGHT_DECAY, _GRADIENT_NORM = 50, 1e-3, 1.0
+_WARM_UP, _WEIGHT_DECAY, _GRADIENT_NORM = 100, 1e-3, 1.0
 _SMOOTHING = 0.95
 
 Rows = NDArray[np.int64]
@@ -54,14 +49,14 @@ class PretrainConfig:
 
     Attributes:
         updates: Of its weights.
-        batch_size: Frames of each update, with the pictures of all cameras.
+        batch_size: Frames of each update, with the images of all cameras.
         learning_rate: At its highest; it falls along a cosine.
         seed: Of the weights at the start, and of which frames are seen.
     """
 
     updates: int = 1500
     batch_size: int = 64
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     seed: int = 0
 
 
@@ -96,8 +91,7 @@ def pretrain(
     """Teach the encoder that the ACT policy of a training will have, and save the policy; go on with what was begun.
 
     Args:
-        config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count; with the policy's `use_amp`
-            the network computes in bfloat16, while its weights and the loss stay in float32.
+        config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count.
         plan: How.
         out: Folder of the policy.
         frame_cache_bytes: Limit of the decoded frames that are kept.
@@ -105,12 +99,12 @@ def pretrain(
         save_every: Updates from one to the next state that a stopped call can go on from.
 
     Raises:
-        ConfigError: The policy is no ACT, the dataset has no pictures or does not tell where the hand is, or the folder
-            holds something else.
+        ConfigError: The policy is of another type, the dataset has no images or does not tell where the hand is, or
+            the folder holds something else.
         DemorecError: What is in the folder is damaged.
     """
-    if getattr(config.policy, "type", None) != "act":
-        raise ConfigError("Only the encoder of an ACT policy can be taught: --policy.type=act.")
+    if getattr(config.policy, "type", None) != "act_keypoints":
+        raise ConfigError("Only the encoder of one type of policy can be taught: --policy.type=act_keypoints.")
     chosen = config.dataset
     dataset = FastDataset(
         chosen.repo_id,
@@ -122,7 +116,7 @@ def pretrain(
     )
     targets = read_targets(dataset)
     if not dataset.meta.camera_keys:
-        raise ConfigError(f"The dataset has no pictures to learn from: {dataset.root}")
+        raise ConfigError(f"The dataset has no images to learn from: {dataset.root}")
     settings = {
         **asdict(plan),
         "dataset": _digest(dataset),
@@ -171,6 +165,7 @@ class _Lessons:
     def __init__(self, policy: Any, plan: PretrainConfig, dataset: FastDataset, targets: KeyframeTargets) -> None:
         self._plan, self._dataset, self._targets = plan, dataset, targets
         torch.manual_seed(plan.seed)
+        policy.num_targets = len(targets.names)
         self._policy = make_policy(policy, ds_meta=dataset.meta)
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
@@ -179,12 +174,7 @@ class _Lessons:
         spread = learnt.std(0)
         self._mean = learnt.mean(0)
         self._spread = np.where(spread > 1e-4, spread, np.inf).astype(np.float32)
-        self._network = KeyframeEncoder(
-            self._policy.config,
-            num_cameras=len(self._policy.config.image_features),
-            state_dim=self._policy.config.robot_state_feature.shape[0],
-            num_targets=len(targets.names),
-        ).to(self._device)
+        self._network = self._policy.encoder.requires_grad_(True)
         self._optimizer = torch.optim.AdamW(
             self._network.parameters(), lr=plan.learning_rate, weight_decay=_WEIGHT_DECAY
         )
@@ -210,8 +200,7 @@ class _Lessons:
         told = []
         with torch.no_grad():
             for start in range(0, len(rows), self._plan.batch_size):
-                together, _ = self._tell(rows[start : start + self._plan.batch_size])
-                told.append(together.cpu().numpy())
+                told.append(self._tell(rows[start : start + self._plan.batch_size]).cpu().numpy())
         offsets = list(self._targets.offsets)
         spread = np.where(np.isinf(self._spread), 0, self._spread)
         found = (np.concatenate(told) * spread + self._mean)[:, offsets]
@@ -227,7 +216,6 @@ class _Lessons:
 
     def save(self, out: Path) -> None:
         """The policy with the encoder, and its processing steps, as LeRobot's trainings leave them."""
-        self._policy.model.backbone.load_state_dict(self._network.weights())
         for part in (self._policy, self._before, self._after):
             part.save_pretrained(out)
 
@@ -239,20 +227,18 @@ class _Lessons:
         rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / plan.updates))
         for group in self._optimizer.param_groups:
             group["lr"] = plan.learning_rate * rate
-        loss = loss_of(self._tell(rows), torch.from_numpy(wanted).to(self._device))
+        loss = functional.l1_loss(self._tell(rows), torch.from_numpy(wanted).to(self._device))
         self._optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), _GRADIENT_NORM)
         self._optimizer.step()
         return float(loss.item())
 
-    def _tell(self, rows: Rows) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    def _tell(self, rows: Rows) -> torch.Tensor:
+        """(B, K) normalised targets, as the encoder has them now."""
         batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
-        pictures: Sequence[torch.Tensor] = [batch[key] for key in self._policy.config.image_features]
-        # bfloat16 has the range of float32, so that no loss needs to be scaled, unlike LeRobot's float16 on CUDA.
-        with torch.autocast(self._device.type, dtype=torch.bfloat16, enabled=self._policy.config.use_amp):
-            together, by_camera = self._network(pictures, batch[_STATE])
-        return together.float(), [each.float() for each in by_camera]
+        _, told = self._network([batch[key] for key in self._policy.config.image_features], batch[_STATE])
+        return told
 
     def _store(self, path: Path) -> None:
         state = {

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
 from demorec.learn.training.columns import Column, Statements, is_statements, numbers
-from demorec.learn.training.pictures import PictureReader
+from demorec.learn.training.images import ImageReader
 
 INTERVENTION = "intervention"
 """Column of LeRobot's DAgger: true where the expert acts in an episode that a policy began."""
@@ -76,12 +76,13 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         self._cache_bytes = cache_bytes
         self._expert_only = expert_only
         self._tables: _Tables | None = None
-        self._pictures: PictureReader | None = None
+        self._images: ImageReader | None = None
         self._process = 0
+        self.left_out: NDArray[np.bool_] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Settings and LeRobot's table: a worker process finds its own arrays and opens its own files."""
-        return {**self.__dict__, "_tables": None, "_pictures": None}
+        return {**self.__dict__, "_tables": None, "_images": None}
 
     def get_item(self, idx: int) -> Item:
         """One item; IndexError for an index beyond the table."""
@@ -112,8 +113,8 @@ class FastReader(DatasetReader):  # type: ignore[misc]
             raise KeyError(key)
         values |= padding
         if self._meta.video_keys:
-            times = values["timestamp"]
-            values = self._videos(tables, episodes, times, windows) | values
+            is_wanted = np.ones(len(rows), np.bool_) if self.left_out is None else ~self.left_out[absolute]
+            values = self._videos(tables, episodes, values["timestamp"], windows, is_wanted) | values
         items = [dict(zip(values, item, strict=True)) for item in zip(*values.values(), strict=True)]
         depth_keys = self._meta.depth_keys
         colors = [key for key in self._meta.camera_keys if key not in depth_keys]
@@ -126,12 +127,12 @@ class FastReader(DatasetReader):  # type: ignore[misc]
             self._tables = _Tables(self)
         return self._tables
 
-    def _current_pictures(self) -> PictureReader:
+    def _current_images(self) -> ImageReader:
         """Of this process: a forked one shares the places in the files that its parent has opened."""
-        if self._pictures is None or self._process != os.getpid():
-            self._pictures = PictureReader(self._video_backend, self._tolerance_s, self._cache_bytes)
+        if self._images is None or self._process != os.getpid():
+            self._images = ImageReader(self._video_backend, self._tolerance_s, self._cache_bytes)
             self._process = os.getpid()
-        return self._pictures
+        return self._images
 
     def _values(self, tables: _Tables, name: str, rows: Rows) -> Sequence[Any]:
         """A feature's value for each item: of its row (B,), or stacked of the rows of its window (B, T)."""
@@ -146,9 +147,15 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         return [torch.stack([values[place] for place in item]) for item in places.reshape(rows.shape)]
 
     def _videos(
-        self, tables: _Tables, episodes: Rows, times: Sequence[torch.Tensor], windows: dict[str, Rows]
+        self,
+        tables: _Tables,
+        episodes: Rows,
+        times: Sequence[torch.Tensor],
+        windows: dict[str, Rows],
+        is_wanted: NDArray[np.bool_],
     ) -> dict[str, list[torch.Tensor]]:
-        """Video feature -> pictures of each item, (C, H, W) or (T, C, H, W), as LeRobot gives them."""
+        """Video feature -> images of each item, (C, H, W) or (T, C, H, W), as LeRobot gives them; black ones of the
+        items that are not wanted."""
         now_s = np.array([time.item() for time in times], np.float64)[:, None]
         videos: dict[str, list[torch.Tensor]] = {}
         for key in self._meta.video_keys:
@@ -157,18 +164,22 @@ class FastReader(DatasetReader):  # type: ignore[misc]
             files = tables.video_file[key][episodes]
             found: list[Any] = [None] * len(episodes)
             is_depth = key in self._meta.depth_keys
-            for file in np.unique(files):
-                places = np.flatnonzero(files == file)
+            for file in np.unique(files[is_wanted]):
+                places = np.flatnonzero((files == file) & is_wanted)
                 path = tables.video_paths[key][file]
-                pictures = self._current_pictures().read(path, times_s[places], is_depth=is_depth)
-                for place, picture in zip(places, pictures, strict=True):
-                    found[place] = (self._depth(key, picture) if is_depth else self._color(picture)).squeeze(0)
+                images = self._current_images().read(path, times_s[places], is_depth=is_depth)
+                for place, image in zip(places, images, strict=True):
+                    found[place] = (self._depth(key, image) if is_depth else self._color(image)).squeeze(0)
+            if not is_wanted.all():
+                height, width, channels = self._meta.features[key]["shape"]
+                black = torch.zeros(channels, height, width, dtype=torch.uint8 if self._return_uint8 else torch.float32)
+                found = [black if image is None else image for image in found]
             videos[key] = found
         return videos
 
-    def _color(self, pictures: torch.Tensor) -> torch.Tensor:
+    def _color(self, images: torch.Tensor) -> torch.Tensor:
         """As it is, or as float32 in 0..1."""
-        return pictures if self._return_uint8 else pictures.to(torch.float32) / 255
+        return images if self._return_uint8 else images.to(torch.float32) / 255
 
     def _depth(self, key: str, codes: torch.Tensor) -> torch.Tensor:
         """Distances in the wanted unit, float32."""
@@ -201,7 +212,7 @@ class _Tables:
         source: The table of rows that they were made from.
         names: Its columns in order.
         numbers: Those that are arrays.
-        others: The rest, each as a table that LeRobot's conversion is applied to: pictures, texts, gaps.
+        others: The rest, each as a table that LeRobot's conversion is applied to: images, texts, gaps.
         statements: Those of them that are language columns.
         video_paths: Video feature -> its files.
         video_file: Video feature -> number of the file of each episode, (E,).
@@ -325,6 +336,14 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
         if reader.hf_dataset is None:
             reader.load_and_activate()
         return reader.get_items(indices)
+
+    def leave_out_images(self, left_out: NDArray[np.bool_]) -> None:
+        """From now on give black images in place of the frames that are marked here.
+
+        Args:
+            left_out: (total_frames,) by the dataset's index; what is changed in it later holds from then on.
+        """
+        self._ensure_reader().left_out = left_out
 
     def _ensure_reader(self) -> FastReader:
         reader = super()._ensure_reader()

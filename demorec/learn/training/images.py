@@ -1,4 +1,4 @@
-"""Pictures of video files at given times: those of a batch together, each decoded once.
+"""Images of video files at given times: those of a batch together, each decoded once.
 
 LeRobot opens the file for every item, decodes from the key frame before the wanted one and makes colours of all that
 it passes. Here a file stays open, the frames of a batch are wanted in their order in the file, decoding goes on where
@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 
 class DecodedFrame(NamedTuple):
-    """A picture and the time in its file, in seconds: (C, H, W), uint8 colours or uint16 codes of depth."""
+    """An image and the time in its file, in seconds: (C, H, W), uint8 colours or uint16 codes of depth."""
 
-    picture: torch.Tensor
+    image: torch.Tensor
     time_s: float
 
 
@@ -133,7 +133,7 @@ class FrameCache:
 
     @property
     def num_bytes(self) -> int:
-        """Of the pictures that are held."""
+        """Of the images that are held."""
         return self._held
 
     def get(self, path: str, number: int) -> DecodedFrame | None:
@@ -144,17 +144,17 @@ class FrameCache:
         return frame
 
     def put(self, path: str, number: int, frame: DecodedFrame) -> None:
-        """Hold a frame that is not held yet; its picture must own its memory, and nobody may change it."""
-        if frame.picture.nbytes > self._limit:
+        """Hold a frame that is not held yet; its image must own its memory, and nobody may change it."""
+        if frame.image.nbytes > self._limit:
             return
         self._frames[path, number] = frame
-        self._held += frame.picture.nbytes
+        self._held += frame.image.nbytes
         while self._held > self._limit:
             _, forgotten = self._frames.popitem(last=False)
-            self._held -= forgotten.picture.nbytes
+            self._held -= forgotten.image.nbytes
 
 
-class PictureReader:
+class ImageReader:
     """Open files and the cache of frames of one process; its methods may be called from several threads.
 
     Args:
@@ -172,7 +172,7 @@ class PictureReader:
         self._lock = Lock()
 
     def read(self, path: Path, times_s: NDArray[np.float64], *, is_depth: bool) -> list[torch.Tensor]:
-        """The pictures of several items from one file.
+        """The images of several items from one file.
 
         Args:
             path: Of the file.
@@ -203,7 +203,7 @@ class PictureReader:
                 f"{found[is_far][0]:.6f} s, so the video does not fit the table of the frames: {path}"
             )
         chosen = np.take_along_axis(numbers, nearest, 1)
-        return [torch.stack([frames[n].picture for n in row]) for row in chosen.tolist()]
+        return [torch.stack([frames[n].image for n in row]) for row in chosen.tolist()]
 
     def _frames(
         self, path: str, decoder: VideoFile | _TorchcodecFile, numbers: Sequence[int]
@@ -242,5 +242,5 @@ class _TorchcodecFile:
     def decode(self, numbers: Sequence[int]) -> Iterator[tuple[int, DecodedFrame]]:
         if numbers:
             batch = self._decoder.get_frames_at(indices=list(numbers))
-            for number, picture, time_s in zip(numbers, batch.data, batch.pts_seconds.tolist(), strict=True):
-                yield number, DecodedFrame(picture.clone(), time_s)  # else one frame would hold the memory of all
+            for number, image, time_s in zip(numbers, batch.data, batch.pts_seconds.tolist(), strict=True):
+                yield number, DecodedFrame(image.clone(), time_s)  # else one frame would hold the memory of all

@@ -1,0 +1,165 @@
+"""A policy of LeRobot that sees where things are: ACT, whose images come as keypoints.
+
+    lerobot-eval --env.discover_packages_path=demorec.lerobot_env --env.type=demorec --policy.path=...
+
+Importing this package makes the policy known to LeRobot, which finds the parts below by their names.
+
+ACT's own ResNet gives maps of features, in which a place is hard to read to the millimetre. Here a small convolutional
+network makes a few maps of each image, and the policy gets the place that each map points at: its expectation under a
+softmax over the map (Finn et al., "Deep Spatial Autoencoders for Visuomotor Learning", 2016). What the network learns,
+before the policy does, is in `demorec.learn.training.pretrain`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACT, ACTPolicy
+from lerobot.policies.act.processor_act import make_act_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from torch import nn
+
+__all__ = ["ActKeypointsConfig", "ActKeypointsPolicy", "KeypointEncoder", "make_act_keypoints_pre_post_processors"]
+
+_HIDDEN = 256
+_HEIGHT_SCALE = 0.1
+"""Of a map's maximum, beside its coordinates, which lie in [-1, 1]."""
+
+
+@PreTrainedConfig.register_subclass("act_keypoints")
+@dataclass
+class ActKeypointsConfig(ACTConfig):  # type: ignore[misc]
+    """Flags `--policy.NAME=...`: those of ACT, of which the ones about the ResNet mean nothing here.
+
+    Attributes:
+        num_keypoints: Maps of each camera.
+        encoder_channels: Of the first convolutions; the later ones have twice as many.
+        num_targets: Numbers that the encoder tells of an image beside the keypoints; set by `demorec pretrain`.
+    """
+
+    num_keypoints: int = 16
+    encoder_channels: int = 16
+    num_targets: int = 0
+
+
+make_act_keypoints_pre_post_processors = make_act_pre_post_processors
+
+
+class KeypointEncoder(nn.Module):  # type: ignore[misc]
+    """Images and the robot's state as numbers that say where things are.
+
+    Args:
+        num_cameras: Each has a network of its own.
+        state_dim: Numbers of the robot's state.
+        num_keypoints, channels, num_targets: As of `ActKeypointsConfig`.
+    """
+
+    def __init__(
+        self, *, num_cameras: int, state_dim: int, num_keypoints: int, channels: int, num_targets: int
+    ) -> None:
+        super().__init__()
+        self.eyes = nn.ModuleList(_maps(channels, num_keypoints) for _ in range(num_cameras))
+        self.temperature = nn.Parameter(torch.zeros(num_cameras, num_keypoints))
+        self.num_numbers = 3 * num_keypoints * num_cameras
+        self.targets = nn.Sequential(
+            nn.Linear(self.num_numbers + state_dim, _HIDDEN), nn.ReLU(),
+            nn.Linear(_HIDDEN, _HIDDEN), nn.ReLU(),
+            nn.Linear(_HIDDEN, num_targets),
+        )  # fmt: skip
+
+    def forward(self, images: Sequence[torch.Tensor], state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Keypoints (B, 3 K num_cameras) and targets (B, num_targets).
+
+        Args:
+            images: Of each camera, (B, 3, H, W), normalised.
+            state: (B, S), normalised.
+        """
+        with torch.autocast(state.device.type, enabled=False):  # bfloat16 has 8 bits, fewer than an image has columns
+            found = [self._keypoints(camera, image.float()) for camera, image in enumerate(images)]
+            keypoints = torch.cat(found, dim=1)
+            targets: torch.Tensor = self.targets(torch.cat([keypoints, state.float()], dim=1))
+        return keypoints, targets
+
+    def _keypoints(self, camera: int, image: torch.Tensor) -> torch.Tensor:
+        """(B, 3 K): expected x, expected y, and height, of the maps of one camera."""
+        maps = self.eyes[camera](image.contiguous(memory_format=torch.channels_last))
+        height, width = maps.shape[2:]
+        weight = (maps.flatten(2) * self.temperature[camera].exp()[:, None]).softmax(2).unflatten(2, (height, width))
+        across, down = (torch.linspace(-1, 1, size, device=maps.device) for size in (width, height))
+        x, y = (weight.sum(2) * across).sum(2), (weight.sum(3) * down).sum(2)
+        return torch.cat([x, y, _HEIGHT_SCALE * maps.amax((2, 3))], dim=1)
+
+
+def _maps(channels: int, num_keypoints: int) -> nn.Module:
+    """From an image to maps of a quarter of its width and height."""
+    layers: list[nn.Module] = []
+    sizes = [3, channels, channels, 2 * channels, 2 * channels, 2 * channels]
+    for number, (before, after) in enumerate(pairwise(sizes)):
+        stride = 2 if number in (0, 2) else 1
+        layers += [nn.Conv2d(before, after, 3, stride, 1, bias=False), nn.BatchNorm2d(after), nn.ReLU(inplace=True)]
+    network = nn.Sequential(*layers, nn.Conv2d(sizes[-1], num_keypoints, 1))
+    return network.to(memory_format=torch.channels_last)
+
+
+class ActKeypointsPolicy(ACTPolicy):  # type: ignore[misc]
+    """ACT whose environment state is what a `KeypointEncoder` makes of the images; only ACT is trained.
+
+    Args:
+        config: With images and a state among its inputs.
+        **kwargs: LeRobot gives more than is needed.
+    """
+
+    config_class = ActKeypointsConfig
+    name = "act_keypoints"
+
+    def __init__(self, config: ActKeypointsConfig, **kwargs: Any) -> None:
+        super(ACTPolicy, self).__init__(config)
+        if not config.image_features or config.robot_state_feature is None:
+            raise ValueError("act_keypoints needs images and observation.state among its inputs.")
+        encoder = KeypointEncoder(
+            num_cameras=len(config.image_features),
+            state_dim=config.robot_state_feature.shape[0],
+            num_keypoints=config.num_keypoints,
+            channels=config.encoder_channels,
+            num_targets=config.num_targets,
+        )
+        self.model = ACT(_without_images(config, encoder.num_numbers + config.num_targets))
+        self.encoder = encoder.requires_grad_(False)
+        self.reset()
+
+    def train(self, mode: bool = True) -> ActKeypointsPolicy:
+        """As of a module; the encoder's statistics stay."""
+        super().train(mode)
+        self.encoder.eval()
+        return self
+
+    def forward(self, batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Loss of a batch, as ACT has it."""
+        loss: tuple[torch.Tensor, dict[str, Any]] = super().forward(batch | {OBS_ENV_STATE: self.encode(batch)})
+        return loss
+
+    def predict_action_chunk(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        """(B, chunk_size, D) actions."""
+        return super().predict_action_chunk(batch | {OBS_ENV_STATE: self.encode(batch)})
+
+    def encode(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        """(B, N) keypoints and targets of a normalised batch."""
+        with torch.no_grad():
+            return torch.cat(self.encoder([batch[key] for key in self.config.image_features], batch[OBS_STATE]), dim=1)
+
+
+def _without_images(config: ActKeypointsConfig, num_numbers: int) -> ACTConfig:
+    """Settings of an ACT that gets numbers in place of the images."""
+    own = ACTConfig.__dataclass_fields__
+    inner = ACTConfig(**{name: value for name, value in vars(config).items() if name in own and own[name].init})
+    inner.input_features = {
+        OBS_STATE: config.robot_state_feature,
+        OBS_ENV_STATE: PolicyFeature(type=FeatureType.ENV, shape=(num_numbers,)),
+    }
+    return inner
