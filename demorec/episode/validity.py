@@ -147,14 +147,17 @@ def _shape(what: str, shape: Shape) -> Iterator[str]:
 def _camera(camera: SceneCamera) -> Iterator[str]:
     what = f"the camera {camera.name!r}"
     yield from _pose(what, camera.mount_from_camera)
-    for side in (camera.width, camera.height):
-        yield from _within(f"a side of {what}", side, 1, 8192)
-    if camera.width * camera.height > MAX_PIXELS:
-        yield f"{what} has {camera.width}x{camera.height} pixels, more than {MAX_PIXELS}"
+    yield from _pixels(what, camera)
     if not 1e-3 <= camera.fov_y <= math.pi - 1e-3:
         yield f"fov_y of {what} is {camera.fov_y:g}, it must be between 0 and pi"
     if not 0 < camera.near < camera.far:
         yield f"{what} sees from {camera.near:g} to {camera.far:g} m"
+
+
+def _pixels(what: str, camera: Camera | SceneCamera) -> Iterator[str]:
+    width, height = camera.width, camera.height
+    if not (1 <= width <= 8192 and 1 <= height <= 8192 and width * height <= MAX_PIXELS):
+        yield f"{what} has {width}x{height} pixels, allowed are 1 to {MAX_PIXELS} in all, and 8192 a side"
 
 
 def _pose(what: str, pose: Pose) -> Iterator[str]:
@@ -261,8 +264,7 @@ def _external_camera(camera: Camera, links: frozenset[str]) -> Iterator[str]:
     what = f"the camera {camera.name!r}"
     if not _CAMERA.fullmatch(camera.name):
         yield f"a camera is called {camera.name!r}, allowed are letters, digits and _, beginning with a letter"
-    if not (1 <= camera.width <= 8192 and 1 <= camera.height <= 8192 and camera.width * camera.height <= MAX_PIXELS):
-        yield f"{what} has {camera.width}x{camera.height} pixels, allowed are 1 to {MAX_PIXELS} in all"
+    yield from _pixels(what, camera)
     if camera.intrinsics is not None and len(camera.intrinsics) != 9:
         yield f"{what} has {len(camera.intrinsics)} intrinsics, K has 9"
     if links and camera.mount and camera.mount not in links:

@@ -99,10 +99,6 @@ class ExternalFolder:
             numbers.append(int(digits) if digits.isdecimal() else -1)
         return max(numbers, default=-1) + 1
 
-    def path_of(self, episode_index: int) -> Path:
-        """Where the recording of an episode goes."""
-        return episode_path(self.path, episode_index)
-
     def kind(self) -> EpisodeInfo | None:
         """Description of the last episode, which new ones must be like; None of an empty run."""
         if not self.episodes:
@@ -121,7 +117,7 @@ class ExternalFolder:
 
     def has(self, info: EpisodeInfo) -> bool:
         """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
-        path = self.path_of(info.episode_index)
+        path = episode_path(self.path, info.episode_index)
         if not path.exists():
             return False
         with Recording(path) as recording:

@@ -17,7 +17,7 @@ from demorec.episode.features import STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFile
 from demorec.mcap import EpisodeWriter
 from demorec.robots.urdf import Urdf
-from demorec.runs.external import ExternalFolder
+from demorec.runs.external import ExternalFolder, episode_path
 from demorec.sources.mapping import SourceMapping, recorded_unit
 
 Picture = bytes | NDArray[Any]
@@ -131,7 +131,7 @@ def write_frames(
         RecordingError: A number is not finite, or the disk is full.
     """
     folder.check_fits(info)
-    path = folder.path_of(info.episode_index)
+    path = episode_path(folder.path, info.episode_index)
     leads = leads or {}
     begin = max(leads.values(), default=0)
     with EpisodeWriter(path, info, video=video, keeps_part=False) as writer:

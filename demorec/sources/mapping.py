@@ -38,6 +38,16 @@ _BAG, _HDF5 = {KIND: "bag"}, {KIND: "hdf5"}
 """Metadata of keys that only mappings of that kind have."""
 
 
+def _bag(default: Any) -> Any:
+    """A key that only mappings of bags have."""
+    return dataclasses.field(default=default, metadata=_BAG)
+
+
+def _hdf5(default: Any) -> Any:
+    """A key that only mappings of HDF5 files have."""
+    return dataclasses.field(default=default, metadata=_HDF5)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Source:
     """A part of a feature: numbers of one topic, or of one dataset.
@@ -67,14 +77,14 @@ class Source:
     to: Unit = ""
     limits: tuple[tuple[float, float], ...] = ()
     next: str = ""
-    topic: str = dataclasses.field(default="", metadata=_BAG)
-    field: str = dataclasses.field(default="", metadata=_BAG)
-    joints: tuple[str, ...] = dataclasses.field(default=(), metadata=_BAG)
-    names_field: str = dataclasses.field(default="", metadata=_BAG)
-    stamp: Stamp | None = dataclasses.field(default=None, metadata=_BAG)
-    sample: Sampling | None = dataclasses.field(default=None, metadata=_BAG)
-    max_age_s: float | None = dataclasses.field(default=None, metadata=_BAG)
-    dataset: str = dataclasses.field(default="", metadata=_HDF5)
+    topic: str = _bag("")
+    field: str = _bag("")
+    joints: tuple[str, ...] = _bag(())
+    names_field: str = _bag("")
+    stamp: Stamp | None = _bag(None)
+    sample: Sampling | None = _bag(None)
+    max_age_s: float | None = _bag(None)
+    dataset: str = _hdf5("")
 
     @property
     def place(self) -> str:
@@ -99,13 +109,13 @@ class CameraSource:
             of pixels that it takes to have blue first.
     """
 
-    topic: str = dataclasses.field(default="", metadata=_BAG)
-    info_topic: str = dataclasses.field(default="", metadata=_BAG)
-    stamp: Stamp | None = dataclasses.field(default=None, metadata=_BAG)
-    sample: Literal["latest", "nearest"] | None = dataclasses.field(default=None, metadata=_BAG)
-    max_age_s: float | None = dataclasses.field(default=None, metadata=_BAG)
-    dataset: str = dataclasses.field(default="", metadata=_HDF5)
-    colors: Literal["rgb", "bgr"] = dataclasses.field(default="rgb", metadata=_HDF5)
+    topic: str = _bag("")
+    info_topic: str = _bag("")
+    stamp: Stamp | None = _bag(None)
+    sample: Literal["latest", "nearest"] | None = _bag(None)
+    max_age_s: float | None = _bag(None)
+    dataset: str = _hdf5("")
+    colors: Literal["rgb", "bgr"] = _hdf5("rgb")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +131,8 @@ class Robot:
 
     name: str
     urdf: str = ""
-    urdf_topic: str = dataclasses.field(default="", metadata=_BAG)
-    urdf_attribute: str = dataclasses.field(default="", metadata=_HDF5)
+    urdf_topic: str = _bag("")
+    urdf_attribute: str = _hdf5("")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,9 +149,9 @@ class TaskText:
     """
 
     text: str = ""
-    topic: str = dataclasses.field(default="", metadata=_BAG)
-    field: str = dataclasses.field(default="data", metadata=_BAG)
-    attribute: str = dataclasses.field(default="", metadata=_HDF5)
+    topic: str = _bag("")
+    field: str = _bag("data")
+    attribute: str = _hdf5("")
     file_name: bool = False
 
 
@@ -174,12 +184,12 @@ class Clock:
     """
 
     fps: int = 0
-    rows: str = dataclasses.field(default="camera", metadata=_BAG)
-    stamp: Stamp = dataclasses.field(default="header", metadata=_BAG)
-    sample: Sampling = dataclasses.field(default="latest", metadata=_BAG)
-    max_age_s: float = dataclasses.field(default=0.2, metadata=_BAG)
-    when_old: Literal["error", "drop_episode"] = dataclasses.field(default="error", metadata=_BAG)
-    max_trim_s: float = dataclasses.field(default=1.0, metadata=_BAG)
+    rows: str = _bag("camera")
+    stamp: Stamp = _bag("header")
+    sample: Sampling = _bag("latest")
+    max_age_s: float = _bag(0.2)
+    when_old: Literal["error", "drop_episode"] = _bag("error")
+    max_trim_s: float = _bag(1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,21 +213,21 @@ class Episodes:
         times_s: [begin, end] of each episode, seconds from the bag's first message.
     """
 
-    cut: Literal["file", "marker", "service", "gap", "times"] = dataclasses.field(default="file", metadata=_BAG)
-    topic: str = dataclasses.field(default="", metadata=_BAG)
-    field: str = dataclasses.field(default="data", metadata=_BAG)
-    start_topic: str = dataclasses.field(default="", metadata=_BAG)
-    stop_topic: str = dataclasses.field(default="", metadata=_BAG)
-    start: str = dataclasses.field(default="start", metadata=_BAG)
-    stop: str = dataclasses.field(default="stop", metadata=_BAG)
+    cut: Literal["file", "marker", "service", "gap", "times"] = _bag("file")
+    topic: str = _bag("")
+    field: str = _bag("data")
+    start_topic: str = _bag("")
+    stop_topic: str = _bag("")
+    start: str = _bag("start")
+    stop: str = _bag("stop")
     success: str = "success"
-    failure: str = dataclasses.field(default="failure", metadata=_BAG)
-    discard: tuple[str, ...] = dataclasses.field(default=("discard",), metadata=_BAG)
-    ignore: tuple[str, ...] = dataclasses.field(default=(), metadata=_BAG)
-    gap_s: float = dataclasses.field(default=5.0, metadata=_BAG)
-    times_s: tuple[tuple[float, float], ...] = dataclasses.field(default=(), metadata=_BAG)
-    group: str = dataclasses.field(default="", metadata=_HDF5)
-    mask: str = dataclasses.field(default="", metadata=_HDF5)
+    failure: str = _bag("failure")
+    discard: tuple[str, ...] = _bag(("discard",))
+    ignore: tuple[str, ...] = _bag(())
+    gap_s: float = _bag(5.0)
+    times_s: tuple[tuple[float, float], ...] = _bag(())
+    group: str = _hdf5("")
+    mask: str = _hdf5("")
 
     @property
     def services(self) -> frozenset[str]:
@@ -245,7 +255,7 @@ class SourceMapping:
     episodes: Episodes = dataclasses.field(default_factory=Episodes)
     features: Mapping[str, tuple[Source, ...]] = dataclasses.field(default_factory=dict)
     cameras: Mapping[str, CameraSource] = dataclasses.field(default_factory=dict)
-    leave_out: tuple[str, ...] = dataclasses.field(default=(), metadata=_HDF5)
+    leave_out: tuple[str, ...] = _hdf5(())
 
     @cached_property
     def digest(self) -> str:

@@ -16,7 +16,7 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
 from demorec.episode.episode import Sample, SampledFrame
 from demorec.mcap import recover
-from demorec.runs.external import open_external_run
+from demorec.runs.external import episode_path, open_external_run
 
 CAMERAS = (TOP, replace(TOP, name="side"))
 
@@ -188,7 +188,7 @@ def external_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
     with open_external_run(folder) as opened:
         for index in range(2):
-            opened.add(write_external(opened.path_of(index), steady(num_frames=20, episode_index=index)))
+            opened.add(write_external(episode_path(opened.path, index), steady(num_frames=20, episode_index=index)))
     return folder
 
 
@@ -217,7 +217,9 @@ def test_a_run_of_other_files_is_a_failure(external_run: Path, tmp_path: Path) -
 def test_an_episode_twice_in_a_run(tmp_path: Path) -> None:
     with open_external_run(tmp_path / "run") as opened:
         for index in range(2):
-            opened.add(write_external(opened.path_of(index), replace(steady(num_frames=20), info=numbered(index))))
+            opened.add(
+                write_external(episode_path(opened.path, index), replace(steady(num_frames=20), info=numbered(index)))
+            )
     report = check_subject(Subject(path=tmp_path / "run", kind="run"), CheckOptions(only=("duplicates",)))
     assert [result.level for result in report.results] == ["fail"]
 

@@ -34,7 +34,7 @@ from demorec.mcap.recorder.vectors import (
     robot_facts,
 )
 from demorec.mcap.video import size_problem
-from demorec.runs.external import ExternalFolder, open_external_run
+from demorec.runs.external import ExternalFolder, episode_path, open_external_run
 
 Image = NDArray[np.uint8] | tuple[NDArray[np.uint8], int]
 """(H, W, 3) uint8 RGB, alone or with the stamp (ns) of when it was taken."""
@@ -324,7 +324,7 @@ class Recorder(Closing):
         if not instruction.strip():
             raise ConfigError("The episode has no task text: give Recorder(task=...) or recorder.episode(task=...).")
         info = self._info(self._features, self._folder.next_index, instruction)
-        path = self._folder.path_of(info.episode_index)
+        path = episode_path(self.path, info.episode_index)
         writer = EpisodeWriter(path, info, video=self._video, begins=False)
         encoder = Encoder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
         self._open = RecordedEpisode(self, info, encoder)
