@@ -10,15 +10,8 @@ from rerun.chunk import RrdReader
 from support.external import TOP, WRIST, make_external, write_external
 
 from demorec.core.errors import ConfigError
-from demorec.view.episode import PlayedEpisode
 from demorec.view.save import save, save_comparison
 from demorec.view.sources import find_episodes
-
-
-def opened(path: Path) -> PlayedEpisode:
-    with find_episodes([path])[0].open() as episode:
-        assert episode.info.simulation is None
-        return episode
 
 
 def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:

@@ -205,7 +205,6 @@ def test_what_is_good_is_selected(late: Path, tmp_path: Path, capsys: pytest.Cap
     assert "other episodes" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("without_lerobot")
 def test_the_worst_is_shown_first(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ("--episodes", "3:7", "--save", str(tmp_path / "v.rrd"))
     assert exit_code("view", str(late), "--rank", "score", *flags) == 0
