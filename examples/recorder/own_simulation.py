@@ -24,6 +24,8 @@ SIDE = 128
 FOV_DEGREES = 60.0
 FOCAL = SIDE / 2 / math.tan(math.radians(FOV_DEGREES) / 2)
 INTRINSICS = (FOCAL, 0.0, SIDE / 2, 0.0, FOCAL, SIDE / 2, 0.0, 0.0, 1.0)
+MAX_SPEED = 1.5
+"""Of each joint, rad/s; without it PyBullet's motors jump to their targets."""
 EYES = {"front": (1.5, 0.0, 0.9), "side": (0.0, 1.5, 0.9)}
 
 
@@ -53,13 +55,15 @@ def main(folder: str, num_episodes: int = 2, num_frames: int = 45) -> None:
                     for frame in range(num_frames):
                         states = pybullet.getJointStates(arm, joints, physicsClientId=client)
                         position = np.array([state[0] for state in states])
-                        pybullet.setJointMotorControlArray(
-                            arm,
-                            joints,
-                            pybullet.POSITION_CONTROL,
-                            targetPositions=goal.tolist(),
-                            physicsClientId=client,
-                        )
+                        for joint, target in zip(joints, goal.tolist(), strict=True):
+                            pybullet.setJointMotorControl2(
+                                arm,
+                                joint,
+                                pybullet.POSITION_CONTROL,
+                                targetPosition=target,
+                                maxVelocity=MAX_SPEED,
+                                physicsClientId=client,
+                            )
                         images = {name: take_image(client, eye) for name, eye in EYES.items()}
                         # Simulated time, exact: the clock on the wall says nothing about a simulation.
                         episode.write(position, goal, images, time_ns=frame * 1_000_000_000 // FPS)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import exit_code
 
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
@@ -68,6 +69,7 @@ def test_a_simulation_of_ones_own(runs: Path) -> None:
     assert columns.time_ns.tolist() == [frame * 1_000_000_000 // 30 for frame in range(45)]
     last, goal = columns.features["observation.state"][-1], columns.features["action"][0]
     assert np.abs(last - goal).max() < np.abs(columns.features["observation.state"][0] - goal).max()
+    assert exit_code("check", str(runs / "own_simulation"), "--strict") == 0
     assert front.std() > 5
     assert np.abs(front.astype(int) - side).mean() > 1
 
