@@ -13,8 +13,9 @@ from pathlib import Path
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.lerobot.episodes import DatasetRecording, LeRobotDataset
+from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.datasets.lerobot.videos import why_transcoded
 from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
@@ -54,7 +55,7 @@ def import_lerobot(
     digest, num_new = functools.cache(sha256_of), 0
     with open_external_run(out, recovers=False) as folder:
         for number in range(len(dataset.places)):
-            recording = dataset.recording(number)
+            recording = DatasetRecording(dataset, number)
             info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
             if not folder.has(info):
                 write_frames(
@@ -88,7 +89,7 @@ def _cameras(dataset: LeRobotDataset) -> tuple[dict[str, Camera], dict[str, str]
         feature = dataset.info.features[key]
         cameras[name] = camera = dataset.camera(name)
         if feature.is_depth:
-            next(dataset.recording(0).distances(name))
+            next(DatasetRecording(dataset, 0).distances(name))
             fates[name] = "the distances of its codes, in metres (32FC1)"
         elif feature.is_video:
             codec, (width, height), reason = why_transcoded([dataset.video(key, place) for place in dataset.places])
