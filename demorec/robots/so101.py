@@ -65,8 +65,7 @@ SO101_FOLLOWER = RealArm(
     },
     calibration="so101_urdf.json",
 )
-"""`lerobot-record --robot.type=so101_follower` (0.6.1) writes this robot type, the name of the class that drives SO-100
-and SO-101 alike. The URDF's zeros lie in the middle of what its joints can turn, between the stops that `lerobot-
-calibrate` finds; the roll turns all around, and is set to its zero by hand. LeRobot's own kinematics take such degrees
-for angles of this URDF. Of an arm that is built so, the servos are set to 2047 there, and their ranges are the URDF's
-limits."""
+"""`lerobot-record --robot.type=so101_follower` (0.6.1) writes this robot type, that of SO-100 and SO-101 alike. The
+URDF's zeros lie in the middle of what its joints can turn, between the stops that `lerobot-calibrate` finds; the roll
+turns all around, and is set to its zero by hand. LeRobot's own kinematics take such degrees for angles of this URDF. Of
+an arm that is built so, the servos are set to 2047 there, and their ranges are the URDF's limits."""
