@@ -29,7 +29,7 @@ from demorec.sim.resting import at_rest
 
 PANDA_HAND = Hand(max_width=0.08, finger_depth=0.007, palm_clearance=0.035)
 UP = (0.0, 0.0, 1.0)
-KINDS = {kind.noun: kind for name in OBJECTS.names() for kind in OBJECTS.load(name).kinds}
+KINDS = {kind.noun: kind for name in ("household", "blocks") for kind in OBJECTS.load(name).kinds}
 
 
 def as_trimesh(mesh: SolidMesh) -> trimesh.Trimesh:
@@ -132,19 +132,6 @@ def test_a_grasp_follows_the_direction_that_is_up() -> None:
     text = encode_mesh(block(0.09, 0.03, 0.05))
     (best, *_) = antipodal_grasps(text, PANDA_HAND, up=(0.0, 1.0, 0.0))  # lies on its side: 0.05 across now
     assert best.width == pytest.approx(0.05, abs=1e-3)
-
-
-def test_a_hand_that_is_a_little_too_low_meets_no_shoulder_below_what_it_grips() -> None:
-    """A neck of 12 mm radius on a cone: with its tips 7 mm below the TCP the hand stays 3 mm above the cone."""
-    rows = [(0.0, 0.0), (0.03, 0.0), (0.012, 0.02), (0.012, 0.06), (0.0, 0.06)]
-    bottle = trimesh.creation.revolve(np.array(rows), sections=48)
-    points = np.asarray(bottle.vertices) - (0.0, 0.0, 0.03)
-    solid = SolidMesh(points=points, faces=np.asarray(bottle.faces), parts=(np.arange(len(points)),))
-    grasps = antipodal_grasps(encode_mesh(solid), PANDA_HAND, up=UP)
-    assert grasps
-    for grasp in grasps:
-        assert grasp.width == pytest.approx(0.024, abs=1e-3)
-        assert grasp.z - 0.007 > -0.01 + 0.0025  # the neck begins at z = -0.01
 
 
 def test_what_sticks_out_where_a_finger_would_come_down_forbids_the_grasp() -> None:
