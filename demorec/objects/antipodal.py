@@ -1,9 +1,9 @@
 """Where a gripper that comes from above takes hold of a solid, from its mesh alone.
 
-Points are drawn from the surface of the convex parts, which is what physics lets fingers touch, where it is steep; at
-each one the fingers close along its normal. What they would touch first is looked up in a cloud of surface points,
-within the strip that a finger's pad sweeps: both contacts have to face the fingers (friction holds nothing steeper),
-across a width that fits, with no other part of the solid where the open fingers come down or where the palm is.
+Points are drawn from the surface where it is steep; at each one the fingers close along its normal. What they would
+touch first is looked up in a cloud of surface points, within the strip that a finger's pad sweeps: both contacts have
+to face the fingers (friction holds nothing steeper), across a width that fits, with no other part of the solid where
+the open fingers come down or where the palm is.
 """
 
 from __future__ import annotations
@@ -146,20 +146,16 @@ def _shares(count: int) -> tuple[Array, Array]:
 
 
 def _surface(mesh: SolidMesh, count: int) -> tuple[Array, Array]:
-    """(count, 3) points spread evenly over the hulls of the parts, and the unit normals there."""
-    from scipy.spatial import ConvexHull  # takes a while to load
-
-    hulls = [ConvexHull(mesh.points[part]) for part in mesh.parts]
-    corners = np.concatenate([hull.points[hull.simplices] for hull in hulls])  # (F, 3, 3)
-    outward = np.concatenate([hull.equations[:, :3] for hull in hulls])
-    a, b, c = corners.transpose(1, 0, 2)
-    across = np.cross(b - a, c - a)
-    total = np.cumsum(np.sqrt((across * across).sum(axis=1)))
+    """(count, 3) points spread evenly over the surface, and the unit normals there."""
+    a, b, c = (mesh.points[mesh.faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    double = np.sqrt((normals * normals).sum(axis=1))
+    total = np.cumsum(double)
     places, share = _shares(count)
     rows = np.minimum(np.searchsorted(total, places * total[-1]), len(total) - 1)
     share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
     points = a[rows] + share[:, :1] * (b - a)[rows] + share[:, 1:] * (c - a)[rows]
-    return points, outward[rows]
+    return points, normals[rows] / double[rows, np.newaxis]
 
 
 def _turned(rotation: Array, vectors: Array) -> Array:
