@@ -15,6 +15,7 @@ from support.commands import exit_code
 from support.sim import episode, run
 
 from demorec.core.errors import ConfigError, SceneError
+from demorec.core.geometry import Pose
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.episode.variation import Ranges
@@ -26,6 +27,7 @@ from demorec.objects.solids import dish
 from demorec.robots.assets import data_folder
 from demorec.sim.parts import with_parts
 from demorec.sim.resting import at_rest
+from demorec.tasks.grasping import hand_down, hand_yaw, places_of
 
 PANDA_HAND = Hand(max_width=0.08, finger_depth=0.007, palm_clearance=0.035)
 UP = (0.0, 0.0, 1.0)
@@ -224,9 +226,21 @@ def test_a_dish_is_hollow_for_physics_too() -> None:
         assert any((hull.equations @ (*point, 1.0) <= 0).all() for hull in hulls) is is_solid
 
 
-def test_a_thing_goes_down_at_another_yaw_where_the_present_one_is_out_of_reach() -> None:
-    _, outcome = run(episode(2077, task="pick_anything"))
-    assert outcome.success, outcome.failure_reason
+def test_what_may_lie_at_any_yaw_can_be_put_down_all_around_from_the_present_yaw_on() -> None:
+    scene = episode(0, task="pick_anything").info.scene
+    body = scene.body(scene.goals[0].object)
+    pose = body.world_from_body
+    hand = hand_down(pose.position + np.array([0.004, -0.003, 0.01]), 0.7)
+    wanted = Pose(position=pose.position + np.array([0.1, 0.2, 0.0]))
+    places = places_of(body, pose, wanted, hand=hand, yaw_symmetry=24)
+    yaws = [hand_yaw(place) for place in places]
+    assert yaws[0] == pytest.approx(0.7)
+    assert len({round(yaw, 6) for yaw in yaws}) == 24
+    assert [abs(math.remainder(yaw - 0.7, 2 * math.pi)) for yaw in yaws] == sorted(
+        abs(math.remainder(yaw - 0.7, 2 * math.pi)) for yaw in yaws
+    )
+    for place in places:
+        np.testing.assert_allclose((place @ hand.inverse() @ pose).position, wanted.position, atol=1e-9)
 
 
 def test_tasks_with_things_of_their_own_refuse_shelves() -> None:
