@@ -26,8 +26,6 @@ FINGER = 0.015
 """Half the width of a finger, and what it has to be clear of, metres."""
 PAD_ABOVE = 0.010
 """How far the pad reaches above the TCP, metres."""
-TOO_LOW = 0.003
-"""By which the hand may be lower than it is meant to: its tips shall not meet a shoulder below a neck, metres."""
 _SKIN = 0.0015
 """Surface points that are so near to the outermost one touch the finger, metres."""
 LEAST_FACING = math.cos(math.radians(25.0))
@@ -117,7 +115,7 @@ def _grasp(points: Array, normals: Array, row: int, hand: Hand) -> Grasp | None:
     if at < z - hand.finger_depth + 0.002:
         return None  # the pads end above it
     middle = float(u[row])
-    pad = (np.abs(u - middle) < PAD) & (w > z - hand.finger_depth - TOO_LOW) & (w < z + PAD_ABOVE)
+    pad = (np.abs(u - middle) < PAD) & (w > z - hand.finger_depth) & (w < z + PAD_ABOVE)
     first, last = float(v[pad].min()), float(v[pad].max())
     width, centre = last - first, (first + last) / 2
     if not LEAST_WIDTH <= width <= hand.max_width - PLAY:

@@ -31,8 +31,8 @@ HAND = 0.105
 GAP = 0.02
 """Between things that stay where they are, metres."""
 MOST_THINGS = 6
-MASSES = (0.015, 0.2)
-"""Limits, kg: lighter things jump, heavier ones slip."""
+MASSES = (0.04, 0.2)
+"""Limits, kg: fingers that press with 20 N sink into lighter things, heavier ones slip."""
 DRAWS = 50
 """Of a thing until one rests on a table and can be grasped."""
 NEUTRAL_COLORS: Mapping[str, Rgba] = {"grey": (0.5, 0.5, 0.51, 1.0), "black": (0.15, 0.15, 0.16, 1.0)}

@@ -59,17 +59,22 @@ NOUNS: dict[str, Callable[[Body], bool]] = {
             "cross",
             "arch",
             "hexagon",
+            "plate",
         )
     },
     "wooden plank": lambda body: body.name == "jenga",
     "toy brick": lambda body: "lego" in body.name,
     "tray": lambda body: "tray" in body.name,
     "table": lambda body: body.name == "table",
-    **dict.fromkeys(("target", "mark", "square"), lambda body: body.role == "target" and "tray" not in body.name),
+    **dict.fromkeys(
+        ("target", "mark", "square"),
+        lambda body: body.role == "target" and not body.name.endswith(("tray", "bowl", "plate")),
+    ),
 }
 """Word -> whether it is a word for a body, as a person looking at the scene would say."""
 _PHRASE = re.compile(
-    r"\b(the|every) ((?:(?:left|right|middle|small|large)\w* )?)((?:red|green|blue|yellow|orange|purple) )?"
+    r"\b(the|every) ((?:(?:left|right|middle|small|large)\w* )?)"
+    r"((?:red|green|blue|yellow|orange|purple|white|grey|black) )?"
     rf"({'|'.join(NOUNS)})\b( (?:nearest to|farthest from) the robot)?"
 )
 

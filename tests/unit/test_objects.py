@@ -15,6 +15,7 @@ from support.commands import exit_code
 from support.sim import episode, run
 
 from demorec.core.errors import ConfigError, SceneError
+from demorec.core.geometry import Pose
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.episode.variation import Ranges
@@ -26,10 +27,11 @@ from demorec.objects.solids import dish
 from demorec.robots.assets import data_folder
 from demorec.sim.parts import with_parts
 from demorec.sim.resting import at_rest
+from demorec.tasks.grasping import hand_down, hand_yaw, places_of
 
 PANDA_HAND = Hand(max_width=0.08, finger_depth=0.007, palm_clearance=0.035)
 UP = (0.0, 0.0, 1.0)
-KINDS = {kind.noun: kind for name in OBJECTS.names() for kind in OBJECTS.load(name).kinds}
+KINDS = {kind.noun: kind for name in ("household", "blocks") for kind in OBJECTS.load(name).kinds}
 
 
 def as_trimesh(mesh: SolidMesh) -> trimesh.Trimesh:
@@ -134,19 +136,6 @@ def test_a_grasp_follows_the_direction_that_is_up() -> None:
     assert best.width == pytest.approx(0.05, abs=1e-3)
 
 
-def test_a_hand_that_is_a_little_too_low_meets_no_shoulder_below_what_it_grips() -> None:
-    """A neck of 12 mm radius on a cone: with its tips 7 mm below the TCP the hand stays 3 mm above the cone."""
-    rows = [(0.0, 0.0), (0.03, 0.0), (0.012, 0.02), (0.012, 0.06), (0.0, 0.06)]
-    bottle = trimesh.creation.revolve(np.array(rows), sections=48)
-    points = np.asarray(bottle.vertices) - (0.0, 0.0, 0.03)
-    solid = SolidMesh(points=points, faces=np.asarray(bottle.faces), parts=(np.arange(len(points)),))
-    grasps = antipodal_grasps(encode_mesh(solid), PANDA_HAND, up=UP)
-    assert grasps
-    for grasp in grasps:
-        assert grasp.width == pytest.approx(0.024, abs=1e-3)
-        assert grasp.z - 0.007 > -0.01 + 0.0025  # the neck begins at z = -0.01
-
-
 def test_what_sticks_out_where_a_finger_would_come_down_forbids_the_grasp() -> None:
     """A post is grasped, but not below a plate on it that is nearly as wide as the hand opens."""
     post, plate = trimesh.creation.box(extents=(0.03, 0.03, 0.04)), trimesh.creation.box(extents=(0.076, 0.076, 0.01))
@@ -237,9 +226,21 @@ def test_a_dish_is_hollow_for_physics_too() -> None:
         assert any((hull.equations @ (*point, 1.0) <= 0).all() for hull in hulls) is is_solid
 
 
-def test_a_thing_goes_down_at_another_yaw_where_the_present_one_is_out_of_reach() -> None:
-    _, outcome = run(episode(2077, task="pick_anything"))
-    assert outcome.success, outcome.failure_reason
+def test_what_may_lie_at_any_yaw_can_be_put_down_all_around_from_the_present_yaw_on() -> None:
+    scene = episode(0, task="pick_anything").info.scene
+    body = scene.body(scene.goals[0].object)
+    pose = body.world_from_body
+    hand = hand_down(pose.position + np.array([0.004, -0.003, 0.01]), 0.7)
+    wanted = Pose(position=pose.position + np.array([0.1, 0.2, 0.0]))
+    places = places_of(body, pose, wanted, hand=hand, yaw_symmetry=24)
+    yaws = [hand_yaw(place) for place in places]
+    assert yaws[0] == pytest.approx(0.7)
+    assert len({round(yaw, 6) for yaw in yaws}) == 24
+    assert [abs(math.remainder(yaw - 0.7, 2 * math.pi)) for yaw in yaws] == sorted(
+        abs(math.remainder(yaw - 0.7, 2 * math.pi)) for yaw in yaws
+    )
+    for place in places:
+        np.testing.assert_allclose((place @ hand.inverse() @ pose).position, wanted.position, atol=1e-9)
 
 
 def test_tasks_with_things_of_their_own_refuse_shelves() -> None:
