@@ -48,13 +48,18 @@ class Film:
         return difference(self.cells[1:], self.cells[:-1])
 
 
-BLANK_LEVELS = 1.0
-"""Contrast, of 255, below which an image is of one colour: black, green or otherwise empty."""
+_BLANK_LEVELS = 1.0
+"""Of 255, standard deviation over an image's parts below which it is of one colour: black, green or otherwise empty."""
 
 
-def contrast(film: Film) -> Array:
-    """(N,) standard deviation over an image's parts, of the colour that varies most."""
-    return np.asarray(film.cells.std(axis=(1, 2)).max(axis=1, initial=0.0))
+def flat_images(film: Film) -> NDArray[np.bool_]:
+    """(N,) images of one colour."""
+    return np.asarray(film.cells.std(axis=(1, 2)).max(axis=1, initial=0.0) < _BLANK_LEVELS)
+
+
+def is_blank(film: Film) -> bool:
+    """Whether most of its images are of one colour."""
+    return bool(np.mean(flat_images(film)) > 0.5) if len(film.cells) else False
 
 
 Films = Mapping[str, Sequence[Film]]
@@ -67,6 +72,10 @@ class Filmed(Protocol):
     @property
     def films(self) -> Films:
         """Of all its cameras that show colours."""
+        ...
+
+    def distances(self) -> Iterable[tuple[str, Iterable[NDArray[Any]]]]:
+        """(camera, its images (H, W) in metres) of the depth cameras whose distances can be read here."""
         ...
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, picture_check
 from demorec.check.evidence import Flags
-from demorec.check.films import BLANK_LEVELS, Film, Filmed, contrast, difference
+from demorec.check.films import Film, Filmed, difference, flat_images, is_blank
 from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
 
@@ -42,10 +42,13 @@ def _all(subject: Filmed) -> Iterator[Film]:
     measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
 )
 def stray_images(subject: Filmed) -> Iterator[Found]:
-    """No image is empty, and none is from another moment or place than those around it."""
+    """No image is empty, and none is from another moment or place than those around it.
+
+    Where most are empty `images_show_something` says so.
+    """
     wrong, count = [], 0
     for film in _all(subject):
-        wrong += [(film, row) for row in np.flatnonzero((contrast(film) < BLANK_LEVELS) | _alien(film)).tolist()]
+        wrong += [(film, row) for row in np.flatnonzero(_alien(film) | (flat_images(film) & ~is_blank(film))).tolist()]
         count += len(film.cells)
     if count:
         named = "; ".join(f"{film.where}, frame {film.frames[row]}" for film, row in wrong[:3])
