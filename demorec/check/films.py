@@ -89,7 +89,7 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
     state = columns.features[STATE].astype(np.float64) if STATE in columns.features else None
     found = {}
     for camera in recording.cameras:
-        cells = _cells_of(decode(recording.video_settings(camera), recording.packets(camera)))
+        cells = cells_of(decode(recording.video_settings(camera), recording.packets(camera)))
         held, frames = np.unique(columns.pictures[camera], return_index=True)
         shown = (held != NO_PICTURE) & (held < len(cells))
         rows = frames[shown]
@@ -104,7 +104,8 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
     return found
 
 
-def _cells_of(images: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+def cells_of(images: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Images (H, W, 3) of one size in parts, as `Film.cells` has them."""
     found = []
     for image in images:
         counts = part_counts(image.shape[1], image.shape[0])

@@ -199,15 +199,15 @@ def starts_at_rest(episode: CheckedEpisode) -> Measurement | None:
 
 
 @physics_check(
-    measures="speed of the last wanted motion at its end by its length against the joints' accelerations, at 30 frames a "
-    "second",
+    measures="speed at the end of the last wanted motion times its length, against the joints' accelerations, at 30 "
+    "frames a second",
     unit="s^2",
 )
 def ends_at_rest(episode: CheckedEpisode) -> Found:
     """The script of a success ends where its last motion does: catches frames cut off at the tail.
 
-    Motions are of least jerk: over the way D in the time T the last step is 10 D (dt/T)^3, and the largest acceleration
-    5.77 D/T^2. That is 0.8 of the joint's limit at most, which makes 0.00154 s^2 of a whole motion, whatever its length.
+    Motions are of least jerk: over the way D in the time T the last step is 10 D (dt/T)^3, the largest acceleration
+    5.77 D/T^2. That is 0.8 of the joint's limit at most: 0.00154 s^2 of a whole motion, whatever its length.
     """
     c, fps = episode.columns, episode.info.fps
     if episode.outcome is None or not episode.outcome.success or c.num_frames < 2:
