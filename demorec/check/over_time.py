@@ -50,7 +50,8 @@ def stray_images(subject: Filmed) -> Iterator[Found]:
     """
     wrong, count = [], 0
     for film in _all(subject):
-        wrong += [(film, row) for row in np.flatnonzero(_alien(film) | (flat_images(film) & ~is_blank(film))).tolist()]
+        odd = _alien(film) if is_blank(film) else _alien(film) | flat_images(film)
+        wrong += [(film, row) for row in np.flatnonzero(odd).tolist()]
         count += len(film.cells)
     if count:
         named = "; ".join(f"{film.where}, frame {film.frames[row]}" for film, row in wrong[:3])
@@ -95,6 +96,7 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
     """
     for camera, films in subject.films.items():
         known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
+        known = [pair for pair in known if not is_blank(pair[0])]  # told of by `images_show_something`
         steps = [np.linalg.norm(np.diff(state, axis=0), axis=1) for _, state in known]
         if not known:
             continue
