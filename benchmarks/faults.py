@@ -12,6 +12,7 @@ other people's data are made of the same recordings, stripped of their scene and
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 from support.faults import Changed
 
+from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Form, Result
 from demorec.check.episode import CheckedEpisode
 from demorec.check.evidence import Motion, motion_of_features
@@ -286,6 +288,47 @@ def colors_exchanged(c: Changed) -> Changed:
     return c.with_info(instruction=" ".join(words))
 
 
+def first_colors_exchanged(c: Changed) -> Changed:
+    """The first colours of an instruction that names several have changed places everywhere in it."""
+    words = re.findall("[a-z]+", c.info.instruction)
+    known = list(dict.fromkeys(word for word in words if word in COLOR_WORDS))
+    if len(known) < 2:
+        return c
+    other = {known[0]: known[1], known[1]: known[0]}
+    text = re.sub("[a-z]+", lambda found: other.get(found[0], found[0]), c.info.instruction)
+    return c.with_info(instruction=text) if text != c.info.instruction else c
+
+
+def another_color(c: Changed) -> Changed:
+    """What is moved has the colour of something else on the table."""
+    moved = c.info.scene.body(goal_object(c)).color_name
+    others = [body.color_name for body in c.info.scene.bodies if body.color_name not in ("", moved)]
+    if not others or moved not in c.info.instruction:
+        return c
+    return c.with_info(instruction=c.info.instruction.replace(moved, others[-1], 1))
+
+
+def held_at_release(rows: Rows) -> Rows:
+    """Where the force falls to nothing it stays for three frames more."""
+    out = rows.copy()
+    for t in np.flatnonzero((rows[:-1] > 1) & (rows[1:] == 0)) + 1:
+        out[t : t + 3] = rows[t - 1]
+    return out
+
+
+def carrying(name: str, change: Callable[[Rows], Rows]) -> Fault:
+    """Other values in a single frame in the midst of carrying."""
+
+    def fault(c: Changed) -> Changed:
+        rows = c.columns.sensed[name] if name in c.columns.sensed else getattr(c.columns, name)
+        out, where = rows.copy(), in_phase(c, "transport")
+        frame = where[2 * len(where) // 3]
+        out[frame : frame + 1] = change(rows[frame : frame + 1])
+        return c.with_columns(**({"sensed": {name: out}} if name in c.columns.sensed else {name: out}))
+
+    return fault
+
+
 def scene_body(**fields: Any) -> Fault:
     """What the first goal moves is said to be otherwise; functions are given the body."""
 
@@ -363,6 +406,20 @@ SIMULATED: tuple[tuple[str, Fault], ...] = (
     ("an object slips by 15 mm", thing(slips)),
     ("objects two frames late", thing(lambda c, r: late(r, 2))),
     ("objects one frame early", thing(lambda c, r: late(r, -1))),
+    ("contact force two frames late", column("contact_force", lambda r: late(r, 2))),
+    ("contact force two frames early", column("contact_force", lambda r: late(r, -2))),
+    ("contact force of one frame doubled", carrying("contact_force", lambda r: 2 * r)),
+    ("contact force of one frame zero", carrying("contact_force", lambda r: 0 * r)),
+    ("wrench of one frame zero", carrying("wrench", lambda r: 0 * r)),
+    ("wrench of one frame of another sign", carrying("wrench", lambda r: -r)),
+    ("efforts of one frame zero", carrying("joint_effort", lambda r: 0 * r)),
+    ("efforts of one frame a tenth", carrying("joint_effort", lambda r: 0.1 * r)),
+    ("force of the wrench of one frame + 6 N", carrying("wrench", lambda r: np.add(r, [0, 6, 0, 0, 0, 0]))),
+    ("effort of the second joint of one frame x 1.8", carrying("joint_effort", times(1, 1.8))),
+    ("contact force held for three frames at release", column("contact_force", held_at_release)),
+    ("contact force four frames late", column("contact_force", lambda r: late(r, 4))),
+    ("colours of the first two words exchanged", first_colors_exchanged),
+    ("a colour of another object", another_color),
 )  # fmt: skip
 
 
@@ -395,6 +452,13 @@ def backlash(rows: Rows, width: float = 0.03) -> Rows:
     out = rows.copy()
     for t in range(1, len(out)):
         out[t, 1] = min(max(out[t - 1, 1], rows[t, 1] - width / 2), rows[t, 1] + width / 2)
+    return out
+
+
+def coarse(rows: Rows, step: float, joints: tuple[int, ...] = tuple(range(7))) -> Rows:
+    """Encoders of so many rad a step."""
+    out = rows.copy()
+    out[:, joints] = np.round(rows[:, joints] / step) * step
     return out
 
 
@@ -470,6 +534,10 @@ STRANGE: tuple[tuple[str, Strange], ...] = (
     ("pose three frames late", pose(lambda r: late(r, 3))),
     ("state filtered", state(lambda r: filtered(r, 0.85))),
     ("gripper never moves", state(lambda r: np.column_stack([r[:, :-1], 0 * r[:, -1] + r[0, -1]]))),
+    ("backlash of 0.06 rad", state(lambda r: backlash(r, 0.06))),
+    ("backlash of 0.04 rad", state(lambda r: backlash(r, 0.04))),
+    ("encoder of 8 bits", state(lambda r: coarse(r, 2 * np.pi / 256))),
+    ("encoder of 7 bits in two joints", state(lambda r: coarse(r, 2 * np.pi / 128, (1, 3)))),
 )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ import argparse
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from check_limits import record
@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 from scipy import ndimage
 
-from demorec.check.base import Result
+from demorec.check.base import Form, Result
 from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import drawable_scene
+from demorec.check.films import Film, cells_of, likeness_of_films
 from demorec.check.report import CheckOptions
 from demorec.core.config import GenerateConfig, VideoConfig
+from demorec.core.tables import CHECKS
 from demorec.mcap.pictures import PixelCounter
 from demorec.mcap.video import VideoPacket, VideoSettings, decode, make_encoder
 from demorec.render.painter import Painter
@@ -437,6 +439,132 @@ FAULTS: list[tuple[str, str, Fault]] = [
 ]
 
 
+# --------------------------------------------------------------------------- of recordings whose scene nobody knows
+
+
+Reel = dict[str, Rows]
+"""Camera -> (T, H, W, 3)."""
+
+
+def of_one(change: Fault) -> Callable[[Reel], Reel]:
+    """A change of the first camera's images."""
+
+    def fault(reel: Reel) -> Reel:
+        first = next(iter(reel))
+        return {**reel, first: change(reel[first])}
+
+    return fault
+
+
+def changed_places(since: float, until: float = 1.0) -> Callable[[Reel], Reel]:
+    """The first two cameras, for a share of the episode."""
+
+    def fault(reel: Reel) -> Reel:
+        (one, a), (other, b) = list(reel.items())[:2]
+        rows = slice(int(since * len(a)), int(until * len(a)))
+        a, b = a.copy(), b.copy()
+        a[rows], b[rows] = reel[other][rows], reel[one][rows]
+        return {**reel, one: a, other: b}
+
+    return fault
+
+
+def hangs(seconds: float, fps: int = 10) -> Fault:
+    """One image for so long, from the first third on."""
+
+    def fault(rows: Rows) -> Rows:
+        out, first = rows.copy(), len(rows) // 3
+        out[first : first + round(seconds * fps)] = rows[first]
+        return out
+
+    return fault
+
+
+def alien(rows: Rows) -> Rows:
+    """One image of another moment."""
+    out = rows.copy()
+    out[len(rows) // 2] = rows[3]
+    return out
+
+
+def empty(rows: Rows) -> Rows:
+    """One image is black."""
+    out = rows.copy()
+    out[len(rows) // 4] = 0
+    return out
+
+
+def shifted(frames: int) -> Fault:
+    """So many frames late, or early."""
+    return lambda rows: (
+        np.concatenate([np.repeat(rows[:1], frames, axis=0), rows[:-frames]])
+        if frames > 0
+        else (np.concatenate([rows[-frames:], np.repeat(rows[-1:], -frames, axis=0)]))
+    )
+
+
+OTHERS: dict[str, Callable[[Reel], Reel]] = {
+    "cameras change places in the middle": changed_places(0.5),
+    "cameras change places for a tenth": changed_places(0.7, 0.8),
+    "cameras change places near the end": changed_places(0.9),
+    "one camera twice": lambda reel: {name: reel[next(iter(reel))] for name in reel},
+    "a camera hangs for 2 s": of_one(hangs(2.0)),
+    "a camera hangs for 1 s": of_one(hangs(1.0)),
+    "a camera hangs from the middle on": of_one(lambda rows: np.concatenate([rows[: len(rows) // 2], np.repeat(
+        rows[len(rows) // 2 :][:1], len(rows) - len(rows) // 2, axis=0)])),
+    "an image of another moment": of_one(alien),
+    "a black image": of_one(empty),
+    "a covered camera": of_one(lambda rows: (rows // 255).astype(np.uint8)),
+    "backwards": of_one(lambda rows: rows[::-1].copy()),
+    "six frames late": of_one(shifted(6)),
+    "six frames early": of_one(shifted(-6)),
+    "five frames late": of_one(shifted(5)),
+    "exposure drifts by 15 %": of_one(over_time(lambda t: 1 - 0.15 * t)),
+    "exposure drifts by 10 %": of_one(over_time(lambda t: 0.9 + 0.1 * t)),
+    "exposure hunts": of_one(over_time(lambda t: 1 + 0.06 * np.sin(20 * t))),
+    "white balance drifts": of_one(over_time(lambda t: np.stack([1 - 0.1 * t, 1 - 0 * t, 0.9 + 0.1 * t], axis=1))),
+    "exposure jumps by 8 %": of_one(over_time(lambda t: np.where(t > 0.6, 0.92, 1.0))),
+    "white balance jumps": of_one(over_time(lambda t: np.where(t[:, None] > 0.4, [0.9, 1.0, 1.0], 1.0))),
+}  # fmt: skip
+
+
+class Stranger:
+    """What is left of an episode without its scene: images beside states."""
+
+    form: ClassVar[Form] = "external"
+
+    def __init__(self, reel: Reel, state: Rows, fps: int) -> None:
+        frames = np.arange(len(state))
+        self.films = {
+            name: [Film(where=name, fps=fps, cells=cells_of(rows), frames=frames, state=state)]
+            for name, rows in reel.items()
+        }
+
+    def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
+        """As of an external recording."""
+        return likeness_of_films(self.films)
+
+    def distances(self) -> tuple[()]:
+        """Of no depth camera."""
+        return ()
+
+
+def judge_stranger(subject: Stranger) -> list[Result]:
+    """What the laws of images over time say."""
+    names = [name for name in CHECKS.names() if CHECKS.load(name).measure.__module__.endswith(".over_time")]
+    return [CHECKS.load(name).run(subject) for name in (*names, "images_show_something", "distinct_cameras")]
+
+
+def levels_of(name: str, results: Sequence[Result], total: dict[str, int], *, verbose: bool) -> None:
+    """Count and tell what was found of a fault."""
+    failed = [r.check for r in results if r.level == "fail"]
+    warned = [r.check for r in results if r.level == "warn"]
+    level = "found" if failed else "seen" if warned else "missed"
+    total[level] += 1
+    if verbose or level != "found":
+        print(f"  {level:7}{name}: {', '.join(failed or warned)}", flush=True)
+
+
 # ------------------------------------------------------------------------------------------------------------- measure
 
 
@@ -519,7 +647,7 @@ def main() -> None:
         for number, fault in enumerate(FAULTS)
         if options.half in ("both", "ab"[number % 2]) and options.only in fault[1]
     ]
-    total = {"found": 0, "seen": 0, "missed": 0}
+    total, others = ({"found": 0, "seen": 0, "missed": 0} for _ in range(2))
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.cache or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
@@ -545,13 +673,18 @@ def main() -> None:
                 changed = fault(good[key])
                 assert fault is IDENTITY or not np.array_equal(changed, good[key]), name
                 results = judge(path, {key: changed}, times=1 + (fault is IDENTITY))
-                failed = [r.check for r in results if r.level == "fail"]
-                warned = [r.check for r in results if r.level == "warn"]
-                level = "found" if failed else "seen" if warned else "missed"
-                total[level] += 1
-                if options.verbose or level != "found":
-                    print(f"  {level:7}{key[0]} {kind} {name}: {', '.join(failed or warned)}", flush=True)
-    print(f"{sum(total.values())} faults: {total}")
+                levels_of(f"{key[0]} {kind} {name}", results, total, verbose=options.verbose)
+            with CheckedEpisode(path) as episode:
+                columns, fps = episode.columns, episode.info.fps
+                state = np.column_stack([columns.joint_position[:, : episode.num_arm], columns.gripper_width])
+            reel = {camera: good[camera, "color"] for camera in cameras}
+            clean = [r for r in judge_stranger(Stranger(reel, state, fps)) if r.level in ("warn", "fail")]
+            print(f"without a scene: clean: {', '.join(r.check for r in clean) or 'passes'}", flush=True)
+            for turn, (name, spoil) in enumerate(OTHERS.items()):
+                if options.half in ("both", "ab"[turn % 2]) and options.only in name:
+                    subject = Stranger(spoil(reel), state, fps)
+                    levels_of(name, judge_stranger(subject), others, verbose=options.verbose)
+    print(f"{sum(total.values())} faults: {total}; without a scene {sum(others.values())}: {others}")
 
 
 if __name__ == "__main__":

@@ -188,6 +188,10 @@ class Dataset:
             for key in self.colour_keys
         }
 
+    def distances(self) -> Iterator[tuple[str, Iterator[NDArray[Any]]]]:
+        """Of none: of depth videos the length counts."""
+        return iter(())
+
     @cached_property
     def compared(self) -> list[tuple[int, str, PictureComparison | NotMeasured]]:
         """(episode, camera, how its pictures begin against states and scene); only with a sidecar.

@@ -277,6 +277,10 @@ class CheckedEpisode(ExitStack):
         """Those of the cameras of a recording that demorec did not simulate: each image once, beside its frame."""
         return films_of_recording(self.recording, self.columns)
 
+    def distances(self) -> Iterator[tuple[str, Iterator[NDArray[Any]]]]:
+        """Of its depth cameras."""
+        yield from ((camera, self.recording.distances(camera)) for camera in self.recording.depth_cameras)
+
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
         """(two cameras, in different places as far as these are known, correlation of their images)."""
         if self.form == "external":

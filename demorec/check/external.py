@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import IMAGES, Found, Measurement, NotMeasured, external_check, worst_frame
+from demorec.check.base import IMAGES, Found, Measurement, NotMeasured, check, external_check, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.films import BLANK_LEVELS, contrast
+from demorec.check.films import Filmed, is_blank
 from demorec.episode.episode import NO_PICTURE
 
 _NANOSECONDS = 1_000_000_000
@@ -106,25 +106,20 @@ def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
             yield Measurement(value=len(without) / len(numbers), frame=first, detail=told)
 
 
-@external_check(
+@check(
     group="pictures",
-    measures="cameras whose images do not decode, are of another size, or show one colour, or no distance, in more "
-    "than half of them",
+    on=("external", "dataset"),
+    measures="cameras whose images are of one colour, or show no distance, in more than half of them",
     needs=IMAGES,
     needs_pictures=True,
 )
-def images_show_something(subject: CheckedEpisode) -> Found:
-    """Every image decodes and shows something."""
-    recording = subject.recording
-    if not recording.info.cameras:
-        return None
-    blank, unmeasured = [], []
-    for camera in recording.depth_cameras:
-        shares = [float(np.mean(np.isfinite(values) & (values > 0))) for values in recording.distances(camera)]
+def images_show_something(subject: Filmed) -> Found:
+    """No camera is covered, and none of depth sees nothing."""
+    blank = [camera for camera, films in subject.films.items() if any(is_blank(film) for film in films)]
+    for camera, images in subject.distances():
+        shares = [float(np.mean(np.isfinite(values) & (values > 0))) for values in images]
         if shares and float(np.median(shares)) == 0:
-            unmeasured.append(camera)
-    for camera, films in subject.films.items():
-        if any(len(film.cells) and np.median(contrast(film)) < BLANK_LEVELS for film in films):
             blank.append(camera)
-    blank += unmeasured
+    if not subject.films and not blank:
+        return None
     return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))

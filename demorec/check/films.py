@@ -48,13 +48,18 @@ class Film:
         return difference(self.cells[1:], self.cells[:-1])
 
 
-BLANK_LEVELS = 1.0
-"""Contrast, of 255, below which an image is of one colour: black, green or otherwise empty."""
+_BLANK_LEVELS = 1.0
+"""Of 255, standard deviation over an image's parts below which it is of one colour: black, green or otherwise empty."""
 
 
-def contrast(film: Film) -> Array:
-    """(N,) standard deviation over an image's parts, of the colour that varies most."""
-    return np.asarray(film.cells.std(axis=(1, 2)).max(axis=1, initial=0.0))
+def flat_images(film: Film) -> NDArray[np.bool_]:
+    """(N,) images of one colour."""
+    return np.asarray(film.cells.std(axis=(1, 2)).max(axis=1, initial=0.0) < _BLANK_LEVELS)
+
+
+def is_blank(film: Film) -> bool:
+    """Whether most of its images are of one colour."""
+    return bool(np.mean(flat_images(film)) > 0.5) if len(film.cells) else False
 
 
 Films = Mapping[str, Sequence[Film]]
@@ -69,6 +74,10 @@ class Filmed(Protocol):
         """Of all its cameras that show colours."""
         ...
 
+    def distances(self) -> Iterable[tuple[str, Iterable[NDArray[Any]]]]:
+        """(camera, its images (H, W) in metres) of the depth cameras whose distances can be read here."""
+        ...
+
 
 def difference(one: NDArray[Any], other: NDArray[Any]) -> Array:
     """(N,) mean difference of images in parts."""
@@ -80,7 +89,7 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
     state = columns.features[STATE].astype(np.float64) if STATE in columns.features else None
     found = {}
     for camera in recording.cameras:
-        cells = _cells_of(decode(recording.video_settings(camera), recording.packets(camera)))
+        cells = cells_of(decode(recording.video_settings(camera), recording.packets(camera)))
         held, frames = np.unique(columns.pictures[camera], return_index=True)
         shown = (held != NO_PICTURE) & (held < len(cells))
         rows = frames[shown]
@@ -95,7 +104,8 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
     return found
 
 
-def _cells_of(images: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+def cells_of(images: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Images (H, W, 3) of one size in parts, as `Film.cells` has them."""
     found = []
     for image in images:
         counts = part_counts(image.shape[1], image.shape[0])

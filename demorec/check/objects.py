@@ -19,6 +19,8 @@ COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""
 _GAP = 0.005
 """Metres above a support from which on it bears nothing."""
+_PRESSED, _IN_HAND = 0.002, 0.05
+"""Metres by which a hand presses what it lowers into a support at most, and of what it holds from its TCP."""
 SOLID = ("box", "sphere", "cylinder", "capsule")
 """Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 
@@ -148,8 +150,13 @@ def starts_as_scene_says(episode: CheckedEpisode) -> Iterator[Found]:
     unit="m",
 )
 def penetration(episode: CheckedEpisode) -> Iterator[Found]:
-    """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules)."""
-    scene = episode.info.scene
+    """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules).
+
+    A hand that lowers something feels the support a frame late, and presses by what it went down since, or less.
+    """
+    scene, c = episode.info.scene, episode.columns
+    tcp = episode.world_from_tcp[:, :3, 3]
+    pressed = np.clip(-np.diff(tcp[:, 2], prepend=tcp[:1, 2]), 0.0, _PRESSED) * (c.contact_force > 0)
     movable = [body for body in scene.movable if body.shape.kind in SOLID]
     still = [b for b in scene.bodies if b.collides and not b.movable and b.shape.kind in SOLID]
     for number, body in enumerate(movable):
@@ -166,7 +173,8 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
             if other.movable or _is_at_surface(pose[near, :3, 3], body, other):
                 theirs = _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near])
                 depth = np.maximum(depth, theirs)
-            yield worst_frame(depth, f"{body.name} in {other.name}", frames=near)
+            held = np.linalg.norm(pose[near, :3, 3] - tcp[near], axis=1) < _IN_HAND
+            yield worst_frame(depth - held * pressed[near], f"{body.name} in {other.name}", frames=near)
     if movable:
         yield Measurement(value=0.0, detail="nothing comes near anything")
 

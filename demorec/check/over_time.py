@@ -10,7 +10,7 @@ import numpy as np
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, picture_check
 from demorec.check.evidence import Flags
-from demorec.check.films import BLANK_LEVELS, Film, Filmed, contrast, difference
+from demorec.check.films import Film, Filmed, difference, flat_images, is_blank
 from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
 
@@ -27,6 +27,8 @@ _SHOWN = 0.35
 """The least usual correlation from which anything is told."""
 _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
+_OTHER_VIEW = 0.7
+"""Share of the distance from their own views within which two images must be from exchanged ones."""
 _STANDS = 0.02
 """Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
 
@@ -42,10 +44,14 @@ def _all(subject: Filmed) -> Iterator[Film]:
     measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
 )
 def stray_images(subject: Filmed) -> Iterator[Found]:
-    """No image is empty, and none is from another moment or place than those around it."""
+    """No image is empty, and none is from another moment or place than those around it.
+
+    Where most are empty `images_show_something` says so.
+    """
     wrong, count = [], 0
     for film in _all(subject):
-        wrong += [(film, row) for row in np.flatnonzero((contrast(film) < BLANK_LEVELS) | _alien(film)).tolist()]
+        odd = _alien(film) if is_blank(film) else _alien(film) | flat_images(film)
+        wrong += [(film, row) for row in np.flatnonzero(odd).tolist()]
         count += len(film.cells)
     if count:
         named = "; ".join(f"{film.where}, frame {film.frames[row]}" for film, row in wrong[:3])
@@ -90,6 +96,7 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
     """
     for camera, films in subject.films.items():
         known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
+        known = [pair for pair in known if not is_blank(pair[0])]  # told of by `images_show_something`
         steps = [np.linalg.norm(np.diff(state, axis=0), axis=1) for _, state in known]
         if not known:
             continue
@@ -185,7 +192,7 @@ def steady_exposure(subject: Filmed) -> Iterator[Found]:
                 ratio = film.cells[..., channel][:, lit[..., channel]] / usual[..., channel][lit[..., channel]]
                 gain = np.median(ratio, axis=1)
                 gains.append(gain)
-                stays.append(np.median(np.abs(ratio / gain[:, None] - 1), axis=1))
+                stays.append(np.median(np.abs(ratio / np.maximum(gain, 1e-3)[:, None] - 1), axis=1))
             if np.quantile(np.max(stays, axis=0), 0.9) > _STANDS:
                 yield NotMeasured(why=f"{camera} moves")
                 continue
@@ -200,8 +207,8 @@ def steady_exposure(subject: Filmed) -> Iterator[Found]:
 def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
     """Each camera shows its own view: catches two that change places, within an episode or from one to another.
 
-    A view is the median of the first fifth of an episode's images, of all episodes together: half as far from the
-    other's view as from its own are only images of the other.
+    A view is the median of the first fifth of an episode's images, of all episodes together. Cameras that move leave
+    theirs: what counts is how far the images of both, taken together, are from either order of the two.
     """
     pairs = list(combinations(subject.films, 2))
     if not pairs:
@@ -217,9 +224,9 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
         ]
         for a, b in films:
             count = min(len(a.cells), len(b.cells))
-            wrong = np.ones(count, dtype=np.bool_)
-            for film, own, others in ((a, views[0], views[1]), (b, views[1], views[0])):
-                cells = film.cells[:count]
-                wrong &= difference(cells, others[None]) < 0.5 * difference(cells, own[None])
+            one_cells, other_cells = a.cells[:count], b.cells[:count]
+            as_named = difference(one_cells, views[0][None]) + difference(other_cells, views[1][None])
+            exchanged = difference(one_cells, views[1][None]) + difference(other_cells, views[0][None])
+            wrong = exchanged < _OTHER_VIEW * as_named
             frame = int(a.frames[int(np.argmax(wrong))]) if wrong.any() else None
             yield Measurement(value=int(wrong.sum()), frame=frame, detail=f"{a.where} and {other}")

@@ -229,7 +229,23 @@ def other_color(c: Changed) -> Changed:
     return c.with_info(instruction=c.info.instruction.replace("red", "purple").replace("green", "purple"))
 
 
+def once_while_carried(name: str, factor: float) -> Fault:
+    """One frame in the midst of carrying."""
+
+    def fault(c: Changed) -> Changed:
+        carried = np.flatnonzero(np.array(c.columns.phase) == "transport")
+        rows = np.array(c.columns.sensed[name] if name in c.columns.sensed else getattr(c.columns, name))
+        rows[carried[len(carried) // 2]] *= factor
+        return c.with_columns(**({"sensed": {name: rows}} if name in c.columns.sensed else {name: rows}))
+
+    return fault
+
+
 CASES: list[tuple[str, Fault, str]] = [
+    ("contact force two frames late", column("contact_force", lambda r: late(late(r))), "contact_lag"),
+    ("contact force doubled once", once_while_carried("contact_force", 2.0), "force_spikes"),
+    ("a sample of the contact force lost", once_while_carried("contact_force", 0.0), "force_spikes"),
+    ("colours exchanged", info(instruction="put the green cube on the red target"), "instruction_fits_scene"),
     ("actions late", columns(late, "action_joint_target", "action_gripper", "action_base_from_tcp"), "action_lag"),
     ("commands late", columns(late, "command_joint_target", "command_base_from_tcp"), "command_lag"),
     ("commands early", column("command_joint_target", early), "command_lag"),

@@ -56,6 +56,7 @@ LINES: list[tuple[str, Callable[[Any], None]]] = [
     ("lengths exchanged", exchanged("num_bytes")),
     ("numbers exchanged", exchanged("episode_index")),
     ("another config", lambda data: data.update(config_digest="0" * 16)),
+    ("another value of the config", lambda data: data["config"].update(depth=not data["config"]["depth"])),
     ("other versions", lambda data: data.update(versions={"demorec": "9.9"})),
 ]
 

@@ -144,6 +144,25 @@ def test_what_robots_do_is_no_fault(strange: Path, kind: str, tmp_path: Path) ->
     assert [(result.check, result.detail) for result in report.results if result.level in ("warn", "fail")] == []
 
 
+@pytest.mark.parametrize("fault", ["coarse", "play"])
+def test_a_dead_band_is_told_of(strange: Path, fault: str, tmp_path: Path) -> None:
+    """An encoder of 8 bits, and one that follows its joint only at the end of a play of 0.04 rad."""
+
+    def change(rows: Rows) -> Rows:
+        out = rows.copy()
+        if fault == "coarse":
+            out[:, 1] = np.round(rows[:, 1] / 0.0245) * 0.0245
+            return out
+        for frame in range(1, len(out)):
+            out[frame, 1] = np.clip(out[frame - 1, 1], rows[frame, 1] - 0.02, rows[frame, 1] + 0.02)
+        return out
+
+    spoilt = copy(strange, tmp_path / "spoilt")
+    edit_column(spoilt, STATE, change)
+    assert level(strange, "dead_band") == "pass"
+    assert level(spoilt, "dead_band") == "warn"
+
+
 def test_a_wrong_rate_is_found(strange: Path, tmp_path: Path) -> None:
     spoilt = copy(strange, tmp_path / "ds")
     edit_json(spoilt / "meta/info.json", slower)
@@ -336,6 +355,19 @@ def test_an_old_name_of_a_check_names_the_new_one(strange: Path, capsys: pytest.
         main(["check", str(strange), "--only", "collected_gaps"])
     assert ended.value.code == 2
     assert "names collected_gaps, which is now gaps" in capsys.readouterr().err
+
+
+def test_exposure_that_drifts(strange: Path, tmp_path: Path) -> None:
+    spoilt = copy(strange, tmp_path / "spoilt")
+
+    def brighter(images: list[Any]) -> list[Any]:
+        gains = np.linspace(0.9, 1.0, len(images))
+        return [(image * gain).astype(np.uint8) for image, gain in zip(images, gains, strict=True)]
+
+    length = Dataset(spoilt).places[0].length
+    rewrite_video(spoilt, FRONT, lambda images: [*brighter(images[:length]), *images[length:]])
+    assert level(strange, "steady_exposure", pictures=True) == "pass"
+    assert level(spoilt, "steady_exposure", pictures=True) == "warn"
 
 
 def test_images_of_an_episode_that_run_backwards(strange: Path, tmp_path: Path) -> None:

@@ -116,6 +116,17 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
         "images_show_something",
         "fail",
     ),
+    "cameras that change places": (
+        lambda e: replace(
+            e,
+            pictures={
+                "top": [*e.pictures["top"][:15], *e.pictures["side"][15:]],
+                "side": [*e.pictures["side"][:15], *e.pictures["top"][15:]],
+            },
+        ),
+        "exchanged_cameras",
+        "fail",
+    ),
     "one camera twice": (
         lambda e: replace(e, pictures={**e.pictures, "side": e.pictures["top"]}),
         "distinct_cameras",
