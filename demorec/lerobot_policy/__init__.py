@@ -12,13 +12,13 @@ before the policy does, is in `demorec.learn.training.pretrain`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACT, ACTPolicy
 from lerobot.policies.act.processor_act import make_act_pre_post_processors
@@ -30,6 +30,8 @@ __all__ = ["ActKeypointsConfig", "ActKeypointsPolicy", "KeypointEncoder", "make_
 _HIDDEN = 256
 _HEIGHT_SCALE = 0.1
 """Of a map's maximum, beside its coordinates, which lie in [-1, 1]."""
+_LEAST_STD = 1e-4
+"""By which what hardly changes is divided."""
 
 
 @PreTrainedConfig.register_subclass("act_keypoints")
@@ -41,11 +43,20 @@ class ActKeypointsConfig(ACTConfig):  # type: ignore[misc]
         num_keypoints: Maps of each camera.
         encoder_channels: Of the first convolutions; the later ones have twice as many.
         num_targets: Numbers that the encoder tells of an image beside the keypoints; set by `demorec pretrain`.
+        normalization_mapping: The encoder normalises what it gets by what it has learnt from. LeRobot would by each
+            dataset that the policy is trained on, and its images by ImageNet.
     """
 
     num_keypoints: int = 16
     encoder_channels: int = 16
     num_targets: int = 0
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.MEAN_STD,
+        }
+    )
 
 
 make_act_keypoints_pre_post_processors = make_act_pre_post_processors
@@ -66,6 +77,9 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
         super().__init__()
         self.eyes = nn.ModuleList(_maps(channels, num_keypoints) for _ in range(num_cameras))
         self.temperature = nn.Parameter(torch.zeros(num_cameras, num_keypoints))
+        for name, shape in (("image", (num_cameras, 3, 1, 1)), ("state", (state_dim,))):
+            self.register_buffer(f"{name}_mean", torch.zeros(shape))
+            self.register_buffer(f"{name}_std", torch.ones(shape))
         self.num_numbers = 3 * num_keypoints * num_cameras
         self.targets = nn.Sequential(
             nn.Linear(self.num_numbers + state_dim, _HIDDEN), nn.ReLU(),
@@ -77,17 +91,31 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
         """Keypoints (B, 3 K num_cameras) and targets (B, num_targets).
 
         Args:
-            images: Of each camera, (B, 3, H, W), normalised.
-            state: (B, S), normalised.
+            images: Of each camera, (B, 3, H, W) in [0, 1].
+            state: (B, S).
         """
         with torch.autocast(state.device.type, enabled=False):  # bfloat16 has 8 bits, fewer than an image has columns
             found = [self._keypoints(camera, image.float()) for camera, image in enumerate(images)]
             keypoints = torch.cat(found, dim=1)
-            targets: torch.Tensor = self.targets(torch.cat([keypoints, state.float()], dim=1))
+            targets: torch.Tensor = self.targets(torch.cat([keypoints, self.normalized(state)], dim=1))
         return keypoints, targets
+
+    def normalized(self, state: torch.Tensor) -> torch.Tensor:
+        """(B, S)."""
+        return (state.float() - self.state_mean) / self.state_std
+
+    def normalize_by(self, stats: Mapping[str, Mapping[str, Any]], cameras: Sequence[str]) -> None:
+        """Take the mean and the standard deviation of images and state from a dataset's statistics."""
+        for moment in ("mean", "std"):
+            images = [torch.as_tensor(stats[camera][moment]).reshape(3, 1, 1) for camera in cameras]
+            getattr(self, f"image_{moment}").copy_(torch.stack(images))
+            getattr(self, f"state_{moment}").copy_(torch.as_tensor(stats[OBS_STATE][moment]).reshape(-1))
+        self.state_std.clamp_(min=_LEAST_STD)
+        self.image_std.clamp_(min=_LEAST_STD)
 
     def _keypoints(self, camera: int, image: torch.Tensor) -> torch.Tensor:
         """(B, 3 K): expected x, expected y, and height, of the maps of one camera."""
+        image = (image - self.image_mean[camera]) / self.image_std[camera]
         maps = self.eyes[camera](image.contiguous(memory_format=torch.channels_last))
         height, width = maps.shape[2:]
         weight = (maps.flatten(2) * self.temperature[camera].exp()[:, None]).softmax(2).unflatten(2, (height, width))
@@ -122,6 +150,8 @@ class ActKeypointsPolicy(ACTPolicy):  # type: ignore[misc]
         super(ACTPolicy, self).__init__(config)
         if not config.image_features or config.robot_state_feature is None:
             raise ValueError("act_keypoints needs images and observation.state among its inputs.")
+        if {config.normalization_mapping.get(kind) for kind in ("VISUAL", "STATE")} != {NormalizationMode.IDENTITY}:
+            raise ValueError("act_keypoints normalises images and state by itself: leave normalization_mapping out.")
         encoder = KeypointEncoder(
             num_cameras=len(config.image_features),
             state_dim=config.robot_state_feature.shape[0],
@@ -141,17 +171,21 @@ class ActKeypointsPolicy(ACTPolicy):  # type: ignore[misc]
 
     def forward(self, batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, dict[str, Any]]:
         """Loss of a batch, as ACT has it."""
-        loss: tuple[torch.Tensor, dict[str, Any]] = super().forward(batch | {OBS_ENV_STATE: self.encode(batch)})
+        loss: tuple[torch.Tensor, dict[str, Any]] = super().forward(self._numbers(batch))
         return loss
 
     def predict_action_chunk(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
         """(B, chunk_size, D) actions."""
-        return super().predict_action_chunk(batch | {OBS_ENV_STATE: self.encode(batch)})
+        return super().predict_action_chunk(self._numbers(batch))
 
     def encode(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(B, N) keypoints and targets of a normalised batch."""
+        """(B, N) keypoints and targets."""
         with torch.no_grad():
             return torch.cat(self.encoder([batch[key] for key in self.config.image_features], batch[OBS_STATE]), dim=1)
+
+    def _numbers(self, batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """What ACT gets."""
+        return batch | {OBS_STATE: self.encoder.normalized(batch[OBS_STATE]), OBS_ENV_STATE: self.encode(batch)}
 
 
 def _without_images(config: ActKeypointsConfig, num_numbers: int) -> ACTConfig:
