@@ -9,13 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.annotate.tries import Story, Stretch
 from demorec.core.geometry import Array
 from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
+
+if TYPE_CHECKING:
+    from demorec.annotate.tries import Story, Stretch
 
 _STAGES = ("approach", "descend", "close", "lift", "transport", "lower", "release", "retreat")
 _ALSO = {

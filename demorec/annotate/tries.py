@@ -8,7 +8,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -17,7 +17,9 @@ from demorec.annotate.situation import Surroundings
 from demorec.core.geometry import Pose
 from demorec.episode.episode import INTERJECTION_EVENT, Columns
 from demorec.episode.scene import Goal, Scene
-from demorec.mcap import Recording
+
+if TYPE_CHECKING:
+    from demorec.mcap import Recording
 
 _SAID = (
     "No, {wanted} is meant.",

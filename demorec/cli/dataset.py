@@ -130,6 +130,9 @@ class Dataset:
             if self.command not in commands and getattr(self, flag) != getattr(Dataset, flag):
                 name = flag.replace("_", "-")
                 raise ConfigError(f"--{name} means nothing to {self.command}: it is for {', '.join(commands)}.")
+        from demorec.datasets.lerobot.files import leave_pandas_out
+
+        leave_pandas_out()
         if self.command == "diff":
             return self._diff()
         if self.command == "score":

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo, FilePosition
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.mp4_index import Mp4Index, mp4_index
 from demorec.datasets.lerobot.reader import EpisodePlace
@@ -28,15 +28,21 @@ class _VideoFile:
     """One mp4 file, opened.
 
     Attributes:
+        path: Of it.
         index: Of its images.
         frames: (N,) int64, number of the frame at which each is shown.
+        order: (N,) by which these rise.
+        keys: (K,) numbers of the keyframes.
         codec, size, pixels: As libav describes it; size is (width, height).
     """
 
     def __init__(self, path: Path, fps: int) -> None:
-        self._path = path
+        self.path = path
         self.index: Mp4Index = mp4_index(path)
         self.frames: NDArray[np.int64] = np.rint(self.index.times * fps).astype(np.int64)
+        self.order = np.argsort(self.frames, kind="stable")
+        self._sorted = self.frames[self.order]
+        self.keys = np.flatnonzero(self.index.is_keyframe)
         with opened_video(path) as (_, stream):
             context = stream.codec_context
             self.codec = codec_of(stream)
@@ -47,12 +53,16 @@ class _VideoFile:
                 raise ExportError(f"The video has lengths of less than four bytes, which are not copied: {path}")
         self._head = b""
 
+    def shown(self, begin: int, end: int) -> NDArray[np.intp]:
+        """The images of the frames from one to before another."""
+        return self.order[np.searchsorted(self._sorted, begin) : np.searchsorted(self._sorted, end)]
+
     def first_image(self, sample: bytes) -> bytes:
         """A first image as it was encoded: behind the parameter sets, which of H.264 and HEVC are those of the file."""
         if self.codec == "av1":
             return b"\x12\x00" + sample
         if not self._head:
-            with opened_video(self._path) as (_, stream):
+            with opened_video(self.path) as (_, stream):
                 self._head = access_units(stream, self.codec)(av.Packet(sample))
         return self._head
 
@@ -62,18 +72,22 @@ class PacketCutter:
 
     def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
         self._root, self._info, self._key = root, info, key
-        self._files: dict[Path, _VideoFile] = {}
+        self._files: dict[FilePosition, _VideoFile] = {}
 
-    def _open(self, path: Path) -> _VideoFile:
-        file = self._files.pop(path, None) or _VideoFile(path, self._info.fps)
-        self._files[path] = file
+    def _open(self, place: EpisodePlace) -> _VideoFile:
+        position, _ = place.videos[self._key]
+        file = self._files.pop(position, None)
+        if file is None:
+            path = self._root / position.path(self._info.video_path or VIDEO_PATH, self._key)
+            file = _VideoFile(path, self._info.fps)
+        self._files[position] = file
         if len(self._files) > _MOST_FILES:
             del self._files[next(iter(self._files))]
         return file
 
     def stream_info(self, place: EpisodePlace) -> dict[str, Any]:
         """What a dataset states about how its images are encoded."""
-        file = self._open(self._path(place))
+        file = self._open(place)
         return {
             "video.height": file.size[1],
             "video.width": file.size[0],
@@ -85,26 +99,21 @@ class PacketCutter:
             "is_depth_map": False,
         }
 
-    def _path(self, place: EpisodePlace) -> Path:
-        position, _ = place.videos[self._key]
-        return self._root / position.path(self._info.video_path or VIDEO_PATH, self._key)
-
     def cut(self, place: EpisodePlace, first: int, last: int) -> EncodedVideo:
         """The images of the frames from `first` to before `last`, with all from which these are decoded.
 
         Raises:
             ExportError: They are not there, or cannot be taken out without encoding them again.
         """
-        path = self._path(place)
-        file = self._open(path)
-        begin, end = place.videos[self._key][1] + first, place.videos[self._key][1] + last
-        wanted = np.flatnonzero((file.frames >= begin) & (file.frames < end))
+        file = self._open(place)
+        path, begin, end = file.path, place.videos[self._key][1] + first, place.videos[self._key][1] + last
+        wanted = file.shown(begin, end)
         if len(wanted) != last - first:
             raise ExportError(
                 f"Episode {place.episode_index} has {len(wanted)} images for {last - first} frames of {self._key}: "
                 f"{path}"
             )
-        keys = np.flatnonzero(file.index.is_keyframe[: wanted.min() + 1])
+        keys = file.keys[: np.searchsorted(file.keys, wanted.min(), side="right")]
         keys = keys[file.frames[keys] <= begin]
         if not len(keys):
             raise ExportError(f"Episode {place.episode_index} does not begin behind a keyframe of {self._key}: {path}")

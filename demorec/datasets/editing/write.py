@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -30,7 +30,9 @@ from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
 from demorec.datasets.staging import CODED, staged_folder
-from demorec.mcap.video import Rgb
+
+if TYPE_CHECKING:
+    from demorec.mcap.video import Rgb
 
 _OLD_STATS = "meta/episodes_stats.jsonl"
 _NUMBERS = tuple(name for name in NAMES if name != "count")

@@ -9,14 +9,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-from demorec.annotate.grounding import SeenObject
 from demorec.core.errors import ExportError, in_words
 from demorec.core.files import open_regular
 from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.staging import sync_file
+
+if TYPE_CHECKING:
+    from demorec.annotate.grounding import SeenObject
 
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
 

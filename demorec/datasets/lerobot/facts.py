@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -37,9 +37,11 @@ from demorec.annotate.progress import (
 from demorec.core.errors import ExportError, in_words
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.staging import sync_file
-from demorec.episode.episode import Columns, SuccessCheck
-from demorec.episode.scene import Scene
-from demorec.mcap import Recording
+
+if TYPE_CHECKING:
+    from demorec.episode.episode import Columns, SuccessCheck
+    from demorec.episode.scene import Scene
+    from demorec.mcap import Recording
 
 PROGRESS_PATH = "sarm_progress.parquet"
 PROPORTIONS_PATH = "meta/temporal_proportions_{head}.json"

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import os
 import struct
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -40,6 +42,22 @@ _MOST_SAID_AT_ALL, _SAID_RATIO = 16 << 20, 32
 _BYTES_PER_VALUE = 8
 _PARENT_BOXES = frozenset((b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf"))
 _MAX_BOXES = 100_000
+
+
+def leave_pandas_out() -> None:
+    """Let PyArrow work without pandas in this process: it would load it, which takes longer than most edits, only to ask
+    whether the lists that it is given are pandas' own.
+    """
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    pa.array([0])  # looks for it once, and remembers
+    sys.meta_path.remove(finder)
+
+
+class _NoPandas(MetaPathFinder):
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
+        if fullname == "pandas":
+            raise ImportError
 
 
 def read_json(path: Path) -> Any:

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.datasets.staging import sync_file
-from demorec.mcap.video import is_keyframe
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
@@ -225,6 +224,8 @@ def mp4_samples(
     Raises:
         ExportError: One of them is none.
     """
+    from demorec.mcap.video import is_keyframe  # loads all that reads recordings
+
     ends = [0, *accumulate(lengths.tolist())]
     units = [data[a:b] for a, b in pairwise(ends)]
     samples = [mp4_sample(codec, unit) for unit in units]

@@ -13,21 +13,23 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from demorec.core.errors import DemorecError, ExportError, in_words
 from demorec.core.files import read_text_limited
 from demorec.core.plain import digest, from_json, to_json
 from demorec.core.tables import ROBOTS
-from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.files import MAX_JSON_BYTES
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.writer import write_text
 from demorec.episode.features import STATE
-from demorec.mcap.description import robot_description
 from demorec.robots.assets import asset_path
 from demorec.robots.robot import RobotSpec
 from demorec.robots.so101 import SO101_FOLLOWER
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml, read_links
+
+if TYPE_CHECKING:
+    from demorec.datasets.episode import ExportEpisode
 
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 
@@ -112,6 +114,8 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     Of a dataset that does not say what its robot is; lengths are those of the model. LeRobot's own arms are left out:
     their joints are called the same in degrees and in per cent.
     """
+    from demorec.mcap.description import robot_description  # loads all that reads recordings
+
     stems = [ELEMENT_SUFFIX.sub("", name) for name in names]
     for row in ROBOTS.names():
         robot = ROBOTS.load(row)

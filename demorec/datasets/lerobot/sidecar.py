@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.core.plain import to_json, to_plain
-from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.facts import first_goal
 from demorec.datasets.lerobot.layout import (
     SIDECAR_ATTEMPTS_PATH,
@@ -36,9 +35,12 @@ from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
 from demorec.datasets.lerobot.writer import WrittenEpisode, write_text
-from demorec.episode.episode import Columns
-from demorec.episode.scene import Scene
-from demorec.mcap import Recording
+
+if TYPE_CHECKING:
+    from demorec.datasets.episode import ExportEpisode
+    from demorec.episode.episode import Columns
+    from demorec.episode.scene import Scene
+    from demorec.mcap import Recording
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import av
 import numpy as np
@@ -28,7 +28,9 @@ from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo, FilePosition
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream
-from demorec.mcap.video import Rgb, is_keyframe
+
+if TYPE_CHECKING:
+    from demorec.mcap.video import Rgb
 
 PacketCodec = Literal["h264", "h265", "av1"]
 PACKET_CODECS: dict[str, PacketCodec] = {"h264": "h264", "hevc": "h265", "av1": "av1", "libdav1d": "av1"}
@@ -192,7 +194,7 @@ class EpisodeVideo:
     def images(self, begin: int = 0) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of every frame from one on, which may be one of the lead (below 0)."""
         for frame in self._frames(begin):
-            yield cast(Rgb, frame.to_ndarray(format="rgb24"))
+            yield cast("Rgb", frame.to_ndarray(format="rgb24"))
 
     @cached_property
     def depth_scale(self) -> DepthScale:
@@ -219,7 +221,7 @@ class EpisodeVideo:
         with opened_video(self.path) as (container, stream):
             for frame in frames:
                 image = next(self._decoded(container, stream, frame))
-                yield cast(Rgb, image.to_ndarray(format="rgb24"))
+                yield cast("Rgb", image.to_ndarray(format="rgb24"))
 
     def _frames(self, begin: int = 0, size: tuple[int, int] | None = None) -> Iterator[av.VideoFrame]:
         """The decoded images from a frame on, one a frame; the size is what info.json claims."""
@@ -265,6 +267,8 @@ def why_transcoded(videos: Sequence[EpisodeVideo]) -> tuple[PacketCodec, tuple[i
     Raises:
         ExportError: A video cannot be read, or they are of several codecs or sizes.
     """
+    from demorec.mcap.video import is_keyframe  # loads all that reads recordings
+
     of_files: dict[Path, dict[int, EpisodeVideo]] = {}
     for video in videos:
         of_files.setdefault(video.path, {})[video.first] = video
