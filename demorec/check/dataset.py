@@ -214,7 +214,7 @@ class Dataset:
         """What the language columns of each episode hold; empty for a dataset without them."""
         if not set(COLUMNS) <= set(self.info.features):
             return []
-        stream = RowStream(self.path, self.info, COLUMNS, rows=64)
+        stream = RowStream(self.path, self.info, COLUMNS)
         return [spoken_of(stream.batches(place), self.path) for place in self.places]
 
     @cached_property

@@ -15,8 +15,8 @@ from demorec.datasets.editing.carried import (
     write_kept_progress,
 )
 from demorec.datasets.editing.plan import Cut, Plan
-from demorec.datasets.editing.rows import RowsBeside
 from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.reader import EpisodeRows
 from demorec.datasets.lerobot.robots import read_robot
 from demorec.datasets.lerobot.sidecar import (
     ATTEMPT_SCHEMA,
@@ -38,11 +38,10 @@ class Beside:
     Args:
         plan: What is written.
         folder: Of the new dataset.
-        aside: Folder for rows until they are asked for.
     """
 
-    def __init__(self, plan: Plan, folder: Path, aside: Path) -> None:
-        self._plan, self._folder, self._aside = plan, folder, aside
+    def __init__(self, plan: Plan, folder: Path) -> None:
+        self._plan, self._folder = plan, folder
         limits: dict[str, Any] = {"limit_mb": plan.info.data_files_size_in_mb, "chunks_size": plan.info.chunks_size}
         configs: dict[str, Any] = {}
         for source in plan.sources:
@@ -50,13 +49,9 @@ class Beside:
                 configs |= read_json(source.root / CONFIGS_PATH)
         has_any = any(source.sidecar_tables for source in plan.sources)
         self._sidecar = SidecarWriter(folder, configs, **limits) if has_any else None
-        self._rows, self._poses = [], []
-        keeps_poses = poses_are_kept(plan)
-        for number, source in enumerate(plan.sources if has_any else ()):
-            path = aside / f"episodes_{number}.arrow"
-            self._rows.append(RowsBeside(source.sidecar_tables, path, EPISODE_SCHEMA, rows=64))
-            if keeps_poses:
-                self._poses.append(CameraPoses(source, aside / f"poses_{number}.arrow"))
+        sources = plan.sources if has_any else ()
+        self._rows = [EpisodeRows(source.sidecar_tables, EPISODE_SCHEMA, rows=64) for source in sources]
+        self._poses = [CameraPoses(source) for source in (sources if poses_are_kept(plan) else ())]
         self._boxes = Boxes(plan, folder)
 
     def __enter__(self) -> Beside:
@@ -107,7 +102,7 @@ class Beside:
             found = next((s.root for s in self._plan.sources if (s.root / EXPORT_PATH).exists()), None)
             self._sidecar.finish(read_json(found / EXPORT_PATH) if found else {})
         if progress_is_kept(self._plan):
-            write_kept_progress(self._plan, self._folder, self._aside)
+            write_kept_progress(self._plan, self._folder)
 
 
 def _reworded(info: str, task: str, root: Path) -> str:

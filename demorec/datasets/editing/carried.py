@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
 from demorec.datasets.editing.plan import Cut, Plan, Source
-from demorec.datasets.editing.rows import RowsBeside
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, SeenByCamera, StoredBoxes
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, STAGE_COLUMNS, read_progress, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.reader import EpisodeRows
 from demorec.datasets.staging import sync_file
 
 _COUNTERS = ("index", "episode_index", "frame_index")
@@ -43,10 +43,10 @@ def poses_are_kept(plan: Plan) -> bool:
 class CameraPoses:
     """Those of one source."""
 
-    def __init__(self, source: Source, aside: Path) -> None:
+    def __init__(self, source: Source) -> None:
         self._root = source.root
         self._names = moving_cameras(source) or ()
-        self._rows = RowsBeside(_pose_files(source), aside, rows=_ROWS_AT_ONCE) if self._names else None
+        self._rows = EpisodeRows(_pose_files(source), rows=_ROWS_AT_ONCE) if self._names else None
 
     def of(self, episode_index: int, cut: Cut) -> dict[str, Array]:
         """Camera -> (T, 7) world_from_camera; none for an episode without; ExportError where frames lack."""
@@ -107,16 +107,13 @@ def progress_is_kept(plan: Plan) -> bool:
     )
 
 
-def write_kept_progress(plan: Plan, folder: Path, aside: Path) -> None:
+def write_kept_progress(plan: Plan, folder: Path) -> None:
     """Write the progress of the new dataset's rows: from stages, else as the sources have it of each frame."""
     if has_stages(plan):
         write_progress(folder, read_progress(folder))
         return
     path, total = folder / PROGRESS_PATH, 0
-    sources = [
-        RowsBeside([source.root / PROGRESS_PATH], aside / f"progress_{number}.arrow", rows=_ROWS_AT_ONCE)
-        for number, source in enumerate(plan.sources)
-    ]
+    sources = [EpisodeRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]
     schema = open_table(plan.sources[0].root / PROGRESS_PATH).schema_arrow
     waiting: list[pa.Table] = []
     with pq.ParquetWriter(path, schema) as writer:

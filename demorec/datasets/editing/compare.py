@@ -55,7 +55,7 @@ class Difference:
 
 
 class EpisodeComparer:
-    """Compares pairs of episodes of two datasets, asked for in the order in which the readers have them.
+    """Compares pairs of episodes of two datasets.
 
     Args:
         sources: A and B.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from demorec.core.errors import ExportError, in_words
 from demorec.datasets.editing.packets import PacketCutter
 from demorec.datasets.editing.plan import Source
-from demorec.datasets.editing.rows import Rows
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
-from demorec.datasets.lerobot.reader import EpisodePlace, column_values
+from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, column_values
 
 TASK = "task"
 """Column of the instructions, in place of `task_index`."""
@@ -94,32 +93,34 @@ class EpisodeContent:
 
 
 class ContentReader:
-    """The columns of a dataset's episodes in a given order, and their digests.
+    """The columns of a dataset's episodes, and their digests.
 
     Args:
         source: The dataset.
         shared: What of it is compared.
-        order: Numbers of the episodes that will be asked for.
-        aside: File for rows that are not asked for in their order.
         side: Whether it is the first (0) or the second (1) dataset.
     """
 
-    def __init__(self, source: Source, shared: Shared, order: Iterable[int], aside: Path, *, side: int) -> None:
+    def __init__(self, source: Source, shared: Shared, *, side: int) -> None:
         self._source, self._shared = source, shared
         self._own = {name: shared.own(side, name) for name in (*shared.columns, *shared.cameras)}
         features = source.info.features
         self._stored = [name for name in shared.cameras if not features[self._own[name]].is_video]
-        self._rows = Rows(source, [self._own[name] for name in (*shared.columns, *self._stored)], list(order), aside)
+        columns = [self._own[name] for name in (*shared.columns, *self._stored)]
+        self._rows = RowStream(source.root, source.info, columns)
         self._cutters = {
             name: PacketCutter(source.root, source.info, self._own[name])
             for name in shared.cameras
             if features[self._own[name]].is_video
         }
 
+    def __len__(self) -> int:
+        return len(self._source.places)
+
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
         """Column -> (T, D) numbers, or (T, 1) texts; of language and stored images digests of each row."""
-        place, table = self._source.places[number], self._rows.read(number)
-        features, found = self._source.info.features, {}
+        place = self._source.places[number]
+        table, features, found = self._rows.read(place), self._source.info.features, {}
         for name in (*self._shared.columns, *self._stored):
             own = self._own[name]
             values = _values(table.column(own).combine_chunks(), features[own], self._source.root)

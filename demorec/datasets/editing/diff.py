@@ -6,7 +6,6 @@ are matched by content (`content.py`), those that are not equal bit for bit are 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,11 +76,16 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
     """
     sources = (Source(a), Source(b))
     shared = Shared.of(*sources, renamed(*sources))
-    with tempfile.TemporaryDirectory(prefix="demorec-diff-") as folder:
-        contents = _contents(sources, shared, Path(folder), progress)
-        pairs = matched(*contents)
-        changed = {n: m for n, m in pairs.items() if not contents[0][n].equals(contents[1][m])}
-        found = list(_compared(sources, shared, contents, changed, Path(folder)))
+    readers = (ContentReader(sources[0], shared, side=0), ContentReader(sources[1], shared, side=1))
+    contents = _contents(readers, progress)
+    pairs = matched(*contents)
+    changed = {n: m for n, m in pairs.items() if not contents[0][n].equals(contents[1][m])}
+    found: list[Difference] = []
+    comparer = EpisodeComparer(sources, readers, shared)
+    for n, m in changed.items():
+        one, other = contents[0][n].images, contents[1][m].images
+        equal = {name: digest is not None and digest == other[name] for name, digest in one.items()}
+        found += comparer.differences(n, m, equal)
     unmatched = [(n, None) for n in range(len(contents[0])) if n not in pairs]
     others = set(pairs.values())
     extra = [(None, m) for m in range(len(contents[1])) if m not in others]
@@ -104,37 +108,18 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
 
 
 def _contents(
-    sources: tuple[Source, Source], shared: Shared, folder: Path, progress: ProgressCallback | None
+    readers: tuple[ContentReader, ContentReader], progress: ProgressCallback | None
 ) -> list[list[EpisodeContent]]:
-    total, done = sum(len(source.places) for source in sources), 0
+    total, done = sum(map(len, readers)), 0
     found: list[list[EpisodeContent]] = []
-    for source in sources:
-        reader = ContentReader(source, shared, range(len(source.places)), folder / "none", side=len(found))
+    for reader in readers:
         found.append([])
-        for number in range(len(source.places)):
+        for number in range(len(reader)):
             found[-1].append(reader.read(number))
             done += 1
             if progress is not None:
                 progress(done, total)
     return found
-
-
-def _compared(
-    sources: tuple[Source, Source],
-    shared: Shared,
-    contents: Sequence[Sequence[EpisodeContent]],
-    changed: Mapping[int, int],
-    folder: Path,
-) -> Iterator[Difference]:
-    readers = (
-        ContentReader(sources[0], shared, changed.keys(), folder / "a", side=0),
-        ContentReader(sources[1], shared, changed.values(), folder / "b", side=1),
-    )
-    comparer = EpisodeComparer(sources, readers, shared)
-    for n, m in changed.items():
-        one, other = contents[0][n].images, contents[1][m].images
-        equal = {name: digest is not None and digest == other[name] for name, digest in one.items()}
-        yield from comparer.differences(n, m, equal)
 
 
 def _one_sided(sources: tuple[Source, Source], episode: tuple[int | None, int | None]) -> Difference:

@@ -11,10 +11,10 @@ import numpy as np
 from demorec.core.errors import ConfigError
 from demorec.core.registry import nearest_match
 from demorec.datasets.editing.plan import Plan, Source, Take
-from demorec.datasets.editing.rows import Rows
 from demorec.datasets.editing.where import Condition
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
+from demorec.datasets.lerobot.reader import RowStream
 
 _SHARE_TOLERANCE = 1e-6
 
@@ -95,12 +95,12 @@ def trim_idle(source: Source, feature: str, threshold: float, margin: int) -> Pl
     if not threshold > 0 or margin < 0:
         raise ConfigError("The threshold is a share above 0, the margin a number of frames of at least 0.")
     plan = Plan.whole(source)
-    order = [cut.episode for cut in plan.cuts]
+    rows = RowStream(source.root, source.info, [feature])
 
     def numbers() -> Any:
-        rows = Rows(source, [feature], order, source.root)
         for cut in plan.cuts:
-            yield cut, column_numbers(rows.read(cut.episode).column(feature).combine_chunks()).astype(np.float64)
+            column = rows.read(source.places[cut.episode]).column(feature)
+            yield cut, column_numbers(column.combine_chunks()).astype(np.float64)
 
     low, high = np.inf, -np.inf
     for _, values in numbers():

@@ -18,18 +18,17 @@ from demorec.datasets.editing.beside import Beside
 from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
 from demorec.datasets.editing.packets import PacketCutter
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
-from demorec.datasets.editing.rows import Rows, RowsBeside
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.paths import DATASET
-from demorec.datasets.lerobot.reader import EpisodePlace
+from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, RowStream
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
-from demorec.datasets.staging import CODED, staged_folder
+from demorec.datasets.staging import staged_folder
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
@@ -76,12 +75,10 @@ def write_plan(
     """
     roots = [source.root for source in plan.sources]
     with staged_folder(out, DATASET, replace=overwrite, sources=roots) as folder:
-        aside = folder.with_name(CODED)
-        aside.mkdir(exist_ok=True)
-        readers = [_Reader(plan, number, aside, decode=decode) for number in range(len(plan.sources))]
+        readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
         with (
             DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
-            Beside(plan, folder, aside) as beside,
+            Beside(plan, folder) as beside,
         ):
             around = 0
             for done, cut in enumerate(plan.cuts, start=1):
@@ -116,7 +113,7 @@ def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
 class _Reader:
     """The episodes of one source as the plan wants them."""
 
-    def __init__(self, plan: Plan, number: int, aside: Path, *, decode: bool) -> None:
+    def __init__(self, plan: Plan, number: int, *, decode: bool) -> None:
         self.source: Source = plan.sources[number]
         self.num_decoded = 0
         self._features, self._fps = plan.info.features, plan.info.fps
@@ -125,23 +122,19 @@ class _Reader:
         info = self.source.info
         names = {take.feature for take in self._takes.values() if take.feature}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
-        order = [cut.episode for cut in plan.cuts if cut.source == number]
-        self._rows = Rows(self.source, [*self._names, "task_index"], order, aside / f"rows_{number}.arrow")
+        self._rows = RowStream(self.source.root, info, [*self._names, "task_index"])
         self._cutters = {key: PacketCutter(self.source.root, info, key) for key in info.video_keys if key in names}
         stored = [name for name in self._names if info.features[name].dtype == "image"]
         self._stored = {key: StoredImages(self.source.root, info, key) for key in stored}
-        self._facts_beside: RowsBeside | None = None
-        if types := self.source.fact_types:
-            schema = pa.schema([("episode_index", pa.int64()), *types.items()])
-            self._facts_beside = RowsBeside(
-                self.source.episode_tables, aside / f"facts_{number}.arrow", schema, rows=_EPISODES_AT_ONCE
-            )
+        schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
+        tables = self.source.episode_tables if self.source.fact_types else ()
+        self._facts_beside = EpisodeRows(tables, schema, rows=_EPISODES_AT_ONCE)
         self._known = _ImageStatistics(self.source) if not decode else None
 
     def episode(self, cut: Cut) -> EpisodeData:
         """Read an episode."""
         place = self.source.places[cut.episode]
-        all_rows = self._rows.read(cut.episode)
+        all_rows = self._rows.read(place)
         rows = all_rows.slice(cut.first, cut.last - cut.first)
         whole = (cut.first, cut.last) == (0, place.length)
         columns: dict[str, Any] = {}
@@ -229,7 +222,7 @@ class _Reader:
         return EpisodeLanguage(persistent=[*latest.values(), *kept], events=spoken.events)
 
     def _facts(self, cut: Cut, place: EpisodePlace) -> dict[str, Any]:
-        table = self._facts_beside.read(place.episode_index) if self._facts_beside is not None else None
+        table = self._facts_beside.read(place.episode_index)
         facts: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
         if "duration_s" in facts:
             facts["duration_s"] = (cut.last - cut.first) / self._fps

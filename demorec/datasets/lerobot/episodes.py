@@ -161,7 +161,7 @@ class LeRobotDataset:
     def language_stream(self) -> RowStream | None:
         """The language columns; None in a dataset without them."""
         spoken = {name for name, feature in self.info.features.items() if feature.dtype == "language"}
-        return RowStream(self.root, self.info, COLUMNS, rows=64) if spoken >= set(COLUMNS) else None
+        return RowStream(self.root, self.info, COLUMNS) if spoken >= set(COLUMNS) else None
 
     @cached_property
     def known(self) -> Mapping[int, dict[str, Any]]:

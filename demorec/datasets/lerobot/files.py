@@ -45,8 +45,9 @@ _MAX_BOXES = 100_000
 
 
 def leave_pandas_out() -> None:
-    """Let PyArrow work without pandas in this process: it would load it, which takes longer than most edits, only to ask
-    whether the lists that it is given are pandas' own.
+    """Let PyArrow work without pandas in this process.
+
+    It would load it, which takes longer than most edits, to ask whether the lists that it is given are pandas' own.
     """
     finder = _NoPandas()
     sys.meta_path.insert(0, finder)
@@ -83,7 +84,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
-    """A Parquet file that has these columns, for what its footer says; its rows are read by `table_batches` alone.
+    """A Parquet file that has these columns, for what its footer says; its rows are read by `TableRows` alone.
 
     Raises:
         ExportError: It is missing, no regular file, no Parquet, lacks a column, or claims too many values.
@@ -112,7 +113,14 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
 def table_batches(
     path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE
 ) -> Iterator[pa.RecordBatch]:
-    """Some columns of a table, some rows at a time: the only way by which rows of a dataset are read.
+    """All rows of some columns of a table, some at a time; arguments and errors as of `TableRows`."""
+    yield from TableRows(path, columns, rows=rows).read()
+
+
+class TableRows:
+    """Rows of a table by number: the only way by which rows of a dataset are read. One batch is in memory.
+
+    Stretches that are asked for in rising order are read in one pass; before another one, row groups are skipped.
 
     Args:
         path: The file.
@@ -122,11 +130,46 @@ def table_batches(
     Raises:
         ExportError: As `open_table`, or the values unpack to too much.
     """
-    table = open_table(path, columns)
-    with _table_errors(path):
-        row_bytes = _check_pages(path, table.metadata, columns)
-        names = None if columns is None else list(columns)
-        yield from table.iter_batches(batch_size=max(1, min(rows, _BATCH_BYTES // row_bytes)), columns=names)
+
+    def __init__(self, path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE) -> None:
+        self._path, self._names = path, None if columns is None else list(columns)
+        self._table = open_table(path, columns)
+        with _table_errors(path):
+            row_bytes = _check_pages(path, self._table.metadata, columns)
+        self._at_once = max(1, min(rows, _BATCH_BYTES // row_bytes))
+        self.rest()
+
+    def rest(self) -> None:
+        """Let go of the batch that is in memory."""
+        self._batches: Iterator[pa.RecordBatch] = iter(())
+        self._held: pa.RecordBatch | None = None
+        self._next = self._table.metadata.num_rows + 1
+
+    def read(self, first: int = 0, count: int | None = None) -> Iterator[pa.RecordBatch]:
+        """So many rows from one on, all by default; fewer where the table ends before."""
+        end = self._table.metadata.num_rows if count is None else first + count
+        if first < self._next:
+            self._seek(first)
+        while self._next < end:
+            with _table_errors(self._path):
+                batch = next(self._batches, None) if self._held is None else self._held
+            if batch is None:
+                return
+            skipped = min(len(batch), max(0, first - self._next))
+            taken = min(len(batch), end - self._next) - skipped
+            rest = batch.slice(skipped + taken)
+            self._held = rest if len(rest) else None
+            self._next += skipped + taken
+            if taken:
+                yield batch.slice(skipped, taken)
+
+    def _seek(self, first: int) -> None:
+        metadata = self._table.metadata
+        begins = np.cumsum([0, *(metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))])
+        group = max(0, int(np.searchsorted(begins, first, side="right")) - 1)
+        groups = range(group, metadata.num_row_groups)
+        self._held, self._next = None, int(begins[group])
+        self._batches = self._table.iter_batches(batch_size=self._at_once, row_groups=groups, columns=self._names)
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.Schema | None = None) -> pa.Table:

@@ -13,13 +13,21 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.files import column_numbers, read_json_lines, read_table, table_batches
+from demorec.core.errors import ExportError, in_words
+from demorec.datasets.lerobot.files import (
+    TableRows,
+    column_numbers,
+    open_table,
+    read_json_lines,
+    read_table,
+    table_batches,
+)
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, OLD_TASKS_PATH, TASKS_PATH, DatasetInfo, FilePosition
 
 _MOST = 1 << 40
 """Above all rows, frames and seconds of any dataset."""
+_INDEX_ROWS = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,45 +138,107 @@ def read_tasks(root: Path) -> list[str]:
 _NUMBERS = ("float32", "float64", "int64", "bool")
 
 
-class RowStream:
-    """Some columns of the data files, episode after episode; one batch of a file is in memory.
+_MOST_FILES = 16
+"""That a stream of rows holds open."""
 
-    Episodes that are asked for in their order are read in one pass.
+
+class RowStream:
+    """Some columns of the data files, episode after episode, in any order; one batch is in memory.
 
     Args:
         root: The dataset's folder.
         info: Of it.
         names: Of the columns.
-        rows: At once, at most.
     """
 
-    def __init__(self, root: Path, info: DatasetInfo, names: Sequence[str], *, rows: int) -> None:
-        self._root, self._info, self._names, self._rows = root, info, list(names), rows
-        self._position: FilePosition | None = None
-        self._batches: Iterator[pa.RecordBatch] = iter(())
-        self._held: pa.RecordBatch | None = None
-        self._next = 0
+    def __init__(self, root: Path, info: DatasetInfo, names: Sequence[str]) -> None:
+        self._root, self._info, self._names = root, info, list(names)
+        kinds = {info.features[name].dtype for name in names}
+        self._at_once = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
+        self._tables: dict[FilePosition, TableRows] = {}
 
     def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
         """The rows of an episode; ExportError when they cannot be read."""
-        if place.data != self._position or place.first_row < self._next:
-            path = self._root / place.data.path(self._info.data_path)
-            self._position, self._next, self._held = place.data, 0, None
-            self._batches = table_batches(path, self._names, rows=self._rows)
-        end = place.first_row + place.length
-        while self._next < end:
-            batch = next(self._batches, None) if self._held is None else self._held
-            if batch is None:
-                raise ExportError(
-                    f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {self._root}"
-                )
-            skipped = min(len(batch), max(0, place.first_row - self._next))
-            taken = min(len(batch), end - self._next) - skipped
-            rest = batch.slice(skipped + taken)
-            self._held = rest if len(rest) else None
-            self._next += skipped + taken
-            if taken:
-                yield batch.slice(skipped, taken)
+        left = place.length
+        for batch in self._table(place.data).read(place.first_row, place.length) if left else ():
+            left -= len(batch)
+            yield batch
+        if left:
+            raise ExportError(
+                f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {self._root}"
+            )
+
+    def read(self, place: EpisodePlace) -> pa.Table:
+        """All rows of an episode, as `batches`; ExportError for one without any, too."""
+        if not place.length:
+            raise ExportError(f"Episode {place.episode_index} has no frames, drop it: {self._root}")
+        return pa.Table.from_batches(list(self.batches(place)))
+
+    def _table(self, position: FilePosition) -> TableRows:
+        found = self._tables.pop(position, None)
+        if self._tables and (found is None or len(self._tables) >= _MOST_FILES):
+            self._tables[next(reversed(self._tables))].rest()
+        if found is None:
+            found = TableRows(self._root / position.path(self._info.data_path), self._names, rows=self._at_once)
+        self._tables[position] = found
+        if len(self._tables) > _MOST_FILES:
+            del self._tables[next(iter(self._tables))]
+        return found
+
+
+class EpisodeRows:
+    """Rows of tables with a column `episode_index`, by episode; ExportError when they cannot be read.
+
+    Args:
+        paths: The tables.
+        schema: Columns that they have, null where a table lacks one; by default those of the first table.
+        rows: That are read at once, at most.
+    """
+
+    def __init__(self, paths: Sequence[Path], schema: pa.Schema | None = None, *, rows: int) -> None:
+        self._schema = schema
+        self._stretches: dict[int, list[tuple[TableRows, Path, int, int]]] = {}
+        for path in paths:
+            there = open_table(path, ["episode_index"]).schema_arrow
+            self._schema = self._schema or there.remove_metadata()
+            table = TableRows(path, [name for name in self._schema.names if name in there.names], rows=rows)
+            first = 0
+            for batch in table_batches(path, ["episode_index"], rows=_INDEX_ROWS):
+                episodes = column_numbers(batch.column(0))[:, 0]
+                begins = [0, *(np.flatnonzero(np.diff(episodes)) + 1).tolist()]
+                for begin, end in zip(begins, [*begins[1:], len(episodes)], strict=True):
+                    stretch = (table, path, first + begin, end - begin)
+                    self._stretches.setdefault(int(episodes[begin]), []).append(stretch)
+                first += len(batch)
+
+    def read(self, episode_index: int) -> pa.Table | None:
+        """All rows of an episode; None where there are none."""
+        batches = [
+            self._conformed(batch, path)
+            for table, path, first, count in self._stretches.get(episode_index, ())
+            for batch in table.read(first, count)
+        ]
+        return pa.Table.from_batches(batches) if batches else None
+
+    def frames(self, episode_index: int, first: int, last: int) -> pa.Table | None:
+        """Those whose `frame_index` is from `first` to before `last`, in order."""
+        if (rows := self.read(episode_index)) is None:
+            return None
+        frames = rows.column("frame_index").to_numpy()
+        kept = np.flatnonzero((frames >= first) & (frames < last))
+        return rows.take(pa.array(kept[np.argsort(frames[kept], kind="stable")]))
+
+    def _conformed(self, batch: pa.RecordBatch, path: Path) -> pa.RecordBatch:
+        try:
+            columns = [
+                batch.column(item.name).cast(item.type)
+                if item.name in batch.schema.names
+                else pa.nulls(len(batch), item.type)
+                for item in self._schema or ()
+            ]
+            return pa.RecordBatch.from_arrays(columns, schema=self._schema)
+        except (ValueError, pa.ArrowException) as error:
+            raise ExportError(f"The table has columns of other types ({in_words(error)}): {path}") from error
 
 
 class RowReader:
@@ -182,8 +252,7 @@ class RowReader:
         self._root = root
         self._info = info
         self.names = [name for name, feature in info.features.items() if not feature.is_video]
-        has_strings = any(feature.dtype in ("string", "language") for feature in info.features.values())
-        self._stream = RowStream(root, info, self.names, rows=64 if has_strings else 4096)
+        self._stream = RowStream(root, info, self.names)
 
     def read(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
         """Feature -> (T, D) of an episode, of language columns digests."""

@@ -308,7 +308,7 @@ class StoredImages:
 
     def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
         self._root, self._info, self._key = root, info, key
-        self._stream = RowStream(root, info, [key], rows=16)
+        self._stream = RowStream(root, info, [key])
         self._allowed = _PIXEL_BYTES
         self._counted: set[Path] = set()
 
