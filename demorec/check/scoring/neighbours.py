@@ -22,7 +22,9 @@ _ROWS_EACH = 3
 _RIDGE, _PREDICTED, _LEAST_ERROR = 0.3, 0.75, 0.25
 """Of the model of words: its damping, the share of the episodes with and without a word that it must tell right, and
 its error at least."""
-_FEWEST_WORDS, _MOST_WORDS = 5, 60
+_ODD_SHARE, _FEWEST_ODD = 0.05, 2
+"""Of the episodes that a word's error leaves out, the farthest off: what is looked for is no measure of itself."""
+_FEWEST_WORDS, _MOST_WORDS = 3, 60
 """Episodes that have a word, and that lack it, for it to be learned; and how many words are, the most frequent ones."""
 
 
@@ -150,10 +152,13 @@ def told_otherwise(tasks: Sequence[str], looks: Array) -> tuple[Array, list[str]
         told = np.where(has, 1.0, -1.0)
         mean = told.mean()
         seen = told - (told - mean - centred @ (influence @ (told - mean))) / (1 - leverage)
-        agrees = told * seen
-        if min((agrees[has] > 0).mean(), (agrees[~has] > 0).mean()) < _PREDICTED:
+        # A rare word is predicted too low everywhere: what is usual with it is 1, what is usual without it -1.
+        high, low = float(np.median(seen[has])), float(np.median(seen[~has]))
+        agrees = told * (2 * seen - high - low) / max(high - low, 1e-9)
+        if high <= low or min((agrees[has] > 0).mean(), (agrees[~has] > 0).mean()) < _PREDICTED:
             continue
-        error = max(float(np.sqrt(((1 - agrees[agrees > 0]) ** 2).mean())), _LEAST_ERROR)
+        usual = np.sort((1 - agrees) ** 2)[: -max(_FEWEST_ODD, round(_ODD_SHARE * len(tasks)))]
+        error = max(float(np.sqrt(usual.mean())), _LEAST_ERROR)
         off = np.where(agrees < 0, 1 - agrees, 0.0) / error
         for number in np.flatnonzero(off > worst):
             worst[number], which[number] = off[number], word
