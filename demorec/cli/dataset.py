@@ -14,6 +14,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, ExportError, check_option
 from demorec.core.registry import check_choice
+from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
     from demorec.check.scoring.score import EpisodeScore
@@ -75,7 +76,8 @@ class Dataset:
     command: Annotated[Positional[str], arg(metavar="COMMAND")]
     """What to do."""
     words: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET")]
-    """The dataset, of merge two or more, of diff two; behind it the features of rename (OLD=NEW) and drop-features."""
+    """The dataset, or the run whose dataset it is; of merge two or more, of diff two; behind it the features of rename
+    (OLD=NEW) and drop-features."""
     out: Path | None = None
     """Folder of the new dataset; of split the folder in which each part gets one; of score a JSON file."""
     where: str = ""
@@ -150,7 +152,7 @@ class Dataset:
         takes_words = self.command in ("rename", "drop-features")
         if len(self.words) > num_sources and not takes_words:
             raise ConfigError(f"demorec dataset {self.command} takes one dataset; demorec dataset merge joins several.")
-        sources = [Source(Path(word)) for word in self.words[:num_sources]]
+        sources = [Source(_dataset(word)) for word in self.words[:num_sources]]
         self._add_scores(sources[0])
         plans = self._split(sources[0]) if self.command == "split" else {"": self._plan(sources)}
         for name, plan in plans.items():
@@ -180,7 +182,7 @@ class Dataset:
 
         if len(self.words) != 2:
             raise ConfigError(f"Two datasets are compared, given are {len(self.words)}: demorec dataset diff A B.")
-        a, b = (Path(word) for word in self.words)
+        a, b = map(_dataset, self.words)
         try:
             with ProgressBar("reading") as bar:
                 found = diff(a, b, progress=bar.set)
@@ -202,7 +204,7 @@ class Dataset:
 
         if len(self.words) != 1:
             raise ConfigError(f"One dataset is scored, given are {len(self.words)}: demorec dataset score DATASET.")
-        root = Path(self.words[0])
+        root = _dataset(self.words[0])
         if self.out is not None:
             refuse_inside([self.out])
             check_target(self.out, source=root, overwrite=self.overwrite)
@@ -284,6 +286,19 @@ class Dataset:
             length = plan.sources[cut.source].places[cut.episode].length
             if (cut.first, cut.last) != (0, length):
                 say(f"episode {cut.episode}: {cut.first} frames cut at the beginning, {length - cut.last} at the end")
+
+
+def _dataset(word: str) -> Path:
+    """The dataset that is named, a run's own where a run is; ConfigError for anything else."""
+    from demorec.runs.find import expect
+    from demorec.runs.run_file import DATASET
+
+    path = Path(word)
+    if expect(path, "dataset", "run").kind == "dataset":
+        return path
+    if not is_dataset(path / DATASET):
+        raise ConfigError(f"This run has no dataset in {DATASET}/, make one (demorec export lerobot): {path}")
+    return path / DATASET
 
 
 def scored(root: Path, *, images: bool = True, workers: int | None = None) -> list[EpisodeScore]:
