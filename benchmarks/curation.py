@@ -1,6 +1,7 @@
 """Does `demorec dataset score` find the bad demonstrations: AUC over all, and of each kind of fault.
 
     python benchmarks/curation.py --out curation                              all of it: an hour with one core
+    python benchmarks/curation.py --out curation --small                      to see that it runs: some minutes
     python benchmarks/curation.py --out curation --episodes 40 --only stack/panda/7
 
 Simulates episodes, of which 30 in 100 are spoilt, and writes them with LeRobot's own writer: under demorec's names, and
@@ -252,7 +253,10 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=80, help="of each cell")
     parser.add_argument("--only", nargs="*", default=MEASURED, help="cells task/robot/seed")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--small", action="store_true", help="16 episodes of one cell, 5 of them spoilt")
     args = parser.parse_args()
+    if args.small:
+        args.episodes, args.only = 16, MEASURED[:1]
     scores: dict[tuple[str, str], list[float]] = {}
     lines = []
     for cell in args.only:
