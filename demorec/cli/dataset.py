@@ -223,7 +223,7 @@ class Dataset:
 
     def _add_scores(self, source: Source) -> None:
         """Where a condition or an order is by score, and the dataset has no column of that name."""
-        from demorec.datasets.editing.where import names_in
+        from demorec.datasets.editing.operations import names_in
 
         if "score" not in names_in(self.where) | {self.by} or any("score" in row for row in source.columns()):
             return

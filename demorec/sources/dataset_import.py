@@ -13,8 +13,9 @@ from pathlib import Path
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.lerobot.episodes import DatasetRecording, LeRobotDataset
+from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.datasets.lerobot.videos import why_transcoded
 from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError, in_words, resource_error
 from demorec.core.geometry import Array, Pose
-from demorec.datasets.lerobot.episodes import DatasetRecording, LeRobotDataset, with_robot
+from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places
+from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
 from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.datasets.lerobot.episodes import DatasetRecording
+from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.episode import NO_PICTURE, Columns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import ObservationRows

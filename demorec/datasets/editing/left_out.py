@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from demorec.datasets.editing.carried import has_stages, poses_are_kept, progress_is_kept
+from demorec.datasets.editing.beside import has_stages, poses_are_kept, progress_is_kept
 from demorec.datasets.editing.plan import Plan
 from demorec.datasets.lerobot.boxes import BOXES_DIR
 from demorec.datasets.lerobot.card import SECOND_CARD_PATH, THUMBNAILS_PATH

@@ -31,10 +31,6 @@ from demorec.datasets.editing.operations import joined
 from demorec.datasets.editing.plan import Plan, Source, Take
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 
-_CODING = (
-    "video.codec", "video.pix_fmt", "is_depth_map", "depth_unit", "video.depth_min", "video.depth_max", "video.shift",
-    "video.use_log",
-)  # fmt: skip
 _UNITS = ("rad", "degree", "normalised")
 _MAX_BYTES = 1 << 20
 _KEYS = ("path", "robot_type", "drop", "feature")
@@ -160,16 +156,8 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
         if there is None:
             yield f"{root} has {name}, which the first one has not"
             continue
-        for what in ("dtype", "shape"):
-            if getattr(there, what) != getattr(feature, what):
-                yield f"{name} of {root} has {what} {getattr(feature, what)}, not {getattr(there, what)}"
-        if feature.is_numeric and None not in (there.names, feature.names) and there.names != feature.names:
-            own, first = (", ".join(each.names or ()) for each in (feature, there))
-            yield f"{name} of {root} has the elements {own}, not {first}"
-        mine, theirs = feature.info or {}, there.info or {}
-        for key in _CODING if feature.is_video else ():
-            if key in mine and key in theirs and mine[key] != theirs[key]:
-                yield f"{key} of {name} is {mine[key]} in {root}, not {theirs[key]}"
+        for what, value, first in feature.differences(there):
+            yield f"{name} of {root} has {what} {value}, not {first}"
 
 
 def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
@@ -207,5 +195,4 @@ def _is_vector(*features: DatasetFeature) -> bool:
 
 
 def _fits(a: DatasetFeature, b: DatasetFeature) -> bool:
-    mine, theirs = a.info or {}, b.info or {}
-    return a.shape == b.shape and all(mine.get(key) == theirs.get(key) for key in _CODING)
+    return not any(a.differences(b))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,14 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.editing.attempts import Attempts
-from demorec.datasets.lerobot.files import open_table, read_json_lines, table_batches
+from demorec.datasets.lerobot.files import open_table, read_json_lines, read_table, table_batches
 from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
+from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
 from demorec.episode.features import ACTION, STATE
 
 _PLACED = ("stats/", "videos/", "data/", "meta/")
@@ -127,6 +129,67 @@ def _columns(tables: Sequence[Path], names: Sequence[str]) -> list[dict[str, Any
         for batch in table_batches(path, there):
             found += batch.to_pylist()
     return found
+
+
+class Attempts:
+    """The attempts that stand beside a dataset, by the episode to which each belongs.
+
+    Args:
+        root: Its folder.
+        episodes: `episode_index` of those of which demorec keeps something, in order.
+    """
+
+    def __init__(self, root: Path, episodes: Sequence[int]) -> None:
+        paths = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+        tables = [read_table(path, ATTEMPT_SCHEMA.names, schema=ATTEMPT_SCHEMA) for path in paths]
+        self._table = pa.concat_tables(tables or [ATTEMPT_SCHEMA.empty_table()]).combine_chunks()
+        is_inside = self._table.column("in_dataset").to_pylist()
+        inside = [number for number, value in enumerate(is_inside) if value]
+        # One row was written for every episode, in order.
+        owners = dict(zip(inside, episodes, strict=True)) if len(inside) == len(episodes) else {}
+        self._own = {episode: number for number, episode in owners.items()}
+        self._failed: dict[int, list[int]] = {}
+        self._homeless: list[int] = []
+        indices = self._table.column("run_episode_index").to_pylist()
+        same: dict[int | None, list[int]] = {}
+        for number in owners:
+            same.setdefault(indices[number], []).append(number)
+        for number, value in enumerate(is_inside):
+            if value:
+                continue
+            # Several runs may have an episode of that number: the rows of one run stand together.
+            if others := same.get(indices[number]):
+                place = bisect_left(others, number)
+                nearest = min(others[max(place - 1, 0) : place + 1], key=lambda n: abs(n - number))
+                self._failed.setdefault(owners[nearest], []).append(number)
+            else:
+                self._homeless.append(number)
+
+    def _rows(self, numbers: Sequence[int]) -> list[dict[str, Any]]:
+        found = [row for number in numbers for row in self._table.slice(number, 1).to_pylist()]
+        return [{name: value for name, value in row.items() if name != "in_dataset"} for row in found]
+
+    def of(self, episode_index: int) -> dict[str, Any] | None:
+        """The one that became an episode of the dataset."""
+        number = self._own.get(episode_index)
+        return None if number is None else self._rows([number])[0]
+
+    def failed(self, episode_index: int) -> list[dict[str, Any]]:
+        """Those before it that failed."""
+        return self._rows(self._failed.get(episode_index, []))
+
+    def homeless(self) -> list[dict[str, Any]]:
+        """Failed ones at episodes that the dataset has not."""
+        return self._rows(self._homeless)
+
+    def num_failed(self, episode_index: int) -> int:
+        """How many failed before an episode."""
+        return len(self._failed.get(episode_index, []))
+
+    @property
+    def num_homeless(self) -> int:
+        """How many failed at episodes that the dataset has not."""
+        return len(self._homeless)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

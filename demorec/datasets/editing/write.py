@@ -260,14 +260,9 @@ class _ImageStatistics:
     def __init__(self, source: Source) -> None:
         keys = [name for name, feature in source.info.features.items() if feature.is_camera]
         self._found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
-        for number, key, entry in _old_statistics(source, keys) if source.info.is_old else _entries(source, keys):
-            try:
-                part = Statistics.from_json(entry)
-                values = np.stack([part.values[name] for name in _NUMBERS]) if part is not None else np.array(np.nan)
-            except (ValueError, TypeError):
-                continue
-            if part is not None and np.isfinite(values).all():
-                self._found[number, key] = part.count, values
+        for number, key, count, values in _old_statistics(source, keys) if source.info.is_old else _kept(source, keys):
+            if np.isfinite(values).all():
+                self._found[number, key] = count, values
 
     def of(self, place: EpisodePlace, key: str) -> Statistics | None:
         """Those of an episode, weighted by its frames; None where they are not kept."""
@@ -277,27 +272,38 @@ class _ImageStatistics:
         return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
 
 
-def _entries(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    for path in sorted((source.root / "meta" / "episodes").glob("*/*.parquet")):
+def _kept(source: Source, keys: list[str]) -> Iterator[tuple[int, str, int, NDArray[np.float64]]]:
+    """(episode_index, camera, count, (9, C) numbers) of each; none of a batch in which one is missing."""
+    for path in source.episode_tables:
         there = open_table(path).schema_arrow.names
         complete = [key for key in keys if all(f"stats/{key}/{name}" in there for name in NAMES)]
         names = ["episode_index", *(f"stats/{key}/{name}" for key in complete for name in NAMES)]
         for batch in table_batches(path, names):
-            for row in batch.to_pylist():
-                for key in complete:
-                    entry = {name: row[f"stats/{key}/{name}"] for name in NAMES}
-                    if None not in entry.values():
-                        yield row["episode_index"], key, entry
+            episodes = batch.column("episode_index").to_pylist()
+            for key in complete:
+                columns = {name: batch.column(f"stats/{key}/{name}") for name in NAMES}
+                if any(column.null_count for column in columns.values()):
+                    continue
+                try:
+                    counts = column_numbers(columns["count"])[:, 0].astype(np.int64).tolist()
+                    values = np.stack([column_numbers(columns[name]) for name in _NUMBERS], axis=1).astype(np.float64)
+                except (ValueError, TypeError):
+                    continue
+                yield from zip(episodes, [key] * len(episodes), counts, values, strict=True)
 
 
-def _old_statistics(source: Source, keys: list[str]) -> Iterator[tuple[int, str, dict[str, Any]]]:
+def _old_statistics(source: Source, keys: list[str]) -> Iterator[tuple[int, str, int, NDArray[np.float64]]]:
     path = source.root / _OLD_STATS
     for line in read_json_lines(path) if path.exists() else ():
-        stats = line.get("stats")
-        for key in keys:
-            entry = stats.get(key) if isinstance(stats, dict) else None
-            if isinstance(entry, dict) and isinstance(line.get("episode_index"), int):
-                yield line["episode_index"], key, entry
+        stats, number = line.get("stats"), line.get("episode_index")
+        for key in keys if isinstance(stats, dict) and isinstance(number, int) else ():
+            entry = stats.get(key)
+            try:
+                part = Statistics.from_json(entry) if isinstance(entry, dict) else None
+                if part is not None:
+                    yield number, key, part.count, np.stack([part.values[name] for name in _NUMBERS])
+            except (ValueError, TypeError):
+                continue
 
 
 def _video_histogram(video: EpisodeVideo, feature: DatasetFeature, first: int, last: int) -> PixelHistogram:

@@ -6,8 +6,9 @@ Files that are there are never opened for writing; new episodes get new files, a
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,27 +21,13 @@ from demorec.datasets.lerobot.layout import (
     CODEBASE_VERSION,
     STATS_PATH,
     TASKS_PATH,
-    DatasetFeature,
     DatasetInfo,
-    how_to_convert,
 )
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import read_tasks
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import Statistics
 from demorec.datasets.lerobot.writer import WriterStart
-
-_CODING = (
-    "video.codec",
-    "video.pix_fmt",
-    "is_depth_map",
-    "depth_unit",
-    "video.depth_min",
-    "video.depth_max",
-    "video.shift",
-    "video.use_log",
-)
-"""What a reader of the dataset takes as true of all its videos."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +58,8 @@ def open_existing(root: Path) -> Existing:
     info = DatasetInfo.load(root)
     if info.is_old:
         raise ExportError(
-            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to; {how_to_convert(root)}"
+            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to; "
+            f"{_how_to_convert(root)}"
         )
     tables = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
     episodes = frames = 0
@@ -134,26 +122,14 @@ def features_to_append(existing: Existing, new: DatasetInfo) -> tuple[str, ...]:
         if name not in offered:
             wrong.append(f"it has {name!r}, which the recordings and these options do not give")
         else:
-            wrong += [f"{name}: {difference}" for difference in _feature_differences(feature, offered[name])]
+            found = feature.differences(offered[name])
+            wrong += [f"{name}: {what} is {there}, not {ours}" for what, there, ours in found]
     if wrong:
         raise ConfigError(
             f"These recordings cannot be appended, since the dataset differs: {'; '.join(wrong)}. "
             f"Export into a new folder, or with other options: {existing.root}"
         )
     return tuple(name for name in offered if name not in info.features)
-
-
-def _feature_differences(there: DatasetFeature, ours: DatasetFeature) -> Iterable[str]:
-    for what in ("dtype", "shape"):
-        if getattr(there, what) != getattr(ours, what):
-            yield f"{what} is {getattr(there, what)}, not {getattr(ours, what)}"
-    if not there.is_video and there.names is not None and there.names != ours.names:
-        yield f"components are {', '.join(there.names)}, not {', '.join(ours.names or ())}"
-    if there.is_video and ours.is_video:
-        mine, theirs = ours.info or {}, there.info or {}
-        for key in _CODING:
-            if key in theirs and theirs[key] != mine.get(key):
-                yield f"{key} is {theirs[key]}, not {mine.get(key)}"
 
 
 def link_files(source: Path, target: Path) -> None:
@@ -179,3 +155,16 @@ def link_files(source: Path, target: Path) -> None:
                 except OSError:
                     pass  # another file system, or one without links
             shutil.copy2(path, copy)
+
+
+def _how_to_convert(root: Path) -> str:
+    """The command of LeRobot 0.6.1 that converts a dataset of v2.1, for a sentence."""
+    root = root.resolve()
+    arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
+    # The converter deletes what has these names, or puts it in the dataset's place.
+    taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
+    first = f"move {' and '.join(taken)} away first, then " if taken else ""
+    return (
+        f"{first}LeRobot converts it in its place and leaves the old one beside it, as {root.name}_old: python -m "
+        f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
+    )

@@ -12,9 +12,8 @@ import hashlib
 import json
 import re
 import reprlib
-import shlex
 import string
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -56,6 +55,11 @@ _ARROW_TYPES = {
     "string": pa.string(),
     **{str(kind): kind for kind in (pa.int8(), pa.int16(), pa.int32(), pa.uint8(), pa.uint16(), pa.uint32())},
 }
+_CODING = (
+    "video.codec", "video.pix_fmt", "is_depth_map", "depth_unit", "video.depth_min", "video.depth_max", "video.shift",
+    "video.use_log",
+)  # fmt: skip
+"""What a reader of the dataset takes as true of all its videos."""
 _MOST_DIMENSIONS = 5
 """Of arrays that HF datasets has types for."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
@@ -97,6 +101,16 @@ class DatasetFeature:
     def is_depth(self) -> bool:
         """Whether it is a camera whose pixels are distances."""
         return bool((self.info or {}).get("is_depth_map"))
+
+    def differences(self, other: DatasetFeature) -> Iterator[tuple[str, Any, Any]]:
+        """In what rows of both cannot stand in one dataset: name, value, the other's value; unknown ones are equal."""
+        pairs = {name: (getattr(self, name), getattr(other, name)) for name in ("dtype", "shape")}
+        if self.is_numeric and None not in (self.names, other.names):
+            pairs["elements"] = tuple(", ".join(feature.names or ()) for feature in (self, other))  # type: ignore[assignment]
+        if self.is_video:
+            mine, theirs = self.info or {}, other.info or {}
+            pairs |= {key: (mine[key], theirs[key]) for key in _CODING if key in mine and key in theirs}
+        yield from ((name, *values) for name, values in pairs.items() if values[0] != values[1])
 
     def to_json(self) -> dict[str, Any]:
         """The entry as info.json has it."""
@@ -160,18 +174,6 @@ class FilePosition:
     def path(self, template: str, video_key: str = "") -> str:
         """The path within the dataset."""
         return template.format(chunk_index=self.chunk, file_index=self.file, video_key=video_key)
-
-
-def next_position(folder: Path, chunks_size: int) -> FilePosition:
-    """The first number that no file of a folder (chunk-CCC/file-FFF.*) has, counting from the last one."""
-    last: FilePosition | None = None
-    for path in folder.glob("chunk-*/file-*"):
-        chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
-        if chunk.isdigit() and file.isdigit():
-            position = FilePosition(chunk=int(chunk), file=int(file))
-            if last is None or (position.chunk, position.file) > (last.chunk, last.file):
-                last = position
-    return FilePosition() if last is None else last.next(chunks_size)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,19 +285,6 @@ def _as_new(template: object) -> object:
     if not isinstance(template, str):
         return template
     return template.replace("{episode_chunk", "{chunk_index").replace("{episode_index", "{file_index")
-
-
-def how_to_convert(root: Path) -> str:
-    """The command of LeRobot 0.6.1 that converts a dataset of v2.1, for a sentence."""
-    root = root.resolve()
-    arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
-    # The converter deletes what has these names, or puts it in the dataset's place.
-    taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
-    first = f"move {' and '.join(taken)} away first, then " if taken else ""
-    return (
-        f"{first}LeRobot converts it in its place and leaves the old one beside it, as {root.name}_old: python -m "
-        f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
-    )
 
 
 def _is_count(value: object, low: int, high: int) -> bool:

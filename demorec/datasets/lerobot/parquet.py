@@ -12,13 +12,25 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.datasets.lerobot.files import plain_column
-from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition, next_position
+from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition
 from demorec.datasets.staging import sync_file
 
 _ROWS_PER_TABLE = 100
 _ROWS_PER_GROUP = 4096
 _BYTES_PER_GROUP = 2 * MEBIBYTE
 """Tables are collected up to so many rows or bytes: a row group costs a writer and a reader far more than its rows."""
+
+
+def next_position(folder: Path, chunks_size: int) -> FilePosition:
+    """The first number that no file of a folder (chunk-CCC/file-FFF.*) has, counting from the last one."""
+    last: FilePosition | None = None
+    for path in folder.glob("chunk-*/file-*"):
+        chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
+        if chunk.isdigit() and file.isdigit():
+            position = FilePosition(chunk=int(chunk), file=int(file))
+            if last is None or (position.chunk, position.file) > (last.chunk, last.file):
+                last = position
+    return FilePosition() if last is None else last.next(chunks_size)
 
 
 class RollingParquet:

@@ -196,27 +196,25 @@ class EpisodeRows:
     """
 
     def __init__(self, paths: Sequence[Path], schema: pa.Schema | None = None, *, rows: int) -> None:
-        self._schema = schema
-        self._stretches: dict[int, list[tuple[TableRows, Path, int, int]]] = {}
+        self._schema, self._at_once = schema, rows
+        self._stretches: dict[int, list[tuple[Path, int, int]]] = {}
+        self._last: tuple[Path, TableRows] | None = None
         for path in paths:
-            there = open_table(path, ["episode_index"]).schema_arrow
+            there, first = open_table(path, ["episode_index"]).schema_arrow, 0
             self._schema = self._schema or there.remove_metadata()
-            table = TableRows(path, [name for name in self._schema.names if name in there.names], rows=rows)
-            first = 0
             for batch in table_batches(path, ["episode_index"], rows=_INDEX_ROWS):
                 episodes = column_numbers(batch.column(0))[:, 0]
                 begins = [0, *(np.flatnonzero(np.diff(episodes)) + 1).tolist()]
                 for begin, end in zip(begins, [*begins[1:], len(episodes)], strict=True):
-                    stretch = (table, path, first + begin, end - begin)
-                    self._stretches.setdefault(int(episodes[begin]), []).append(stretch)
+                    self._stretches.setdefault(int(episodes[begin]), []).append((path, first + begin, end - begin))
                 first += len(batch)
 
     def read(self, episode_index: int) -> pa.Table | None:
         """All rows of an episode; None where there are none."""
         batches = [
             self._conformed(batch, path)
-            for table, path, first, count in self._stretches.get(episode_index, ())
-            for batch in table.read(first, count)
+            for path, first, count in self._stretches.get(episode_index, ())
+            for batch in self._table(path).read(first, count)
         ]
         return pa.Table.from_batches(batches) if batches else None
 
@@ -227,6 +225,14 @@ class EpisodeRows:
         frames = rows.column("frame_index").to_numpy()
         kept = np.flatnonzero((frames >= first) & (frames < last))
         return rows.take(pa.array(kept[np.argsort(frames[kept], kind="stable")]))
+
+    def _table(self, path: Path) -> TableRows:
+        """The table, the last one of which stays open."""
+        if self._last is None or self._last[0] != path:
+            there = open_table(path).schema_arrow.names
+            names = [item.name for item in self._schema or () if item.name in there]
+            self._last = path, TableRows(path, names, rows=self._at_once)
+        return self._last[1]
 
     def _conformed(self, batch: pa.RecordBatch, path: Path) -> pa.RecordBatch:
         try:

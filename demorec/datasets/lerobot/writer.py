@@ -39,10 +39,9 @@ from demorec.datasets.lerobot.layout import (
     data_schema,
     episode_digest,
     merged_video_info,
-    next_position,
 )
 from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
-from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, vector_array
+from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, next_position, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import column_values
 from demorec.datasets.lerobot.stats import (

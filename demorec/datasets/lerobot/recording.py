@@ -1,0 +1,262 @@
+"""One episode of a LeRobot dataset with the interface of a recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ExportError
+from demorec.core.geometry import Pose
+from demorec.datasets.lerobot.boxes import BOXES_DIR, ReadBox, read_boxes
+from demorec.datasets.lerobot.language import PERSISTENT, SpokenEpisode, spoken_of
+from demorec.datasets.lerobot.reader import EpisodePlace
+from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
+from demorec.episode.episode import Columns, Outcome, frame_time_ns
+from demorec.episode.features import DEPTH_SUFFIX, STATE
+from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
+from demorec.mcap.frame_check import MAX_SUBTASK
+from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
+
+if TYPE_CHECKING:
+    from demorec.datasets.lerobot.episodes import LeRobotDataset
+
+_SUCCESS, _EPISODE = "next.success", "episode_index"
+_TIME_TOLERANCE_S = 1e-4
+"""By which LeRobot lets a row's time be off the grid."""
+_UNNAMED_ROBOT = "unknown"
+_MAX_REASON = 10_000
+
+
+class DatasetRecording:
+    """One episode of a dataset, with the interface of `demorec.mcap.Recording`; frames are at multiples of 1/fps.
+
+    Attributes:
+        path: The dataset's folder.
+        dataset, place: Where it lies.
+        known: What the sidecar says of it; empty where none is.
+        num_frames: T.
+
+    Methods and properties raise ExportError where the files cannot be read.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, place: EpisodePlace) -> None:
+        self.path, self.dataset, self.place = dataset.root, dataset, place
+        self.num_frames = place.length
+        self.known: Mapping[str, Any] = dataset.known.get(place.episode_index, {})
+        is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
+        self.cameras = tuple(name for name, depth in is_depth.items() if not depth)
+        self.depth_cameras = tuple(name for name, depth in is_depth.items() if depth)
+
+    @cached_property
+    def info(self) -> EpisodeInfo:
+        """What is known of it; its robot and cameras as the sidecar describes them."""
+        robot = self.robot if self.dataset.has_one_robot and self.known.get("robot_digest") is not None else None
+        links = set() if robot is None else {robot.model.root, *(joint.child for joint in robot.model.joints)}
+        described = {camera["name"]: camera for camera in self.known.get("cameras") or () if camera is not None}
+        cameras = [
+            # A depth camera of a simulated episode has no entry of its own there.
+            _described(
+                self.dataset.camera(name), described.get(name, described.get(name.removesuffix(DEPTH_SUFFIX))), links
+            )
+            for name in self.dataset.keys
+        ]
+        info = EpisodeInfo(
+            episode_index=self.place.episode_index,
+            instruction=self._instruction(),
+            robot_name=self.dataset.info.robot_type or _UNNAMED_ROBOT,
+            fps=int(self.dataset.info.fps),
+            features=self.dataset.features,
+            cameras=tuple(cameras),
+            origin=Origin(kind="dataset"),
+        )
+        return info if robot is None else with_robot(info, robot)
+
+    def _instruction(self) -> str:
+        indices = dict.fromkeys(self._rows["task_index"][:, 0].tolist())
+        tasks = self.dataset.tasks
+        if any(not 0 <= index < len(tasks) for index in indices):
+            raise ExportError(
+                f"Episode {self.place.episode_index} names a task that is not in the table of tasks: {self.path}"
+            )
+        return "; ".join(" ".join(tasks[int(index)].split()) for index in indices)
+
+    @cached_property
+    def robot(self) -> DatasetRobot | None:
+        """The arm that the sidecar keeps, or one of ours that has joints of these names; None for neither."""
+        if (name := self.known.get("robot_digest")) is not None:
+            return self.dataset.robot(str(name))
+        state = self.dataset.info.features.get(STATE)
+        return recognised_robot(state.names) if state is not None and state.names and not self.known else None
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """As the sidecar has it, or else as the last row says."""
+        success, reason = self.known.get("success"), self.known.get("failure_reason") or ""
+        if len(reason) > _MAX_REASON or not reason.isprintable():
+            reason = ""
+        if not self.known and _SUCCESS in self._rows and self.num_frames:
+            success = bool(self._rows[_SUCCESS][-1, 0])
+        return Outcome(success=success, num_frames=self.num_frames, failure_reason=reason)
+
+    @property
+    def success(self) -> bool | None:
+        """How it ended; None where nobody said."""
+        return self.outcome.success
+
+    @cached_property
+    def _rows(self) -> Mapping[str, NDArray[Any]]:
+        rows, info, number = self.dataset.rows.read(self.place), self.dataset.info, self.place.episode_index
+        if _EPISODE in rows and (rows[_EPISODE] != number).any():
+            raise ExportError(
+                f"The rows of episode {number} are those of others, by its place in the table: {self.path}"
+            )
+        off = np.abs(rows["timestamp"][:, 0].astype(np.float64) - np.arange(self.num_frames) / int(info.fps))
+        if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
+            raise ExportError(
+                f"Row {wrong[0]} of episode {number} is at {rows['timestamp'][wrong[0], 0]:.4f} s, which is no "
+                f"multiple of 1/{info.fps} s: {self.path}"
+            )
+        for feature in self.dataset.features:
+            found, claimed = rows[feature.name].dtype, info.features[feature.name].dtype
+            if self.num_frames and found != claimed:
+                raise ExportError(f"The column {feature.name} holds {found}, not {claimed}: {self.path}")
+        return rows
+
+    def columns(self) -> Columns:
+        """All numbers, one row a frame, each feature in the type that recordings hold it in."""
+        return self._columns
+
+    @cached_property
+    def _columns(self) -> Columns:
+        leads = {name: self._lead(name) for name in self.dataset.keys}
+        begin, fps = max(leads.values(), default=0), int(self.dataset.info.fps)
+        times = np.array([frame_time_ns(index, fps) for index in range(begin + self.num_frames)], dtype=np.int64)
+        features = {item.name: self._rows[item.name].astype(item.dtype) for item in self.dataset.features}
+        return Columns(
+            time_ns=times[begin:],
+            features=features,
+            stamps=dict.fromkeys(features, times[begin:]),
+            pictures={name: np.arange(lead, lead + self.num_frames) for name, lead in leads.items()},
+            picture_stamps={name: times[begin - lead :] for name, lead in leads.items()},
+        )
+
+    def _lead(self, camera: str) -> int:
+        """How many images of a camera come before the first frame: what that is decoded from."""
+        key = self.dataset.keys[camera]
+        feature = self.dataset.info.features[key]
+        return self.dataset.video(key, self.place).lead if feature.is_video and not feature.is_depth else 0
+
+    def video_settings(self, camera: str) -> VideoSettings:
+        """How the images of a camera are encoded; those in rows of tables are given as JPEG."""
+        found = self.dataset.camera(camera)
+        return settings_of_coded(found.kept or "jpeg", found.width, found.height, int(self.dataset.info.fps))
+
+    def packets(self, camera: str) -> Iterator[VideoPacket]:
+        """The encoded images of a camera in order; `frame_index` is their number, by which frames hold them."""
+        key, lead, times = self.dataset.keys[camera], self._lead(camera), self.columns().picture_stamps[camera]
+        if self.dataset.info.features[key].is_video:
+            for frame, data, is_key in self.dataset.video(key, self.place).packets():
+                number = min(frame + lead, len(times) - 1)
+                yield VideoPacket(frame_index=number, time_ns=int(times[number]), data=data, is_keyframe=is_key)
+            return
+        found = self.dataset.camera(camera)
+        encoder = make_encoder(
+            video=VideoConfig(codec="jpeg"), width=found.width, height=found.height, fps=int(self.dataset.info.fps)
+        )
+        for number, image in enumerate(self.images(camera)):
+            (data,) = encoder.encode(image)
+            yield VideoPacket(frame_index=number, time_ns=int(times[number]), data=data, is_keyframe=True)
+
+    def images(self, camera: str) -> Iterator[Rgb]:
+        """The decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
+        key = self.dataset.keys[camera]
+        if self.dataset.info.features[key].is_video:
+            return self.dataset.video(key, self.place).images(-self._lead(camera))
+        return self.dataset.stored_images(key, self.place)
+
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
+        """What some frames, in rising order, show of a camera, (H, W, 3) uint8 RGB."""
+        key = self.dataset.keys[camera]
+        if self.dataset.info.features[key].is_video:
+            return self.dataset.video(key, self.place).images_at(frames)
+        return self.dataset.stored_images(key, self.place, frames)
+
+    def distances(self, camera: str) -> Iterator[NDArray[np.float32]]:
+        """The images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""
+        return self.dataset.video(self.dataset.keys[camera], self.place).distances()
+
+    depth = distances
+
+    @cached_property
+    def spoken(self) -> SpokenEpisode:
+        """What its language columns hold; nothing in a dataset without them."""
+        stream = self.dataset.language_stream
+        return SpokenEpisode(persistent=[]) if stream is None else spoken_of(stream.batches(self.place), self.path)
+
+    @cached_property
+    def subtasks(self) -> tuple[tuple[int, str], ...]:
+        """(frame, what is begun there), in order; empty where nobody said any.
+
+        What else is said, or cannot be held, is noted among what the dataset leaves out.
+        """
+        texts: dict[int, str] = {}
+        for row in self.spoken.persistent:
+            text, begin = str(row.get("content")), row.get("timestamp")
+            frame = begin * self.dataset.info.fps if isinstance(begin, float) else -1
+            if row.get("style") != "subtask" or not 0 <= frame < self.num_frames:
+                self.dataset.left_out.setdefault(PERSISTENT, "all but its subtasks")
+            elif len(text) > MAX_SUBTASK or not text.isprintable():
+                self.dataset.left_out[PERSISTENT] = f"a subtask is no single line of at most {MAX_SUBTASK} characters"
+                return ()
+            else:
+                texts[round(frame)] = text
+        return tuple(sorted(texts.items()))
+
+    def boxes(self, camera: str) -> Iterator[tuple[int, ReadBox]]:
+        """(frame, box) of what a camera sees, of a dataset with boxes beside it."""
+        path = self.path / BOXES_DIR / f"{self.dataset.keys[camera]}.json"
+        for item in read_boxes(path) if path.exists() else ():
+            if 0 <= (frame := item.index - self.place.from_index) < self.num_frames:
+                yield frame, item
+
+
+def with_robot(info: EpisodeInfo, robot: DatasetRobot) -> EpisodeInfo:
+    """The description with an arm, and which of its joints the features move."""
+    joints, units = robot.record.joints, robot.record.units
+
+    def fitting(found: Mapping[str, tuple[str, ...]], feature: Feature) -> tuple[str, ...]:
+        values = found.get(feature.name, ())
+        return values if len(values) == len(feature.names) else ()
+
+    features = tuple(
+        replace(feature, joints=fitting(joints, feature), units=fitting(units, feature)) for feature in info.features
+    )
+    return replace(info, urdf=robot.urdf, features=features)
+
+
+def _described(camera: Camera, found: Mapping[str, Any] | None, links: set[str]) -> Camera:
+    """A camera with what the sidecar says of it."""
+    if found is None:
+        return camera
+    intrinsics, pose = found["intrinsics"], found["mount_from_camera"]
+    if intrinsics is not None and len(intrinsics) == 9 and all(map(_is_finite, intrinsics)):
+        camera = replace(camera, intrinsics=tuple(intrinsics))
+    # A camera that stands in the world of a simulation hangs on no link, and where the arm stands there is not said.
+    is_pose = (
+        pose is not None and len(pose) == 7 and all(map(_is_finite, pose)) and abs(math.hypot(*pose[3:]) - 1) < 1e-3
+    )
+    if found["mount"] in links and is_pose:
+        placed = Pose(position=np.array(pose[:3]), quat_xyzw=np.array(pose[3:]))
+        camera = replace(camera, mount=found["mount"], mount_from_camera=placed)
+    return camera
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, float) and math.isfinite(value)
