@@ -296,7 +296,9 @@ def _old_statistics(source: Source, keys: list[str]) -> Iterator[tuple[int, str,
     path = source.root / _OLD_STATS
     for line in read_json_lines(path) if path.exists() else ():
         stats, number = line.get("stats"), line.get("episode_index")
-        for key in keys if isinstance(stats, dict) and isinstance(number, int) else ():
+        if not isinstance(stats, dict) or not isinstance(number, int):
+            continue
+        for key in keys:
             entry = stats.get(key)
             try:
                 part = Statistics.from_json(entry) if isinstance(entry, dict) else None
