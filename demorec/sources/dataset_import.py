@@ -50,7 +50,7 @@ def import_lerobot(root: Path, out: Path, *, video: VideoConfig | None = None) -
     digest, num_new = functools.cache(sha256_of), 0
     with open_external_run(out, recovers=False) as folder:
         for number in range(len(dataset.places)):
-            recording = dataset.recording(number)
+            recording = DatasetRecording(dataset, number)
             info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
             if not folder.has(info):
                 write_frames(
@@ -84,7 +84,7 @@ def _cameras(dataset: LeRobotDataset) -> tuple[dict[str, Camera], dict[str, str]
         feature = dataset.info.features[key]
         cameras[name] = camera = dataset.camera(name)
         if feature.is_depth:
-            next(dataset.recording(0).distances(name))
+            next(DatasetRecording(dataset, 0).distances(name))
             fates[name] = "the distances of its codes, in metres (32FC1)"
         elif feature.is_video:
             codec, (width, height), reason = why_transcoded([dataset.video(key, place) for place in dataset.places])

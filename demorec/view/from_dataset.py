@@ -70,7 +70,7 @@ def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
     numbers = [number for number, place in enumerate(dataset.places) if place.episode_index == episode_index]
     if not numbers:
         raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
-    recording = dataset.recording(numbers[0])
+    recording = DatasetRecording(dataset, numbers[0])
     group = root.resolve().name
     known = {
         "name": f"episode_{episode_index:06d}",

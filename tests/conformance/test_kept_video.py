@@ -22,6 +22,7 @@ from support.export import episode_rows, export
 
 from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.episodes import LeRobotDataset
+from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
 from demorec.sources.import_run import import_bags
@@ -109,7 +110,7 @@ def test_single_pictures(expected: list[Pictures], dataset: Path) -> None:
     found_in = LeRobotDataset(dataset)
     for number, pictures in enumerate(expected):
         frames = [0, 1, GOP, len(pictures) - 1]
-        for frame, found in zip(frames, found_in.recording(number).images_at("high", frames), strict=True):
+        for frame, found in zip(frames, DatasetRecording(found_in, number).images_at("high", frames), strict=True):
             assert np.array_equal(found, pictures[frame])
 
 
@@ -169,7 +170,7 @@ def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path
 def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Pictures], dataset: Path) -> None:
     found = LeRobotDataset(dataset)
     for number, (place, pictures) in enumerate(zip(found.places, expected, strict=True)):
-        packets = list(found.recording(number).packets("high"))
+        packets = list(DatasetRecording(found, number).packets("high"))
         assert packets[0].is_keyframe
         assert [packet.frame_index for packet in packets] == list(range(len(packets)))
         with av.open(io.BytesIO(b"".join(packet.data for packet in packets)), "r", format="h264") as container:

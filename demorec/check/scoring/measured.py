@@ -18,6 +18,7 @@ from demorec.check.scoring.sight import Sight, sight
 from demorec.core.errors import ExportError, without_path
 from demorec.datasets.editing.content import row_hashes
 from demorec.datasets.lerobot.episodes import LeRobotDataset
+from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.features import ACTION, STATE
 
 _FEWEST_FRAMES = 8
@@ -96,7 +97,7 @@ def _measured(dataset: LeRobotDataset, scale: Scale | None, number: int, *, imag
     moved = None if motion is None or scale is None else movement(motion, scale)
     flaws = list(_flaws(rows, place.length, float(dataset.info.fps)))
     sights: dict[str, Sight] = {}
-    recording = dataset.recording(number)
+    recording = DatasetRecording(dataset, number)
     grips = moved.grips if moved is not None else ()
     first, last = grips[0] if grips else (place.length // 2, place.length // 2)
     for camera in recording.cameras if images and place.length else ():

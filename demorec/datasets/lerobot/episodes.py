@@ -2,7 +2,7 @@
 
     dataset = LeRobotDataset(root)
     for number in range(len(dataset)):
-        recording = dataset.recording(number)
+        recording = DatasetRecording(dataset, number)
         recording.info, recording.columns(), recording.packets("front"), recording.subtasks
 
 Formats v3.0, v2.1 and v2.0 are read. What our own exports keep beside the tables (outcome, robot, cameras) is used
@@ -28,7 +28,6 @@ from demorec.datasets.lerobot.language import COLUMNS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, RowReader, RowStream, episode_places, read_tasks
-from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages, codec_of, opened_video
@@ -215,10 +214,6 @@ class LeRobotDataset:
         if key not in self._stored:
             self._stored[key] = StoredImages(self.root, self.info, key)
         return self._stored[key].read(place, frames)
-
-    def recording(self, number: int) -> DatasetRecording:
-        """The episode of a place, counted from 0; one after the other they are read in one pass."""
-        return DatasetRecording(self, self.places[number])
 
 
 def _why_left_out(name: str, feature: DatasetFeature) -> str:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,14 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot.boxes import BOXES_DIR, ReadBox, read_boxes
+from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.language import PERSISTENT, SpokenEpisode, spoken_of
-from demorec.datasets.lerobot.reader import EpisodePlace
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
 from demorec.episode.episode import Columns, Outcome, frame_time_ns
 from demorec.episode.features import DEPTH_SUFFIX, STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
 from demorec.mcap.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
-
-if TYPE_CHECKING:
-    from demorec.datasets.lerobot.episodes import LeRobotDataset
 
 _SUCCESS, _EPISODE = "next.success", "episode_index"
 _TIME_TOLERANCE_S = 1e-4
@@ -37,6 +34,12 @@ _MAX_REASON = 10_000
 class DatasetRecording:
     """One episode of a dataset, with the interface of `demorec.mcap.Recording`; frames are at multiples of 1/fps.
 
+    One after the other they are read in one pass.
+
+    Args:
+        dataset: Opened.
+        number: Of the episode's place in it, from 0.
+
     Attributes:
         path: The dataset's folder.
         dataset, place: Where it lies.
@@ -46,8 +49,9 @@ class DatasetRecording:
     Methods and properties raise ExportError where the files cannot be read.
     """
 
-    def __init__(self, dataset: LeRobotDataset, place: EpisodePlace) -> None:
-        self.path, self.dataset, self.place = dataset.root, dataset, place
+    def __init__(self, dataset: LeRobotDataset, number: int) -> None:
+        self.place = place = dataset.places[number]
+        self.path, self.dataset = dataset.root, dataset
         self.num_frames = place.length
         self.known: Mapping[str, Any] = dataset.known.get(place.episode_index, {})
         is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
