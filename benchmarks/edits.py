@@ -29,6 +29,7 @@ import numpy as np
 
 BIN = Path(sys.executable).parent
 ENVIRONMENT = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # with it every start would compile the package anew
 
 
 def written_by_lerobot(root: Path, episodes: int, frames: int, size: int) -> Path:
