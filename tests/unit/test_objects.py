@@ -323,7 +323,7 @@ def test_random_shapes_are_closed_and_lie_flat() -> None:
     assert kind.count == 345
     for number in (0, 100, 344):
         shape = kind.shape(number)
-        assert as_trimesh(shape).is_watertight
+        assert shape.is_closed()
         assert float(shape.extents[2]) < 0.07
 
 
