@@ -114,11 +114,14 @@ class PickAnything(TableTask):
         others: list[Body] = []
         for thing in things[1:]:
             radius = radius_of(thing)
-            point = sampler.point(
-                EVERYWHERE if onto == "mark" else BESIDE_TRAY,
-                accept=lambda point, radius=radius: all(math.dist(point, at) > r + radius for at, r in taken),  # type: ignore[misc]
-                what="another thing",
-            )
+            try:
+                point = sampler.point(
+                    EVERYWHERE if onto == "mark" else BESIDE_TRAY,
+                    accept=lambda point, radius=radius: all(math.dist(point, at) > r + radius for at, r in taken),  # type: ignore[misc]
+                    what="another thing",
+                )
+            except SceneError:  # the table is full
+                break
             taken.append((point, radius + GAP))
             others.append(_standing(thing, point, sampler.yaw(), role="distractor"))
         return [target, wanted, *others], [goal]
