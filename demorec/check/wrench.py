@@ -26,9 +26,9 @@ from demorec.core.geometry import Array
 
 _LEVER = 0.2
 """Metres at which a torque counts as much as a force."""
-_LEAST_TORQUE = 0.01
+_LEAST_TORQUE = 0.012
 """N m below which nothing is said: motors of wrists that bear less differ from the wrench by up to 0.0063 N m (of 145
-clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), 0.63 of this."""
+clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
 _MOST_LAG = 3
 """Frames up to which wrench and motors are shifted against each other."""
 
