@@ -17,9 +17,9 @@ def test_a_keypoint_is_where_the_map_is_high() -> None:
     from demorec.lerobot_policy import KeypointEncoder
 
     encoder = KeypointEncoder(num_cameras=1, state_dim=2, num_keypoints=1, channels=4, num_targets=3).eval()
-    encoder.eyes[0] = torch.nn.AvgPool2d(4)  # a map is the image itself, a quarter of its size
-    image = torch.zeros(1, 1, 40, 80)
-    image[0, 0, 4:8, 60:64] = 50.0
+    encoder.eyes[0] = torch.nn.AvgPool3d((3, 4, 4))  # a map is the grey image, a quarter of its size
+    image = torch.zeros(1, 3, 40, 80)
+    image[0, :, 4:8, 60:64] = 50.0
     keypoints, targets = encoder([image], torch.zeros(1, 2))
     across, down = np.linspace(-1, 1, 20)[15], np.linspace(-1, 1, 10)[1]
     assert keypoints[0].tolist() == pytest.approx([across, down, 5.0], abs=1e-5)

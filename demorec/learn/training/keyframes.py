@@ -26,13 +26,11 @@ class KeyframeTargets:
 
     Attributes:
         values: (N, K) metres, and sines and cosines of angles.
-        is_ahead: (N, K) whether the keyframe that a value is about still comes; where not, the value means nothing.
         names: Of the components.
         offsets: Places of the offset from the TCP to the next keyframe, base frame, x, y, z.
     """
 
     values: NDArray[np.float32]
-    is_ahead: NDArray[np.bool_]
     names: tuple[str, ...]
     offsets: tuple[int, int, int]
 
@@ -45,7 +43,7 @@ def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) 
         episode: (N,) number of each frame's episode; its frames follow one another.
 
     Returns:
-        (N, 2) indices of the next one and of the one after it, -1 where the episode has none.
+        (N, 2) indices of the next one and of the one after it; the episode's last frame where there is none.
     """
     is_open = opening > (opening.min() + opening.max()) / 2
     frames = np.arange(len(episode))
@@ -56,7 +54,7 @@ def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) 
     place = np.searchsorted(changes, frames, side="right")
     for k in range(NUM_KEYFRAMES):
         candidate = np.append(changes, len(episode))[np.minimum(place + k, len(changes))]
-        found[:, k] = np.where(candidate <= last, candidate, -1)
+        found[:, k] = np.minimum(candidate, last)
     return found
 
 
@@ -70,8 +68,6 @@ def keyframe_targets(
         quat_xyzw: (N, 4) of the TCP, base frame.
         keyframes: As of `find_keyframes`.
     """
-    is_ahead = keyframes >= 0
-    keyframes = np.where(is_ahead, keyframes, np.arange(len(position))[:, None])
     xyz = position.astype(np.float64)
     yaw = _yaw(quat_xyzw.astype(np.float64))
     columns: dict[str, Array] = {}
@@ -97,10 +93,7 @@ def keyframe_targets(
     names = tuple(columns)
     x, y, z = (names.index(f"keyframe_0.from_tcp.{name}") for name in "xyz")
     return KeyframeTargets(
-        values=np.stack(list(columns.values()), axis=1).astype(np.float32),
-        is_ahead=is_ahead[:, [int(name.removeprefix("keyframe_")[0]) for name in names]],
-        names=names,
-        offsets=(x, y, z),
+        values=np.stack(list(columns.values()), axis=1).astype(np.float32), names=names, offsets=(x, y, z)
     )
 
 

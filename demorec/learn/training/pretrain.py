@@ -170,13 +170,9 @@ class _Lessons:
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
         self._learnt, self._held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1))
-        for rows in (self._learnt, self._held_out):
-            if not targets.is_ahead[rows].any():
-                raise ConfigError("The gripper is not commanded to close or open, in the first or the last episodes.")
-        learnt, is_ahead = targets.values[self._learnt].astype(np.float64), targets.is_ahead[self._learnt]
-        counts = np.maximum(is_ahead.sum(0), 1)
-        self._mean = ((learnt * is_ahead).sum(0) / counts).astype(np.float32)
-        spread = np.sqrt((((learnt - self._mean) * is_ahead) ** 2).sum(0) / counts)
+        learnt = targets.values[self._learnt]
+        spread = learnt.std(0)
+        self._mean = learnt.mean(0)
         self._spread = np.where(spread > 1e-4, spread, np.inf).astype(np.float32)
         self._network = self._policy.encoder.requires_grad_(True)
         self._network.normalize_by(dataset.meta.stats, list(self._policy.config.image_features))
@@ -200,14 +196,13 @@ class _Lessons:
 
     def judge(self, cpu_seconds: float) -> PretrainResult:
         """Of the episodes that were left out."""
-        offsets = list(self._targets.offsets)
-        rows = self._held_out[self._targets.is_ahead[self._held_out, offsets[0]]]
-        rows = rows[:: max(1, len(rows) // _JUDGED_FRAMES)]
+        rows = self._held_out[:: max(1, len(self._held_out) // _JUDGED_FRAMES)]
         self._network.eval()
         told = []
         with torch.no_grad():
             for start in range(0, len(rows), self._plan.batch_size):
                 told.append(self._tell(rows[start : start + self._plan.batch_size]).cpu().numpy())
+        offsets = list(self._targets.offsets)
         spread = np.where(np.isinf(self._spread), 0, self._spread)
         found = (np.concatenate(told) * spread + self._mean)[:, offsets]
         true = self._targets.values[rows][:, offsets]
@@ -233,9 +228,7 @@ class _Lessons:
         rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / plan.updates))
         for group in self._optimizer.param_groups:
             group["lr"] = plan.learning_rate * rate
-        counts = torch.from_numpy(self._targets.is_ahead[rows].astype(np.float32)).to(self._device)
-        error = functional.l1_loss(self._tell(rows), torch.from_numpy(wanted).to(self._device), reduction="none")
-        loss = (error * counts).sum() / counts.sum().clamp(min=1)
+        loss = functional.l1_loss(self._tell(rows), torch.from_numpy(wanted).to(self._device))
         self._optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), _GRADIENT_NORM)
