@@ -33,18 +33,6 @@ def next_position(folder: Path, chunks_size: int) -> FilePosition:
     return FilePosition() if last is None else last.next(chunks_size)
 
 
-def next_position(folder: Path, chunks_size: int) -> FilePosition:
-    """The first number that no file of a folder (chunk-CCC/file-FFF.*) has, counting from the last one."""
-    last: FilePosition | None = None
-    for path in folder.glob("chunk-*/file-*"):
-        chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
-        if chunk.isdigit() and file.isdigit():
-            position = FilePosition(chunk=int(chunk), file=int(file))
-            if last is None or (position.chunk, position.file) > (last.chunk, last.file):
-                last = position
-    return FilePosition() if last is None else last.next(chunks_size)
-
-
 class RollingParquet:
     """Writes tables into numbered files; one table is never split over two of them.
 
