@@ -146,15 +146,15 @@ def test_what_robots_do_is_no_fault(strange: Path, kind: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("fault", ["coarse", "play"])
 def test_a_dead_band_is_told_of(strange: Path, fault: str, tmp_path: Path) -> None:
-    """An encoder of 8 bits, and one that follows its joint only at the end of a play of 0.04 rad."""
+    """An encoder of 7 bits, and one that follows its joint only at the end of a play of 0.08 rad."""
 
     def change(rows: Rows) -> Rows:
         out = rows.copy()
         if fault == "coarse":
-            out[:, 1] = np.round(rows[:, 1] / 0.0245) * 0.0245
+            out[:, 1] = np.round(rows[:, 1] / 0.049) * 0.049
             return out
         for frame in range(1, len(out)):
-            out[frame, 1] = np.clip(out[frame - 1, 1], rows[frame, 1] - 0.02, rows[frame, 1] + 0.02)
+            out[frame, 1] = np.clip(out[frame - 1, 1], rows[frame, 1] - 0.04, rows[frame, 1] + 0.04)
         return out
 
     spoilt = copy(strange, tmp_path / "spoilt")
