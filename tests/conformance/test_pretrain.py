@@ -220,7 +220,7 @@ def test_a_dataset_that_does_not_tell_where_the_hand_is(
 def train(settings: Path, out: Path, *more: str, program: str = "demorec train") -> tuple[list[float], Path]:
     """Losses, and the last checkpoint, of a training in a process of its own."""
     name, *words = program.split()
-    plugin = [] if words else ["--policy.discover_packages_path=demorec.lerobot_policy"]
+    plugin = [] if words else ["--env.discover_packages_path=demorec.lerobot_env"]
     command = [
         str(Path(sys.executable).parent / name),
         *words,
