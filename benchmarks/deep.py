@@ -2,7 +2,7 @@
 
     python benchmarks/deep.py --episodes 20
 
-Each episode is generated, checked with its pictures and made again, one after the other in one process that is warm,
+Each episode is generated, checked with its images and made again, one after the other in one process that is warm,
 so that the ratios hold whatever else the machine does.
 """
 

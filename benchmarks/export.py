@@ -5,7 +5,7 @@
 
 Every round runs all candidates one after the other on the same frames; CPU time counts all processes and threads,
 so that the figures can be compared on a shared machine. What is compared is what a user waits for after recording:
-the pictures of our recordings are coded already, so the cost of recording them is told beside it.
+the images of our recordings are coded already, so the cost of recording them is told beside it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 CAMERAS = {"front": (640, 480), "wrist": (224, 224), "side": (224, 224)}
 """Those of the comparison, with their sizes."""
 
-Pictures = dict[str, list[NDArray[np.uint8]]]
+Images = dict[str, list[NDArray[np.uint8]]]
 
 
 @dataclass(kw_only=True)
@@ -73,37 +73,37 @@ def measured(cost: Cost, per: float) -> Iterator[None]:
     cost.wall.append((time.perf_counter() - wall) / per)
 
 
-def scene_pictures(frames: int, width: int, height: int, seed: int) -> list[NDArray[np.uint8]]:
-    """Pictures that cost an encoder what rendered ones do: shaded surfaces, edges, a moving arm, a little noise."""
+def scene_images(frames: int, width: int, height: int, seed: int) -> list[NDArray[np.uint8]]:
+    """Images that cost an encoder what rendered ones do: shaded surfaces, edges, a moving arm, a little noise."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32) / np.float32(height)
     table = np.stack([170 + 40 * columns, 140 + 30 * rows, 100 + 20 * columns], axis=-1)
     grain = rng.normal(0, 1, (height, width, 1))
     result = []
     for t in range(frames):
-        picture = table + grain
+        image = table + grain
         x, y = 0.3 + 0.4 * t / frames, 0.5 + 0.2 * np.sin(t / 15)
         for k in range(6):
             near = (columns - x - 0.05 * k) ** 2 + (rows - y + 0.08 * k) ** 2 < (0.07 - 0.005 * k) ** 2
-            picture[near] = (60 + 25 * k, 70 + 10 * k, 200 - 20 * k)
-        result.append(np.clip(picture, 0, 255).astype(np.uint8))
+            image[near] = (60 + 25 * k, 70 + 10 * k, 200 - 20 * k)
+        result.append(np.clip(image, 0, 255).astype(np.uint8))
     return result
 
 
-def made_up(pictures: Pictures, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
-    """An episode of made-up numbers and the given pictures."""
+def made_up(images: Images, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
+    """An episode of made-up numbers and the given images."""
     from support.recording import make_episode
 
-    length = len(next(iter(pictures.values())))
+    length = len(next(iter(images.values())))
     info, frames, outcome = make_episode(
-        num_frames=length, cameras=tuple(pictures), width=16, height=16, episode_index=episode
+        num_frames=length, cameras=tuple(images), width=16, height=16, episode_index=episode
     )
     cameras = tuple(
-        replace(camera, height=pictures[camera.name][0].shape[0], width=pictures[camera.name][0].shape[1])
+        replace(camera, height=images[camera.name][0].shape[0], width=images[camera.name][0].shape[1])
         for camera in info.scene.cameras
     )
     frames = [
-        replace(frame, images={name: replace(frame.images[name], color=pictures[name][t]) for name in pictures})
+        replace(frame, images={name: replace(frame.images[name], color=images[name][t]) for name in images})
         for t, frame in enumerate(frames)
     ]
     return info.with_simulation(scene=replace(info.scene, cameras=cameras)), frames, outcome
@@ -122,11 +122,11 @@ def compare(args: argparse.Namespace, work: Path) -> dict[str, Any]:
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 
-    pictures: list[Pictures] = [
-        {name: scene_pictures(args.frames, *size, seed=7 * e + n) for n, (name, size) in enumerate(CAMERAS.items())}
+    images: list[Images] = [
+        {name: scene_images(args.frames, *size, seed=7 * e + n) for n, (name, size) in enumerate(CAMERAS.items())}
         for e in range(args.episodes)
     ]
-    episodes = [made_up(found, e) for e, found in enumerate(pictures)]
+    episodes = [made_up(found, e) for e, found in enumerate(images)]
     costs = {
         name: Cost() for name in ("record", "export", "lerobot", "lerobot_streaming_av1", "lerobot_streaming_h264")
     }
@@ -144,7 +144,7 @@ def compare(args: argparse.Namespace, work: Path) -> dict[str, Any]:
             }  # fmt: skip
         with measured(costs[name], total):
             dataset = LeRobotDataset.create("local/bench", 30, features, root=folder, **options)
-            for episode in pictures:
+            for episode in images:
                 for t in range(args.frames):
                     vector = np.full(8, t, dtype=np.float32)
                     frame: dict[str, Any] = {"observation.state": vector, "action": vector, "task": "task"}
@@ -238,8 +238,8 @@ def against_copy(args: argparse.Namespace, work: Path) -> dict[str, float]:
     run = work / "copy" / "episodes"
     run.mkdir(parents=True)
     names = ("front", "wrist")
-    pictures = {name: scene_pictures(args.frames, 640, 480, seed=n) for n, name in enumerate(names)}
-    record(run / "episode_000000.mcap", made_up(pictures, 0))
+    images = {name: scene_images(args.frames, 640, 480, seed=n) for n, name in enumerate(names)}
+    record(run / "episode_000000.mcap", made_up(images, 0))
     for index in range(1, args.copy_episodes):
         shutil.copy(run / "episode_000000.mcap", run / f"episode_{index:06d}.mcap")
     size = sum(path.stat().st_size for path in run.iterdir()) / 1e6

@@ -581,7 +581,7 @@ def judge(subject: Any) -> dict[str, Result]:
     for name in CHECKS.names():
         check = CHECKS.load(name)
         is_motion = check.measure.__module__.rpartition(".")[2] in ("motion", "targets", "mounts")
-        if subject.form not in check.on or check.needs_pictures or check.group in ("file", "time"):
+        if subject.form not in check.on or check.needs_images or check.group in ("file", "time"):
             continue
         if subject.form == "external" and not is_motion:
             continue

@@ -3,7 +3,7 @@
     python benchmarks/first_start.py --rounds 3
     git worktree add /tmp/before HEAD~1 && python benchmarks/first_start.py --against /tmp/before
 
-A frame is two 224x224 pictures and all numbers. The versions take turns; each starts with empty folders for compiled
+A frame is two 224x224 images and all numbers. The versions take turns; each starts with empty folders for compiled
 code and meshes, and then once more with what that start has kept.
 """
 

@@ -7,7 +7,7 @@
     python benchmarks/generate.py --driver 1000 100000              run.json at two lengths of a run
 
 "Today" is PyBullet's TinyRenderer and `LeRobotDataset.add_frame` / `save_episode`, with LeRobot's defaults (AV1) and
-with streaming encoding; scenes, expert and picture sizes are ours, so that only the pipeline differs. Each variant
+with streaming encoding; scenes, expert and image sizes are ours, so that only the pipeline differs. Each variant
 is a process of its own and each round runs all of them one after the other; CPU time counts all processes that
 belong to a variant, so that ratios hold on a busy machine as well. "All" has the start-up in it (imports, compiled
 code, the first episode), "steady" is what one more episode costs.
@@ -369,7 +369,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=6, help="of ours in each round")
     parser.add_argument("--today-episodes", type=int, default=2, help="of today's way in each round (x2: at least 2)")
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--size", type=int, default=224, help="of the pictures of both cameras")
+    parser.add_argument("--size", type=int, default=224, help="of the images of both cameras")
     parser.add_argument("--cameras", nargs="+", default=["front", "wrist"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[], choices=[*OURS, *TODAY], help="only these variants")

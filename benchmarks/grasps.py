@@ -3,7 +3,7 @@
     python benchmarks/grasps.py --episodes 340 --workers 8 --out grasps.jsonl     # all tasks, both arms: 20,000 grasps
     python benchmarks/grasps.py --robots panda --against path/of/boxed_fingers.urdf --episodes 50
 
-Whole episodes without pictures. The depth is that of a finger's collision shapes in the object's, from poses alone. A
+Whole episodes without images. The depth is that of a finger's collision shapes in the object's, from poses alone. A
 grasp slips when the object moves by more than a millimetre in the hand while it is lifted and carried. `--against`
 simulates every episode once more, right after, with another URDF of the same robot, to compare fingers.
 The episodes that stand in `--out` already are not made again: the same command goes on after `--minutes` or Ctrl-C.

@@ -30,7 +30,7 @@ from demorec.check.films import Film, cells_of, likeness_of_films
 from demorec.check.report import CheckOptions
 from demorec.core.config import GenerateConfig, VideoConfig
 from demorec.core.tables import CHECKS
-from demorec.mcap.pictures import PixelCounter
+from demorec.mcap.images import PixelCounter
 from demorec.mcap.video import VideoPacket, VideoSettings, decode, make_encoder
 from demorec.render.painter import Painter
 from demorec.render.raster import RasterRenderer
@@ -629,7 +629,7 @@ def judge(path: Path, changed: Mapping[tuple[str, str], Rows], *, times: int = 1
                 return iter(images[camera, kind]) if (camera, kind) in images else reads[kind](camera)
 
             setattr(recording, name, read)
-        checks = [check for check in CheckOptions().checks("simulated") if check.needs_pictures]
+        checks = [check for check in CheckOptions().checks("simulated") if check.needs_images]
         return [check.run(episode) for check in checks]
 
 

@@ -1,8 +1,8 @@
 """The import of a bag against LeRobot's own writer on the same bag: CPU seconds a gigabyte, milliseconds a frame.
 
     python benchmarks/import.py                              a small sample
-    python benchmarks/import.py --seconds 30 --rounds 5 --pictures h264 jpeg
-    python benchmarks/import.py --pictures h264 --gop 30     video with a keyframe a second
+    python benchmarks/import.py --seconds 30 --rounds 5 --images h264 jpeg
+    python benchmarks/import.py --images h264 --gop 30     video with a keyframe a second
     python benchmarks/import.py --growth 1 5 20              peak memory for so many gigabytes, as one bag and as many
     python benchmarks/import.py --forge /tmp/forge/bin/python    against forge-robotics, too
 
@@ -13,7 +13,7 @@ place of figures.
 The bag is written by `mcap` and `rosbags`: two joint topics at 200 Hz and two 640x480 cameras. Each round runs the
 candidates one after the other in processes of their own; loading libraries is not counted, of none of them.
 LeRobot's writer is given frames that were decoded by the same reader as ours, aligned as ours. "decoding and coding" is
-what no import of JPEG pictures into videos can do without: each picture decoded by Pillow and coded by libx264, as our
+what no import of JPEG images into videos can do without: each image decoded by Pillow and coded by libx264, as our
 export codes it.
 """
 
@@ -73,7 +73,7 @@ class Cost:
 
 
 def scene(step: int, camera: int) -> NDArray[np.uint8]:
-    """A picture with texture and motion, which costs a coder what real ones do."""
+    """An image with texture and motion, which costs a coder what real ones do."""
     generator = np.random.default_rng(camera)
     coarse = generator.integers(0, 255, (HEIGHT // 16 + 4, WIDTH // 16 + 4, 3), np.uint8)
     large = coarse.repeat(16, axis=0).repeat(16, axis=1)
@@ -81,18 +81,18 @@ def scene(step: int, camera: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(large[shift // 2 : shift // 2 + HEIGHT, shift : shift + WIDTH])
 
 
-def make_bag(path: Path, seconds: float, pictures: str, gop: int) -> Path:
-    """A bag with `pictures` (h264 with a keyframe in front of every `gop` pictures, or jpeg)."""
+def make_bag(path: Path, seconds: float, images: str, gop: int) -> Path:
+    """A bag with `images` (h264 with a keyframe in front of every `gop` images, or jpeg)."""
     bags.WIDTH, bags.HEIGHT = WIDTH, HEIGHT
     notes = bags.joints("/follower/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=1))
     notes += bags.joints("/leader/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=2), shift=0.1)
     for camera, topic in enumerate(CAMERAS):
         moments = bags.times(FPS, seconds, seed=3, jitter=0.01)
         loop = [scene(step, camera) for step in range(48)]
-        if pictures == "h264":
+        if images == "h264":
             packets = bags.video([loop[step % 48] for step in range(len(moments))], gop=gop)
         else:
-            coded = [bags.jpeg(picture) for picture in loop]
+            coded = [bags.jpeg(image) for image in loop]
             packets = [coded[step % 48] for step in range(len(moments))]
         notes += [
             bags.Note(
@@ -100,7 +100,7 @@ def make_bag(path: Path, seconds: float, pictures: str, gop: int) -> Path:
                 type="sensor_msgs/msg/CompressedImage",
                 log_ns=moment + 1_000_000,
                 header_ns=moment,
-                body={"format": pictures, "data": np.frombuffer(packet, np.uint8)},
+                body={"format": images, "data": np.frombuffer(packet, np.uint8)},
             )
             for moment, packet in zip(moments, packets, strict=True)
         ]
@@ -126,9 +126,9 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     from demorec.sources.bag import open_bag
     from demorec.sources.decoding import BagDecoder
     from demorec.sources.episodes import windows
-    from demorec.sources.fields import picture_bytes
+    from demorec.sources.fields import image_bytes
+    from demorec.sources.image_messages import decode_image
     from demorec.sources.mapping_file import read_mapping
-    from demorec.sources.picture_messages import decode_picture
     from demorec.sources.rows import Timelines
     from demorec.sources.streams import read_streams
 
@@ -150,9 +150,9 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     for message in opened.messages([], topics.keys()):
         values, name = decoder.values(message), topics[message.channel.topic]
         if values["format"] == "jpeg":
-            kept[name].append(decode_picture(values))
+            kept[name].append(decode_image(values))
         else:
-            packets[name].append(picture_bytes(values))
+            packets[name].append(image_bytes(values))
     for name, coded in packets.items():
         if coded:
             with av.open(io.BytesIO(b"".join(coded)), mode="r", format="h264") as file:
@@ -168,17 +168,17 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
 
 
 def decoding_and_coding(bag: Path) -> None:
-    """Every picture of the bag decoded and coded once as the export codes it, and nothing else."""
+    """Every image of the bag decoded and coded once as the export codes it, and nothing else."""
     from demorec.core.config import VideoConfig
     from demorec.mcap.video import make_encoder
     from demorec.sources.bag import open_bag
     from demorec.sources.decoding import BagDecoder
-    from demorec.sources.picture_messages import decode_picture
+    from demorec.sources.image_messages import decode_image
 
     decoder = BagDecoder(open_bag(bag).num_bytes)
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}
     for message in open_bag(bag).messages([], CAMERAS):
-        encoders[message.channel.topic].encode(decode_picture(decoder.values(message)))
+        encoders[message.channel.topic].encode(decode_image(decoder.values(message)))
     for encoder in encoders.values():
         encoder.finish()
 
@@ -262,12 +262,12 @@ def measure(candidate: str, bags_: list[Path], folder: Path) -> Cost:
     return cost
 
 
-def grow(path: Path, pictures: str, gop: int, gigabytes: float) -> Path:
+def grow(path: Path, images: str, gop: int, gigabytes: float) -> Path:
     """A bag of that size: a piece of ten seconds again and again, each time ten seconds later."""
     from mcap.reader import make_reader
     from mcap.writer import CompressionType, Writer
 
-    piece = make_bag(path.with_suffix(".piece"), 10.0, pictures, gop)
+    piece = make_bag(path.with_suffix(".piece"), 10.0, images, gop)
     with piece.open("rb") as source, path.open("wb") as target:
         writer = Writer(target, compression=CompressionType.NONE)
         writer.start()
@@ -294,9 +294,9 @@ def grow(path: Path, pictures: str, gop: int, gigabytes: float) -> Path:
     return path
 
 
-def table(pictures: str, bag: Path, options: argparse.Namespace, folder: Path) -> None:
+def table(images: str, bag: Path, options: argparse.Namespace, folder: Path) -> None:
     """Measure all candidates on a bag in turn and print the medians."""
-    candidates = ["import", "import and export", *(["decoding and coding"] if pictures == "jpeg" else [])]
+    candidates = ["import", "import and export", *(["decoding and coding"] if images == "jpeg" else [])]
     candidates += [] if options.ours else ["lerobot"]
     costs: dict[str, list[Cost]] = {candidate: [] for candidate in candidates}
     told = ""
@@ -310,13 +310,13 @@ def table(pictures: str, bag: Path, options: argparse.Namespace, folder: Path) -
             else:
                 costs.setdefault("forge", []).append(cost)
     frames, size = int(options.seconds * FPS), bag.stat().st_size
-    print(f"{pictures}, {size / 1e6:.1f} MB, {frames} frames, two cameras 640x480")
+    print(f"{images}, {size / 1e6:.1f} MB, {frames} frames, two cameras 640x480")
     print(f"  {'':19} {'CPU ms/frame':>13} {'CPU s/GB':>9} {'x import':>9}")
     medians = {candidate: statistics.median(cost.cpu for cost in found) for candidate, found in costs.items()}
     for candidate, cpu in medians.items():
         ratio = cpu / medians["import"]
         print(f"  {candidate:19} {1e3 * cpu / frames:13.3f} {cpu / size * 1e9:9.1f} {ratio:9.1f}")
-    if pictures == "jpeg":
+    if images == "jpeg":
         share = medians["decoding and coding"] / medians["import and export"]
         print(f"  decoding and coding take {share:.0%} of import and export")
     if told:
@@ -333,9 +333,9 @@ def tell(bags_: list[Path], folder: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=4.0, help="of the bag")
-    parser.add_argument("--gop", type=int, default=2, help="pictures from a keyframe of H.264 video to the next")
+    parser.add_argument("--gop", type=int, default=2, help="images from a keyframe of H.264 video to the next")
     parser.add_argument("--rounds", type=int, default=2, help="0 for --growth alone")
-    parser.add_argument("--pictures", nargs="+", choices=("h264", "jpeg"), default=["h264", "jpeg"])
+    parser.add_argument("--images", nargs="+", choices=("h264", "jpeg"), default=["h264", "jpeg"])
     parser.add_argument(
         "--growth", type=float, nargs="*", default=[], help="gigabytes of bags whose peak memory is measured"
     )
@@ -345,18 +345,18 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="demorec-import-", dir=options.folder) as name:
         folder = Path(name)
-        for pictures in options.pictures if options.rounds else ():
-            bag = make_bag(folder / f"{pictures}.mcap", options.seconds, pictures, options.gop)
-            table(pictures, bag, options, folder)
+        for images in options.images if options.rounds else ():
+            bag = make_bag(folder / f"{images}.mcap", options.seconds, images, options.gop)
+            table(images, bag, options, folder)
         for gigabytes in options.growth:
-            one = grow(folder / "one.mcap", options.pictures[0], options.gop, 1)
+            one = grow(folder / "one.mcap", options.images[0], options.gop, 1)
             many = [folder / f"part_{number:04d}.mcap" for number in range(round(gigabytes))]
             for path in many:
                 path.hardlink_to(one)
             tell(many, folder)
             for path in many:
                 path.unlink()
-            tell([grow(one, options.pictures[0], options.gop, gigabytes)], folder)
+            tell([grow(one, options.images[0], options.gop, gigabytes)], folder)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
     python benchmarks/language.py --commands 10 1000                 whole commands, of so many episodes
 
 Every round exports the same run with each choice one after the other; CPU time of the process, medians, and the ratio
-to the plain export of the same round. The same random items are read by LeRobot and by demorec, with pictures (by each
+to the plain export of the same round. The same random items are read by LeRobot and by demorec, with images (by each
 decoder that works here) and without. --commands runs `demorec export lerobot` as it is, LeRobot's verification
 included, without --language and with it, on copies of the run's recordings.
 """
@@ -35,7 +35,7 @@ CHOICES: dict[str, dict[str, Any]] = {
     "progress": {"progress": True},
     "boxes": {"boxes": True},
 }
-"""What is exported, and with which options; `states` is all language but what is about single pictures."""
+"""What is exported, and with which options; `states` is all language but what is about single images."""
 
 
 BATCH = 32
@@ -72,7 +72,7 @@ def decoders() -> list[str]:
     return ["pyav", "torchcodec"]
 
 
-def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
+def items(run: Path, work: Path, rounds: int, *, images: bool) -> None:
     """Reading random items in batches, by LeRobot and by `FastDataset`, from datasets with and without language."""
     import numpy as np
     import torch
@@ -81,19 +81,19 @@ def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
     from demorec.learn.training.reader import FastDataset
 
     torch.set_num_threads(1)  # threads that wait for each other count as CPU time
-    features = () if pictures else ("observation.state", "action")
+    features = () if images else ("observation.state", "action")
     names = ("plain", "subtask", "states", "language")
     readers: dict[tuple[str, str, str], Any] = {}
     for name in names:
-        out = work / f"items-{name}-{pictures}"
+        out = work / f"items-{name}-{images}"
         export_lerobot([run], out, ExportOptions(verify=False, features=features, **CHOICES[name]))
-        for decoder in decoders() if pictures else ["pyav"]:
+        for decoder in decoders() if images else ["pyav"]:
             for reader in (LeRobotDataset, FastDataset):
                 cache: dict[str, Any] = {} if reader is LeRobotDataset else {"frame_cache_bytes": 0}
                 made = reader("local/x", root=out, video_backend=decoder, **cache)
-                readers[reader.__name__, decoder if pictures else "", name] = made
+                readers[reader.__name__, decoder if images else "", name] = made
     seconds: dict[tuple[str, str, str], list[float]] = {key: [] for key in readers}
-    rng, count = np.random.default_rng(0), BATCH * (2 if pictures else 12)
+    rng, count = np.random.default_rng(0), BATCH * (2 if images else 12)
     for number in range(rounds + 1):
         chosen = rng.permutation(len(readers[next(iter(readers))]))[:count].tolist()
         for key, dataset in readers.items():
@@ -106,7 +106,7 @@ def items(run: Path, work: Path, rounds: int, *, pictures: bool) -> None:
                     [dataset[index] for index in batch]
             if number:
                 seconds[key].append((time.process_time() - start) / len(chosen))
-    print(f"an item {'with' if pictures else 'without'} pictures: CPU ms, ratio to plain")
+    print(f"an item {'with' if images else 'without'} images: CPU ms, ratio to plain")
     for (reader_name, decoder, name), found in seconds.items():
         plain = seconds[reader_name, decoder, "plain"]
         ratio = statistics.median(a / b for a, b in zip(found, plain, strict=True))
@@ -153,8 +153,8 @@ def main() -> None:
             commands(run, work, args.commands, args.rounds)
             return
         exports(run, work, args.rounds)
-        for pictures in (False, True):
-            items(run, work, args.rounds, pictures=pictures)
+        for images in (False, True):
+            items(run, work, args.rounds, images=images)
 
 
 if __name__ == "__main__":

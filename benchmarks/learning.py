@@ -10,7 +10,7 @@ Training is LeRobot's ACT class with the numbers of a dataset held in memory: le
 spends five sixths of its CPU time there; the network, the loss and the optimizer are the same. One thread, no
 download. Each variant is one row: strict success in closed loop with its 95 % interval, and CPU seconds of training.
 What is there already (runs, datasets, policies, evaluations in --out) is used again. benchmarks/checkpoints.py measures
-trainings of lerobot-train, such as those with pictures.
+trainings of lerobot-train, such as those with images.
 """
 
 from __future__ import annotations
@@ -274,7 +274,7 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Success of every variant with its interval, and the training loss of its first seed, as a picture."""
+    """Success of every variant with its interval, and the training loss of its first seed, as an image."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -4,7 +4,7 @@
     python benchmarks/reading.py --sizes 224 --workers 0 --batches 8 --rounds 3
 
 Batches of 64 random items by torch's DataLoader, none of them twice, so that no cache of frames helps. CPU time counts
-the worker processes with their start. The datasets show the same pictures: one is demorec's export (H.264), one is
+the worker processes with their start. The datasets show the same images: one is demorec's export (H.264), one is
 written by LeRobot with its defaults (AV1).
 """
 
@@ -25,7 +25,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from export import Pictures, made_up, record, scene_pictures
+from export import Images, made_up, record, scene_images
 
 CAMERAS = ("front", "wrist")
 BATCH = 64
@@ -42,8 +42,8 @@ class Cost:
     wall: list[float] = field(default_factory=list)
 
 
-def pictures_of(args: argparse.Namespace, size: int, episode: int) -> Pictures:
-    return {name: scene_pictures(args.frames, size, size, seed=7 * episode + n) for n, name in enumerate(CAMERAS)}
+def images_of(args: argparse.Namespace, size: int, episode: int) -> Images:
+    return {name: scene_images(args.frames, size, size, seed=7 * episode + n) for n, name in enumerate(CAMERAS)}
 
 
 def written_by_demorec(folder: Path, args: argparse.Namespace, size: int) -> Path:
@@ -52,7 +52,7 @@ def written_by_demorec(folder: Path, args: argparse.Namespace, size: int) -> Pat
     (folder / "run" / "episodes").mkdir(parents=True)
     for episode in range(args.episodes):
         path = folder / "run" / "episodes" / f"episode_{episode:06d}.mcap"
-        record(path, made_up(pictures_of(args, size, episode), episode))
+        record(path, made_up(images_of(args, size, episode), episode))
     export_lerobot([folder / "run"], folder / "dataset", ExportOptions(verify=False))
     return folder / "dataset"
 
@@ -69,17 +69,17 @@ def written_by_lerobot(folder: Path, args: argparse.Namespace, size: int) -> Pat
         features[f"observation.images.{name}"] = {"dtype": "video", "shape": (size, size, 3), "names": axes}
     dataset = LeRobotDataset.create("local/av1", FPS, features, root=folder / "dataset")
     for episode in range(args.episodes):
-        pictures = pictures_of(args, size, episode)
+        images = images_of(args, size, episode)
         for t in range(args.frames):
             numbers = np.full(8, episode + t / args.frames, np.float32)
-            frame = {f"observation.images.{name}": pictures[name][t] for name in CAMERAS}
+            frame = {f"observation.images.{name}": images[name][t] for name in CAMERAS}
             dataset.add_frame({"observation.state": numbers, "action": numbers, "task": "bench", **frame})
         dataset.save_episode()
     dataset.finalize()
     return folder / "dataset"
 
 
-def without_pictures(folder: Path, args: argparse.Namespace) -> Path:
+def without_images(folder: Path, args: argparse.Namespace) -> Path:
     """The numbers of demorec's default features, 13 columns, of as many episodes as a training has."""
     from support.recording import write_episode
 
@@ -168,7 +168,7 @@ def main() -> None:
     print(f"{'ms an item':<34} {'workers':>7} {'lerobot':>9} {'demorec':>9} {'ratio':>7} {'wall':>9} {'wall':>9}")
     with tempfile.TemporaryDirectory(prefix="demorec-reading-") as folder:
         if not args.no_numbers:
-            root = without_pictures(Path(folder) / "numbers", args)
+            root = without_images(Path(folder) / "numbers", args)
             for workers in args.workers:
                 compare("numbers, chunk 16", root, {"action": CHUNK}, workers, args)
         for size in args.sizes:

@@ -2,7 +2,7 @@
 
     python benchmarks/recorder.py --seconds 60 --hz 100 --cameras 3
 
-A loop gives frames at an exact rate, with pictures of 640x480 that move and carry noise as those of cameras do. `write`
+A loop gives frames at an exact rate, with images of 640x480 that move and carry noise as those of cameras do. `write`
 is measured on the wall and in the CPU time of its own thread. Then another process does the same and is killed.
 """
 
@@ -25,17 +25,17 @@ from demorec.core.config import VideoConfig
 from demorec.mcap import Recording
 
 HEIGHT, WIDTH = 480, 640
-NUM_PICTURES = 64
+NUM_IMAGES = 64
 
 
-def pictures(seed: int) -> list[NDArray[np.uint8]]:
+def images(seed: int) -> list[NDArray[np.uint8]]:
     """Smooth scenes that shift by two pixels each, with sensor noise of two levels."""
     random = np.random.default_rng(seed)
-    rows, columns = np.mgrid[0:HEIGHT, 0 : WIDTH + 2 * NUM_PICTURES]
+    rows, columns = np.mgrid[0:HEIGHT, 0 : WIDTH + 2 * NUM_IMAGES]
     waves = [np.sin(rows / a + columns / b) for a, b in ((37, 53), (71, 23), (19, 97))]
     scene = np.stack([128 + 90 * wave for wave in waves], axis=-1)
     result = []
-    for index in range(NUM_PICTURES):
+    for index in range(NUM_IMAGES):
         noise = random.normal(0, 2, (HEIGHT, WIDTH, 3))
         result.append(np.clip(scene[:, 2 * index :][:, :WIDTH] + noise, 0, 255).astype(np.uint8))
     return result
@@ -44,7 +44,7 @@ def pictures(seed: int) -> list[NDArray[np.uint8]]:
 def loop(folder: Path, args: argparse.Namespace, *, tells: bool) -> tuple[list[float], list[float], int]:
     """Record; wall and CPU milliseconds of every `write`, and how many frames were dropped."""
     names = [f"camera_{number}" for number in range(args.cameras)]
-    seen = {name: pictures(number) for number, name in enumerate(names)}
+    seen = {name: images(number) for number, name in enumerate(names)}
     wall, cpu = [], []
     with (
         Recorder(
@@ -62,9 +62,9 @@ def loop(folder: Path, args: argparse.Namespace, *, tells: bool) -> tuple[list[f
         for number in range(round(args.seconds * args.hz)):
             time.sleep(max(0.0, start + number / args.hz - time.monotonic()))
             state = np.full(7, number, dtype=np.float64)
-            images = {name: seen[name][number % NUM_PICTURES] for name in names}
+            shown = {name: seen[name][number % NUM_IMAGES] for name in names}
             before_wall, before_cpu = time.perf_counter(), time.thread_time()
-            episode.write(state, state, images)
+            episode.write(state, state, shown)
             cpu.append(1000 * (time.thread_time() - before_cpu))
             wall.append(1000 * (time.perf_counter() - before_wall))
             if tells:

@@ -4,7 +4,7 @@
 
 Every stage of every episode is measured in the same run, in CPU time of this process; the recorder's share is what
 `EpisodeWriter` takes less its video encoders. Bytes are those of the same episode recorded in several ways, against
-raw pictures and float64 numbers.
+raw images and float64 numbers.
 """
 
 from __future__ import annotations
@@ -115,12 +115,12 @@ def measure(
 
 
 def raw_bytes(frames: list[Frame]) -> int:
-    """Pictures as RGB, numbers as float64."""
-    pictures = sum(image.color.nbytes for frame in frames for image in frame.images.values())
+    """Images as RGB, numbers as float64."""
+    images = sum(image.color.nbytes for frame in frames for image in frame.images.values())
     observation = frames[0].observation
     numbers = 3 * len(observation.joint_position) + 2 + 6 + 7 + 7 * len(observation.object_poses)
     numbers += 2 * (len(frames[0].action.joint_target) + 1 + 7) + 7 * len(frames[0].images)
-    return pictures + 8 * numbers * len(frames)
+    return images + 8 * numbers * len(frames)
 
 
 def main() -> None:
@@ -159,12 +159,10 @@ def main() -> None:
         again = EpisodePlan(config=config, episode_index=args.episodes - 1)
         info, outcome = measure(again, folder / "again", Clock(), frames)
         raw = raw_bytes(frames)
-        pictures = sum(image.color.nbytes for frame in frames for image in frame.images.values())
-        numbers = (raw - pictures) / 1e3
+        images = sum(image.color.nbytes for frame in frames for image in frame.images.values())
+        numbers = (raw - images) / 1e3
         print(f"one episode of {len(frames)} frames: {raw / 1e6:.1f} MB raw, {numbers:.0f} kB of it numbers")
-        print(
-            f"{'coding':<14}{'file kB':>9}{'video kB':>10}{'raw / file':>12}{'encoding ms/picture':>21}{'PSNR dB':>9}"
-        )
+        print(f"{'coding':<14}{'file kB':>9}{'video kB':>10}{'raw / file':>12}{'encoding ms/image':>21}{'PSNR dB':>9}")
         for way in [*WAYS, VideoConfig(codec="jpeg")] if frames[0].images else [VideoConfig()]:
             clock.seconds.clear()
             with EpisodeWriter(folder / f"{way.codec}-{way.gop}.mcap", info, video=way) as writer:
@@ -181,14 +179,14 @@ def main() -> None:
 
 
 def psnr(path: Path, frames: list[Frame]) -> float:
-    """Of the decoded pictures, all cameras together."""
+    """Of the decoded images, all cameras together."""
     from demorec.mcap import Recording
 
     errors = []
     with Recording(path) as recording:
         for camera in recording.cameras:
-            for frame, picture in zip(frames, recording.images(camera), strict=True):
-                errors.append(np.mean((picture.astype(np.float64) - frame.images[camera].color) ** 2))
+            for frame, image in zip(frames, recording.images(camera), strict=True):
+                errors.append(np.mean((image.astype(np.float64) - frame.images[camera].color) ** 2))
     return float(10 * np.log10(255**2 / np.mean(errors))) if errors else float("nan")
 
 

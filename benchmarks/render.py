@@ -1,4 +1,4 @@
-"""CPU time of a picture by each renderer, on frames of a real episode, all measured in one interleaved run.
+"""CPU time of an image by each renderer, on frames of a real episode, all measured in one interleaved run.
 
     python benchmarks/render.py                        # a quick look
     python benchmarks/render.py --rounds 11 --memory --rate-seconds 10
@@ -61,7 +61,7 @@ def plan(index: int = 0, **config: Any) -> Episode:
 
 
 def run_episode(world: World, episode: Episode) -> list[State]:
-    """Every frame of an episode, without pictures."""
+    """Every frame of an episode, without images."""
     return [
         State(frame.observation.joint_position, dict(frame.observation.object_poses))
         for frame in Session.of_episode(world, episode).run(ScriptAgent(episode))
@@ -77,7 +77,7 @@ def painter_for(
 
 
 def measure(painter: Painter, world: World, states: list[State]) -> float:
-    """CPU milliseconds a picture over the states; placing the robot is not counted."""
+    """CPU milliseconds an image over the states; placing the robot is not counted."""
     spent = 0.0
     for state in states:
         world.set_state(joint_position=state.joint_position, object_poses=state.object_poses)
@@ -115,7 +115,7 @@ def table(renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frame
                             few = chosen if variant.renderer == "raster" else chosen[:: max(1, frames // 4)]
                             times[variant].append(measure(painter, world, few) / len(cameras))
                 name = " + ".join(camera.name for camera in cameras)
-                print(f"\n{width}x{height} {name}: CPU ms a picture (times faster than tiny)")
+                print(f"\n{width}x{height} {name}: CPU ms an image (times faster than tiny)")
                 for variant in variants:
                     middle = statistics.median(times[variant])
                     base = times.get(Variant("tiny", True, variant.everything))
@@ -124,7 +124,7 @@ def table(renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frame
 
 
 def draw_for(renderer_name: str, size: tuple[int, int], seconds: float, ready: Any, counts: Any) -> None:
-    """A worker: pictures drawn within the time, both cameras."""
+    """A worker: images drawn within the time, both cameras."""
     episode = plan(width=size[0], height=size[1])
     with make_world(episode.info) as world, RENDERERS.load(renderer_name)() as renderer:
         states = run_episode(world, episode)
@@ -140,7 +140,7 @@ def draw_for(renderer_name: str, size: tuple[int, int], seconds: float, ready: A
 
 
 def rate(renderers: list[str], sizes: list[tuple[int, int]], seconds: float, workers: int) -> None:
-    """Pictures a second with one process a core (wall time: only meaningful on a quiet machine)."""
+    """Images a second with one process a core (wall time: only meaningful on a quiet machine)."""
     context = multiprocessing.get_context("spawn")
     for size in sizes:
         for name in renderers:
@@ -153,11 +153,11 @@ def rate(renderers: list[str], sizes: list[tuple[int, int]], seconds: float, wor
             total = sum(counts.get(timeout=300) for _ in processes)
             for process in processes:
                 process.join()
-            print(f"  {size[0]}x{size[1]} {name:8s} {total:8.0f} pictures a second, {workers} processes", flush=True)
+            print(f"  {size[0]}x{size[1]} {name:8s} {total:8.0f} images a second, {workers} processes", flush=True)
 
 
-def memory(pictures: int, resets: int) -> bool:
-    """Whether the process stays as large as it was over many pictures and scenes, after a first round of them."""
+def memory(images: int, resets: int) -> bool:
+    """Whether the process stays as large as it was over many images and scenes, after a first round of them."""
     process = psutil.Process()
     sizes = []
     episode = plan(width=224, height=224)
@@ -166,13 +166,13 @@ def memory(pictures: int, resets: int) -> bool:
         for number in range(resets):
             world.reset(plan(number, width=224, height=224).info.scene)
             painter = painter_for(renderer, world, episode.info.scene.cameras, antialias=True, everything=True)
-            for step in range(pictures // resets // len(episode.info.scene.cameras)):
+            for step in range(images // resets // len(episode.info.scene.cameras)):
                 world.set_state(joint_position=states[(number + step) % len(states)].joint_position)
                 painter.images()
             gc.collect()
             sizes.append(process.memory_info().rss / 2**20)
     settled, last = sizes[resets // 5], sizes[-1]
-    print(f"\nMemory over {pictures} pictures, {resets} scenes: {settled:.0f} MiB after a fifth, {last:.0f} after all")
+    print(f"\nMemory over {images} images, {resets} scenes: {settled:.0f} MiB after a fifth, {last:.0f} after all")
     return last - settled < 0.05 * settled
 
 
@@ -182,9 +182,9 @@ def main() -> int:
     parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=16, help="frames a round; a quarter of them for slow renderers")
-    parser.add_argument("--rate-seconds", type=float, default=0.0, help="measure pictures a second for so long")
+    parser.add_argument("--rate-seconds", type=float, default=0.0, help="measure images a second for so long")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--memory", action="store_true", help="2,000 pictures and 50 scenes; fails when memory grows")
+    parser.add_argument("--memory", action="store_true", help="2,000 images and 50 scenes; fails when memory grows")
     options = parser.parse_args()
     sizes = [(int(w), int(h)) for w, _, h in (size.partition("x") for size in options.sizes)]
     renderers = []
@@ -199,7 +199,7 @@ def main() -> int:
     if options.rounds > 0:
         table(renderers, sizes, options.rounds, options.frames)
     if options.rate_seconds > 0:
-        print(f"\nPictures a second, both cameras, {options.rate_seconds:g} s each")
+        print(f"\nImages a second, both cameras, {options.rate_seconds:g} s each")
         rate(renderers, sizes, options.rate_seconds, options.workers)
     if options.memory and not memory(2000, 50):
         print("Memory grew.", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The sheet of pictures in docs/rendering.md: both cameras by every renderer that works here, at three sizes."""
+"""The sheet of images in docs/rendering.md: both cameras by every renderer that works here, at three sizes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """How fast recordings are replayed, checked and drawn anew, and whether the replays are identical to the bit.
 
-    python benchmarks/replay.py --episodes 100 --pictures 2
+    python benchmarks/replay.py --episodes 100 --images 2
 
 CPU seconds of this process. Ratios are taken within one interleaved run: each episode is generated, checked,
 replayed and (the first few) drawn anew, one after the other. World and renderer are kept from one episode to the next,
@@ -38,8 +38,8 @@ def generate(path: Path, config: GenerateConfig, index: int, simulators: Simulat
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=10, help="without pictures, replayed and checked")
-    parser.add_argument("--pictures", type=int, default=1, help="with two cameras, drawn anew and checked")
+    parser.add_argument("--episodes", type=int, default=10, help="without images, replayed and checked")
+    parser.add_argument("--images", type=int, default=1, help="with two cameras, drawn anew and checked")
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--task", default="pick_place")
     arguments = parser.parse_args()
@@ -62,7 +62,7 @@ def main() -> None:
             generate(path, plain, index, simulators)
             timed("generate", start)
             start = time.process_time()
-            report = check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=False))
+            report = check_subject(Subject(path=path, kind="recording"), CheckOptions(images=False))
             timed("check", start)
             assert report.level == "pass", report
             start = time.process_time()
@@ -74,15 +74,15 @@ def main() -> None:
         config = GenerateConfig(
             task=arguments.task, cameras=("front", "wrist"), width=arguments.size, height=arguments.size
         )
-        if arguments.pictures:
-            warming = Path(folder) / "warm_pictures.mcap"
+        if arguments.images:
+            warming = Path(folder) / "warm_images.mcap"
             generate(warming, config, 10_000, simulators)
             rerender(warming, Path(folder) / "warm_again.mcap", RerenderOptions(), renderers=warm)
-        for index in range(arguments.pictures):
+        for index in range(arguments.images):
             path = Path(folder) / f"filmed_{index}.mcap"
             start = time.process_time()
             generate(path, config, index, simulators)
-            timed("generate with pictures", start)
+            timed("generate with images", start)
             start = time.process_time()
             rerender(path, Path(folder) / f"as_it_was_{index}.mcap", RerenderOptions())
             timed("draw anew, as it was", start)
@@ -94,20 +94,20 @@ def main() -> None:
             small = RerenderOptions(cameras=("front",), width=96, height=96)
             rerender(path, Path(folder) / f"small_{index}.mcap", small, renderers=warm)
             timed("draw one camera, 96x96", start)
-            for pictures in (False, True):
+            for images in (False, True):
                 start = time.process_time()
-                check_subject(Subject(path=path, kind="recording"), CheckOptions(pictures=pictures))
-                timed("check with pictures" if pictures else "check, not decoding", start)
+                check_subject(Subject(path=path, kind="recording"), CheckOptions(images=images))
+                timed("check with images" if images else "check, not decoding", start)
             with Recording(path) as recording:
                 filmed += recording.num_frames / recording.info.fps
     count = arguments.episodes
-    print(f"{identical} of {count} replays identical to the bit, {same_pictures} of {arguments.pictures} drawings")
+    print(f"{identical} of {count} replays identical to the bit, {same_pictures} of {arguments.images} drawings")
     for name, seconds in cpu.items():
-        of_pictures = name not in ("generate", "check", "replay")
-        number, length = (arguments.pictures, filmed) if of_pictures else (count, simulated)
+        of_images = name not in ("generate", "check", "replay")
+        number, length = (arguments.images, filmed) if of_images else (count, simulated)
         print(f"{name:<24} {1e3 * seconds / number:8.1f} CPU ms an episode, {length / seconds:8.1f} times real time")
-    if arguments.pictures:
-        generation = cpu["generate with pictures"]
+    if arguments.images:
+        generation = cpu["generate with images"]
         was, now = generation / cpu["draw anew, as it was"], generation / cpu["draw anew"]
         print(f"generate / draw anew: as it was {was:.2f}, {now:.2f} now")
 

@@ -1,4 +1,4 @@
-"""How often the expert succeeds, without pictures: strict success, first tries, failures by phase and reason, speed.
+"""How often the expert succeeds, without images: strict success, first tries, failures by phase and reason, speed.
 
     python benchmarks/success.py --episodes 500
     python benchmarks/success.py --tasks pick_place --robots panda --episodes 300 --json out.json

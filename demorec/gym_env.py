@@ -96,9 +96,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         action: What an action means.
         episode_length: Time limit in frames; None: 15 s for each object to be moved.
         render_mode: None or "rgb_array".
-        render_camera: Whose pictures `render` returns.
+        render_camera: Whose images `render` returns.
         render_width, render_height: Their size, pixels.
-        config: Everything that decides scenes and pictures at once; replaces the arguments above that it holds.
+        config: Everything that decides scenes and images at once; replaces the arguments above that it holds.
 
     Raises:
         ConfigError: An unknown name or an impossible value.
@@ -171,7 +171,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     @property
     def keys(self) -> dict[str, str]:
-        """Dataset feature -> key of the observation, pictures aside."""
+        """Dataset feature -> key of the observation, images aside."""
         return {name: _key(name) for name in self._vector_lengths}
 
     @property
@@ -263,7 +263,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return self._observation(self._situation), float(success), success, truncated, information
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(H, W, 3) uint8 picture of the present state from `render_camera`; None without a render mode."""
+        """(H, W, 3) uint8 image of the present state from `render_camera`; None without a render mode."""
         if self.render_mode is None:
             return None
         _after_reset(self._situation)
@@ -355,11 +355,11 @@ def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> 
         for name, length in vector_lengths.items()
     }
     if info.scene.cameras:
-        pictures = {
+        images = {
             camera.name: spaces.Box(0, 255, shape=(camera.height, camera.width, 3), dtype=np.uint8)
             for camera in info.scene.cameras
         }
-        found["pixels"] = spaces.Dict(pictures)
+        found["pixels"] = spaces.Dict(images)
     return spaces.Dict(found)
 
 

@@ -41,7 +41,7 @@ __all__ = ["RobotContract", "TaskContract"]
 
 
 class TaskContract:
-    """Layouts, words, success and recordings of one task with one robot, without pictures.
+    """Layouts, words, success and recordings of one task with one robot, without images.
 
     Attributes:
         task: Name of a row of `demorec list tasks`, or "package.module:Name".
@@ -270,7 +270,7 @@ class RobotContract:
 
 
 def plan_of(task: str, robot: str, seed: int, index: int) -> EpisodePlan:
-    """An episode's plan, without pictures."""
+    """An episode's plan, without images."""
     config = GenerateConfig(task=task, robot=robot, seed=seed, cameras=())
     config.validate()
     return EpisodePlan(config=config, episode_index=index)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 LanguageKind = Literal["subtask", "plan", "memory", "motion", "task_aug", "vqa", "trace", "interjection"]
-"""`task_aug` is another wording of the task, `vqa` a question about a picture, `trace` a way in a picture,
+"""`task_aug` is another wording of the task, `vqa` a question about an image, `trace` a way in an image,
 `interjection` what somebody says in the midst of it."""
 KINDS: tuple[LanguageKind, ...] = get_args(LanguageKind)
 STATES: tuple[LanguageKind, ...] = ("subtask", "plan", "memory", "motion", "task_aug")
@@ -25,7 +25,7 @@ class Statement:
         kind: What it tells; `task_aug` is another wording of the task.
         role: Who says it: the user asks, the assistant does.
         text: The sentence.
-        camera: Of the picture that it is about, None for all that is about no picture.
+        camera: Of the image that it is about, None for all that is about no image.
     """
 
     row: int

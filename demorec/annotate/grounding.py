@@ -26,7 +26,7 @@ MIN_PIXELS = 10
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """One thing in one picture.
+    """One thing in one image.
 
     Attributes:
         name: Of the body.
@@ -58,7 +58,7 @@ class Seen:
 
 
 def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str, Seen]:
-    """Name -> what a picture shows of it; things that no pixel shows are left out.
+    """Name -> what an image shows of it; things that no pixel shows are left out.
 
     Args:
         labels: (H, W) as of `Recording.segmentation_at`.
@@ -73,7 +73,7 @@ def seen_things(labels: NDArray[np.uint16], numbers: dict[str, int]) -> dict[str
 
 
 def body_labels(recording: Recording) -> dict[str, int]:
-    """Name of each body that is spoken of, all but what only carries the scene -> its label in segmentation pictures.
+    """Name of each body that is spoken of, all but what only carries the scene -> its label in segmentation images.
 
     Raises:
         RecordingError: The recording is damaged.
@@ -83,11 +83,11 @@ def body_labels(recording: Recording) -> dict[str, int]:
 
 
 def project(camera: SceneCamera, world_from_camera: Array, points: Array) -> Array:
-    """(T, N, 2) where points in the world are in the pictures of T moments, px; NaN for those behind the camera.
+    """(T, N, 2) where points in the world are in the images of T moments, px; NaN for those behind the camera.
 
     Args:
         camera: With its intrinsics.
-        world_from_camera: (T, 7) poses at the moments of the pictures.
+        world_from_camera: (T, 7) poses at the moments of the images.
         points: (T, N, 3) metres, in the world frame.
     """
     x, y, z, w = (world_from_camera[:, index, np.newaxis] for index in range(3, 7))
@@ -109,7 +109,7 @@ def project(camera: SceneCamera, world_from_camera: Array, points: Array) -> Arr
 
 
 def pixels_of(camera: SceneCamera, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The pixels that contain points (..., 2) px, and whether they are in the picture at all; (0, 0) where not."""
+    """The pixels that contain points (..., 2) px, and whether they are in the image at all; (0, 0) where not."""
     x, y = points[..., 0], points[..., 1]
     # NaN is not inside either.
     inside: NDArray[np.bool_] = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
@@ -122,7 +122,7 @@ _ROUND = 48
 
 @dataclass(frozen=True, kw_only=True)
 class SeenObject:
-    """What one picture shows of one thing, in COCO's terms.
+    """What one image shows of one thing, in COCO's terms.
 
     Attributes:
         row: Of the dataset's episode.
@@ -132,7 +132,7 @@ class SeenObject:
         box: (x, y, width, height) of the pixels that show it.
         area: How many pixels show it.
         visible_fraction: That number over the area, px, of its whole outline, hidden parts and those beyond the
-            picture's edge included; None for a shape whose outline is not known (meshes, URDFs), or behind the camera.
+            image's edge included; None for a shape whose outline is not known (meshes, URDFs), or behind the camera.
         counts: Run lengths of the mask, column by column, the first of pixels that do not show it.
     """
 
@@ -177,7 +177,7 @@ def seen_objects(
 
 
 def _by_column(pixels: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """Pixels of a picture (height, width) that are counted row by row as COCO counts them, column by column."""
+    """Pixels of an image (height, width) that are counted row by row as COCO counts them, column by column."""
     height, width = shape
     rows, columns = np.divmod(pixels, width)
     return np.sort(columns * height + rows)
@@ -200,7 +200,7 @@ def run_lengths(pixels: NDArray[np.intp], size: int) -> tuple[int, ...]:
 
 
 def outline_area(camera: SceneCamera, world_from_camera: Array, shape: Shape, world_from_body: Array) -> float | None:
-    """Area, px, of the whole outline of a convex body, as if nothing hid it and the picture went on for ever.
+    """Area, px, of the whole outline of a convex body, as if nothing hid it and the image went on for ever.
 
     None for a mesh or a URDF, and for a body that is not wholly before the camera.
     """

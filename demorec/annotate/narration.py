@@ -39,8 +39,8 @@ def narrate(
         columns: All of its numbers.
         rows: (T,) which of its frames the dataset has.
         kinds: What shall be said, as far as the recording has it.
-        cameras: Those whose pictures may be spoken of.
-        about: The rows whose pictures are spoken of, None for all.
+        cameras: Those whose images may be spoken of.
+        about: The rows whose images are spoken of, None for all.
 
     Raises:
         RecordingError: The recording is damaged.

@@ -1,4 +1,4 @@
-"""Questions about single pictures with exact answers, and the way that the TCP is about to take in them.
+"""Questions about single images with exact answers, and the way that the TCP is about to take in them.
 
 Answers have the shapes that LeRobot's validator knows (bbox, keypoint, count, attribute, spatial). A question is
 asked only where the answer is beyond doubt: of what is visible enough, in words that mean one thing.
@@ -33,7 +33,7 @@ ANSWERS = {
 }
 """Kind of question -> what its answer has at least."""
 _CLEARLY_BESIDE = 0.05
-"""Share of the picture's width by which one thing must be farther to a side than another to be called so."""
+"""Share of the image's width by which one thing must be farther to a side than another to be called so."""
 _SIDES = frozenset(("left", "right", "leftmost", "rightmost"))
 _TRACE_SECONDS, _TRACE_POINTS = 1.0, 5
 _TOUCHING = 0.01
@@ -53,7 +53,7 @@ def _phrase(name: str, now: Surroundings) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
-    """One picture with all that is known of it; `middles` are where those of the things are in it, px."""
+    """One image with all that is known of it; `middles` are where those of the things are in it, px."""
 
     camera: SceneCamera
     seen: dict[str, Seen]
@@ -124,7 +124,7 @@ def questions(
 
 
 def _ask(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
-    """The next kind of question that the picture has an answer to."""
+    """The next kind of question that the image has an answer to."""
     for step in range(len(_KINDS)):
         asked = _KINDS[(turn + step) % len(_KINDS)](view, turn // len(_KINDS))
         if asked is not None:
@@ -195,7 +195,7 @@ def _spatial(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
 
 
 def _relation(view: _View, name: str, other: str) -> str:
-    """ "on" or "in" by where the things are, else "left_of" or "right_of" by where the picture shows their middles."""
+    """ "on" or "in" by where the things are, else "left_of" or "right_of" by where the image shows their middles."""
     lower = view.now.thing(other)
     if rests_on(view.now.thing(name), lower):
         return "in" if lower.noun in CONTAINERS else "on"
@@ -231,9 +231,9 @@ def traces(
     cameras: Sequence[str],
     asked: Mapping[int, int],
 ) -> Iterator[Statement]:
-    """The next second of the TCP in each camera's picture, once a second, in order by camera.
+    """The next second of the TCP in each camera's image, once a second, in order by camera.
 
-    Points are where the picture of that moment would show the TCP; the trace ends where it leaves the picture, and
+    Points are where the image of that moment would show the TCP; the trace ends where it leaves the image, and
     there is none where it begins outside. Arguments as of `questions`.
     """
     info, frames = recording.info, rows[list(asked)]

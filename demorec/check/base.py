@@ -24,7 +24,7 @@ from demorec.core.geometry import Array
 Level = Literal["pass", "warn", "fail", "skip"]
 Form = Literal["simulated", "external", "run", "external run", "dataset"]
 """What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
-Group = Literal["file", "time", "physics", "alignment", "calibration", "pictures", "outcome", "run", "dataset"]
+Group = Literal["file", "time", "physics", "alignment", "calibration", "images", "outcome", "run", "dataset"]
 
 _BLOCKED = "it needs what is damaged"
 _NOT_APPLICABLE = "not applicable: it needs "
@@ -97,7 +97,7 @@ class Check:
         unit: Of the value and the limits; "" for counts and ratios.
         warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.
         simulated: (warn, fail) of recordings that demorec simulated, where these are exact and others are not.
-        needs_pictures: Whether pictures have to be decoded.
+        needs_images: Whether images have to be decoded.
         measure: The function.
     """
 
@@ -110,7 +110,7 @@ class Check:
     warn: float
     fail: float
     simulated: tuple[float, float]
-    needs_pictures: bool
+    needs_images: bool
     measure: Callable[[Any], Found]
 
     @property
@@ -241,7 +241,7 @@ def check(
     unit: str = "",
     on: tuple[Form, ...] = ("simulated",),
     needs: str = SCENE,
-    needs_pictures: bool = False,
+    needs_images: bool = False,
 ) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
     """Make a `Check` of a function; its name is the function's. Of a generator the `worst` that it yields is judged.
 
@@ -269,7 +269,7 @@ def check(
             warn=limits[0],
             fail=limits[1],
             simulated=exact,
-            needs_pictures=needs_pictures,
+            needs_images=needs_images,
             measure=measure,
         )
 
@@ -281,7 +281,7 @@ time_check = partial(check, group="time")
 physics_check = partial(check, group="physics")
 alignment_check = partial(check, group="alignment")
 calibration_check = partial(check, group="calibration")
-picture_check = partial(check, group="pictures", needs_pictures=True)
+image_check = partial(check, group="images", needs_images=True)
 outcome_check = partial(check, group="outcome")
 external_check = partial(check, on=("external",), needs="stamps of its own for each sample")
 run_check = partial(check, group="run", on=("run",), needs="a run of simulated episodes")

@@ -1,4 +1,4 @@
-"""Do cameras see what their calibration says: K, extrinsics, names, depth units, pictures the right way round."""
+"""Do cameras see what their calibration says: K, extrinsics, names, depth units, images the right way round."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from demorec.check.base import (
     worst_frame,
 )
 from demorec.check.cells import ImageKind
-from demorec.check.drawn import PictureComparison, judge_lag
+from demorec.check.drawn import ImageComparison, judge_lag
 from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
-from demorec.check.pictures import at_full_size, of_each_camera
+from demorec.check.images import at_full_size, of_each_camera
 from demorec.check.rows import displacement, matrices
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
@@ -28,7 +28,7 @@ from demorec.episode.scene import SceneCamera
 from demorec.mcap import channels
 
 UNRELATED = 16.0
-"""Root mean square difference of all pictures from the drawn ones, of 255, from which on they show something else."""
+"""Root mean square difference of all images from the drawn ones, of 255, from which on they show something else."""
 
 
 @calibration_check(
@@ -38,7 +38,7 @@ UNRELATED = 16.0
     fail=0.5,
 )
 def intrinsics(episode: CheckedEpisode) -> Iterator[Found]:
-    """The calibration message agrees with the scene's camera and the pictures' size."""
+    """The calibration message agrees with the scene's camera and the images' size."""
     for camera in episode.cameras:
         scan = episode.scan.get(channels.camera_topic(camera.name, "camera_info"))
         if scan is None or not scan.first:
@@ -77,7 +77,7 @@ def _expected(episode: CheckedEpisode, camera: SceneCamera) -> Array:
 
 
 def _allowance(episode: CheckedEpisode, camera: SceneCamera) -> float:
-    """By how much pictures may be shifted, of their height: older recordings do not tell how they are turned."""
+    """By how much images may be shifted, of their height: older recordings do not tell how they are turned."""
     if told_error(camera.name, episode.info.behaviour) is not None:
         return 0.0
     angle = episode.info.behaviour.get(f"calibration_{camera.name}_angle", 0.0)
@@ -85,21 +85,21 @@ def _allowance(episode: CheckedEpisode, camera: SceneCamera) -> float:
 
 
 @calibration_check(
-    measures="shift of the pictures against what the recorded numbers make of them, of the height",
+    measures="shift of the images against what the recorded numbers make of them, of the height",
     unit="%",
-    needs_pictures=True,
+    needs_images=True,
 )
 @of_each_camera
-def projection(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
-    """Recorded poses, projected with K and extrinsics, fall where the picture has them.
+def projection(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
+    """Recorded poses, projected with K and extrinsics, fall where the image has them.
 
-    The pictures are drawn anew from joints, objects, K and mounts, and the shift that fits best is measured over all
-    frames. Catches mirrored and flipped pictures, a wrong K, pictures or the name of another camera, swapped colours.
+    The images are drawn anew from joints, objects, K and mounts, and the shift that fits best is measured over all
+    frames. Catches mirrored and flipped images, a wrong K, images or the name of another camera, swapped colours.
     Where the episode has a calibration error of its own, which it names, that much is allowed.
     """
     usual = float(np.median(compared.unlike))
     if usual > UNRELATED:
-        detail = f"camera {camera.name}: its pictures show something else than the recorded numbers ({usual:.0f})"
+        detail = f"camera {camera.name}: its images show something else than the recorded numbers ({usual:.0f})"
         return Measurement(value=math.inf, frame=int(np.argmax(compared.unlike)), detail=detail)
     told = (episode.recording.calibration(camera.name).intrinsics - camera.intrinsics)[:2, 2] / camera.height
     off = float(np.linalg.norm(compared.shift - told))
@@ -110,7 +110,7 @@ def projection(episode: CheckedEpisode, camera: SceneCamera, compared: PictureCo
 @calibration_check(
     measures="how far things are from where the recorded numbers put them, in some images at full size",
     unit="px",
-    needs_pictures=True,
+    needs_images=True,
 )
 @at_full_size
 def image_placement(camera: SceneCamera, compared: FullSize) -> Found:
@@ -120,7 +120,7 @@ def image_placement(camera: SceneCamera, compared: FullSize) -> Found:
 
 @calibration_check(
     measures="share of the pixels of some images of depth or labels that are not what is drawn at full size",
-    needs_pictures=True,
+    needs_images=True,
 )
 def pixels_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
     """Depth and labels are exact to the pixel: catches offsets, steps, noise, filters, smeared and grown edges."""
@@ -132,13 +132,13 @@ def pixels_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @alignment_check(
-    measures="lag between pictures and numbers, frames",
-    needs_pictures=True,
+    measures="lag between images and numbers, frames",
+    needs_images=True,
 )
-def picture_lag(episode: CheckedEpisode) -> Iterator[Found]:
-    """Picture t shows state t: robot and objects are where the numbers of the same frame put them.
+def image_lag(episode: CheckedEpisode) -> Iterator[Found]:
+    """Image t shows state t: robot and objects are where the numbers of the same frame put them.
 
-    Colour, depth and labels of each camera against the pictures that are drawn of the frames before and after. Where
+    Colour, depth and labels of each camera against the images that are drawn of the frames before and after. Where
     less than a dozen frames show any motion nothing is told.
     """
     for camera in episode.cameras:
@@ -148,8 +148,8 @@ def picture_lag(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @calibration_check(
-    measures="share of a depth picture that is not what the recorded numbers make of it",
-    needs_pictures=True,
+    measures="share of a depth image that is not what the recorded numbers make of it",
+    needs_images=True,
 )
 def depth_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
     """Depth is metres along the optical axis, in every frame: catches other units, distances along the ray, flips."""
@@ -157,8 +157,8 @@ def depth_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @calibration_check(
-    measures="share of a picture of labels that is not what the recorded numbers make of it",
-    needs_pictures=True,
+    measures="share of an image of labels that is not what the recorded numbers make of it",
+    needs_images=True,
 )
 def segmentation_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
     """Every pixel has the label of the body that geometry puts there, in every frame."""
@@ -166,7 +166,7 @@ def segmentation_matches_scene(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 def _strays(episode: CheckedEpisode, kind: ImageKind) -> Iterator[Found]:
-    """The largest share of any picture of a kind, of each camera."""
+    """The largest share of any image of a kind, of each camera."""
     for camera in episode.cameras:
         if kind in episode.kinds(camera.name):
             share = episode.strays(camera, kind)

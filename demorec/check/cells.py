@@ -1,4 +1,4 @@
-"""Pictures as means over small areas: what the checks keep of every picture, recorded or drawn."""
+"""Images as means over small areas: what the checks keep of every image, recorded or drawn."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ CHANNELS: dict[ImageKind, int] = {"color": 3, "depth": 1, "labels": 2}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PictureCells:
-    """One picture in cells.
+class ImageCells:
+    """One image in cells.
 
     Attributes:
         cells: (h, w, channels) means, 0..255.
-        mean: (channels,) of the whole picture.
+        mean: (channels,) of the whole image.
         dark, bright: Share of the pixels that are nearly black or nearly white; 0 for depth and labels.
     """
 
@@ -43,11 +43,11 @@ class PictureCells:
 
 
 class CellGrid:
-    """Means over a grid of equal squares in the middle of pictures of one size, but for a narrow border of some sizes.
+    """Means over a grid of equal squares in the middle of images of one size, but for a narrow border of some sizes.
 
     Args:
-        width, height: Of the pictures, pixels.
-        counts: (columns, rows) of the grid; default: those for pictures of this size.
+        width, height: Of the images, pixels.
+        counts: (columns, rows) of the grid; default: those for images of this size.
     """
 
     def __init__(self, width: int, height: int, counts: tuple[int, int] | None = None) -> None:
@@ -55,39 +55,39 @@ class CellGrid:
         side = cell_side(width, height, counts)
         self._shape = rows, columns
         self._area = side * side
-        # The border's cells are added up, too, for what is told of the whole picture.
+        # The border's cells are added up, too, for what is told of the whole image.
         self._columns, self._rows = (_lines(count, side, size) for count, size in ((columns, width), (rows, height)))
         self._num_pixels = width * height
         size = (height, width)
         self._shapes: dict[ImageKind, tuple[int, ...]] = {"color": (*size, 3), "depth": size, "labels": size}
 
     def shape(self, kind: ImageKind) -> tuple[int, int, int]:
-        """Of the cells of a picture: (h, w, channels)."""
+        """Of the cells of an image: (h, w, channels)."""
         return (*self._shape, CHANNELS[kind])
 
-    def read(self, kind: ImageKind, picture: NDArray[Any]) -> PictureCells:
-        """A picture (H, W, 3) uint8 of colours, (H, W) float32 metres or (H, W) int32 labels, as brightnesses.
+    def read(self, kind: ImageKind, image: NDArray[Any]) -> ImageCells:
+        """An image (H, W, 3) uint8 of colours, (H, W) float32 metres or (H, W) int32 labels, as brightnesses.
 
         Raises:
-            RecordingError: The picture has another size.
+            RecordingError: The image has another size.
         """
         from demorec.check import kernels
 
-        if picture.shape != self._shapes[kind]:
+        if image.shape != self._shapes[kind]:
             raise RecordingError(
-                f"A picture ({kind}) has the shape {picture.shape}, those of its camera {self._shapes[kind]}."
+                f"An image ({kind}) has the shape {image.shape}, those of its camera {self._shapes[kind]}."
             )
         grid = self._rows, self._columns
         sums = np.empty((len(self._rows) - 1, len(self._columns) - 1, CHANNELS[kind]))
         dark = bright = 0
         if kind == "color":
-            dark, bright = kernels.sum_colors(np.ascontiguousarray(picture), *grid, sums)
+            dark, bright = kernels.sum_colors(np.ascontiguousarray(image), *grid, sums)
         elif kind == "depth":
-            kernels.sum_depths(np.ascontiguousarray(picture, dtype=np.float32), *grid, DEPTH_RANGE, sums)
+            kernels.sum_depths(np.ascontiguousarray(image, dtype=np.float32), *grid, DEPTH_RANGE, sums)
             sums *= 255 / DEPTH_RANGE
         else:
-            kernels.sum_labels(np.ascontiguousarray(picture, dtype=np.int32), *grid, sums)
-        return PictureCells(
+            kernels.sum_labels(np.ascontiguousarray(image, dtype=np.int32), *grid, sums)
+        return ImageCells(
             cells=(sums[1:-1, 1:-1] / self._area).astype(np.float32),
             mean=sums.sum(axis=(0, 1)) / self._num_pixels,
             dark=dark / self._num_pixels,
@@ -102,7 +102,7 @@ def _lines(count: int, side: int, size: int) -> NDArray[np.int64]:
 
 
 def cell_counts(width: int, height: int) -> tuple[int, int]:
-    """(columns, rows) of the grid for pictures of a size: it leaves out as little of them as possible.
+    """(columns, rows) of the grid for images of a size: it leaves out as little of them as possible.
 
     What it leaves out is even where that can be, so that it lies in the middle.
     """

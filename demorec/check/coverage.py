@@ -1,4 +1,4 @@
-"""How well the episodes cover what was randomised: the largest gaps, and a picture to look at."""
+"""How well the episodes cover what was randomised: the largest gaps, and an image to look at."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from demorec.check.base import Found, Measurement, worst
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
-from demorec.core.replacing import PICTURE, written_whole
+from demorec.core.replacing import IMAGE, written_whole
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, yaw_of
 
@@ -167,10 +167,10 @@ def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> None:
         _draw_histogram(draw, name, values, left, top)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(path, PICTURE) as part:
+        with written_whole(path, IMAGE) as part:
             image.save(part, format="png")
     except OSError as error:
-        raise ConfigError(f"The picture cannot be written ({error.strerror or error}): {path}") from error
+        raise ConfigError(f"The image cannot be written ({error.strerror or error}): {path}") from error
 
 
 def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import Cells
 from demorec.check.coverage import motion_vector
-from demorec.check.dataset_video import EpisodePictures, episode_pictures
-from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, draw, frames_to_draw
+from demorec.check.dataset_video import EpisodeImages, episode_images
+from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, draw, frames_to_draw
 from demorec.check.dynamics import Dynamics
 from demorec.check.episode_drawn import drawable_scene
 from demorec.check.evidence import Motion, motions_of_dataset
 from demorec.check.films import Film, Films, likeness_of_films
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices
-from demorec.core.errors import ConfigError, ExportError, in_words
+from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode, spoken_of
@@ -98,7 +98,7 @@ class Dataset:
 
     def __init__(self, path: Path, urdf: str = "", motors: Motors | None = None) -> None:
         self.path, self.urdf, self.motors = path, urdf, motors
-        self._pictures: dict[str, list[EpisodePictures]] = {}
+        self._images: dict[str, list[EpisodeImages]] = {}
 
     @cached_property
     def info(self) -> DatasetInfo:
@@ -164,11 +164,11 @@ class Dataset:
         """Names of the camera features, less those of depth."""
         return [key for key in self.info.video_keys if not self.info.features[key].is_depth]
 
-    def pictures(self, key: str) -> list[EpisodePictures]:
+    def images(self, key: str) -> list[EpisodeImages]:
         """What is decoded of a camera in each episode, kept from the first call on."""
-        if key not in self._pictures:
-            self._pictures[key] = episode_pictures(self.path, self.info, self.places, key)
-        return self._pictures[key]
+        if key not in self._images:
+            self._images[key] = episode_images(self.path, self.info, self.places, key)
+        return self._images[key]
 
     @cached_property
     def films(self) -> Films:
@@ -179,11 +179,11 @@ class Dataset:
                 Film(
                     where=f"{key}, episode {number}",
                     fps=self.info.fps,
-                    cells=pictures.cells,
-                    frames=np.arange(pictures.count),
+                    cells=images.cells,
+                    frames=np.arange(images.count),
                     state=self.rows[number][STATE].astype(np.float64) if known else None,
                 )
-                for number, pictures in enumerate(self.pictures(key))
+                for number, images in enumerate(self.images(key))
             ]
             for key in self.colour_keys
         }
@@ -193,19 +193,19 @@ class Dataset:
         return iter(())
 
     @cached_property
-    def compared(self) -> list[tuple[int, str, PictureComparison | NotMeasured]]:
-        """(episode, camera, how its pictures begin against states and scene); only with a sidecar.
+    def compared(self) -> list[tuple[int, str, ImageComparison | NotMeasured]]:
+        """(episode, camera, how its images begin against states and scene); only with a sidecar.
 
         Where nothing can be told of an episode it is there once, without a camera.
         """
         keys = {key.removeprefix(IMAGE_PREFIX): key for key in self.colour_keys}
-        found: list[tuple[int, str, PictureComparison | NotMeasured]] = []
+        found: list[tuple[int, str, ImageComparison | NotMeasured]] = []
         for each in self.described():
             names = [camera.name for camera in each.info.scene.cameras if camera.name in keys]
-            seen = {name: self.pictures(keys[name])[each.number].cells.astype(np.float32) for name in names}
+            seen = {name: self.images(keys[name])[each.number].cells.astype(np.float32) for name in names}
             compared = compare_beginning(each.info, each.rows[STATE].astype(np.float64), self.info.fps, seen)
             of_cameras = {"": compared} if isinstance(compared, NotMeasured) else compared
-            found += [(each.number, camera, pictures) for camera, pictures in of_cameras.items()]
+            found += [(each.number, camera, images) for camera, images in of_cameras.items()]
         return found
 
     @cached_property
@@ -248,7 +248,9 @@ class Dataset:
         try:
             return [read_episode_info(row["episode_info"]) for row in self.sidecar if row["episode_info"] is not None]
         except (ValueError, KeyError, TypeError) as error:
-            raise ExportError(f"The sidecar's episode_info cannot be used ({in_words(error)}): {self.path}") from error
+            raise ExportError(
+                f"The sidecar's episode_info cannot be used ({describe_error(error)}): {self.path}"
+            ) from error
 
     @property
     def successes(self) -> list[EpisodeInfo]:
@@ -311,8 +313,8 @@ class Dataset:
 
 def compare_beginning(
     info: EpisodeInfo, state: Array, fps: int, seen: Mapping[str, Cells]
-) -> Mapping[str, PictureComparison] | NotMeasured:
-    """Camera -> its pictures until the fingers first close against what states and scene make of them.
+) -> Mapping[str, ImageComparison] | NotMeasured:
+    """Camera -> its images until the fingers first close against what states and scene make of them.
 
     Until then nothing but the robot moves, and the sidecar says where the objects stood, so everything is known.
 
@@ -320,7 +322,7 @@ def compare_beginning(
         info: Of the episode, from the sidecar.
         state: (T, n_arm + 1) joint positions (rad) and opening (m) of each row.
         fps: Rows a second.
-        seen: Camera -> its pictures in cells.
+        seen: Camera -> its images in cells.
     """
     if (renderer := info.config.get("renderer", "raster")) != "raster":
         return NotMeasured(why=f"colours of the renderer {renderer!r} are others than those that are drawn here")

@@ -108,12 +108,12 @@ def _wrong_ends(dataset: Dataset) -> Iterator[str]:
 
 
 @dataset_check(
-    measures="episodes without a coded picture for every frame",
+    measures="episodes without a coded image for every frame",
 )
 def dataset_videos(dataset: Dataset) -> Measurement | None:
-    """Every episode has its pictures in every camera's file, one after the other.
+    """Every episode has its images in every camera's file, one after the other.
 
-    In front of an episode there may be pictures from the keyframe on that its first one needs.
+    In front of an episode there may be images from the keyframe on that its first one needs.
     """
     if not dataset.info.video_keys:
         return None
@@ -128,7 +128,7 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
                 for number, _ in enumerate(reader.read(place)):
                     # Between two episodes there is nothing but what the second one is decoded from.
                     if number == 0 and first != end and reader.keyframe != end:
-                        wrong.append(f"{key}, episode {place.episode_index}: starts at picture {first}")
+                        wrong.append(f"{key}, episode {place.episode_index}: starts at image {first}")
         except ExportError as error:
             wrong.append(str(error))
         finally:
@@ -188,10 +188,10 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
 
 @dataset_check(
     measures="errors when the installed LeRobot opens it",
-    needs_pictures=True,
+    needs_images=True,
 )
 def dataset_opens(dataset: Dataset) -> Measurement | None:
-    """LeRobot opens the dataset and reads first, middle and last frame, pictures included."""
+    """LeRobot opens the dataset and reads first, middle and last frame, images included."""
     if dataset.info.is_old:  # LeRobot 0.6 reads v3.0 alone
         return None
     if not lerobot_is_installed():

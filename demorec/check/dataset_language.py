@@ -1,7 +1,7 @@
 """Do the language columns of a dataset say what they must, in LeRobot's form, and is it true of the episode.
 
 The first check needs the columns alone, the second one what demorec keeps beside the dataset: phases, the scene, and
-with `--boxes` what each picture shows.
+with `--boxes` what each image shows.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
 from demorec.episode.info import EpisodeInfo
 
 Row = dict[str, Any]
-_ABOUT_PICTURES = ("vqa", "trace")
-_EVENTS = {*_ABOUT_PICTURES, "interjection", None}
+_ABOUT_IMAGES = ("vqa", "trace")
+_EVENTS = {*_ABOUT_IMAGES, "interjection", None}
 _ROLES = ("user", "assistant", "system", "tool")
 
 
@@ -68,7 +68,7 @@ def _malformed(dataset: Dataset, episode: SpokenEpisode) -> Iterator[str]:
             yield f"frame {frame} has two entries of one style, role and camera"
         for row in rows:
             yield from (f"frame {frame}: {text}" for text in _entry_faults(row, _EVENTS, dataset))
-            if row.get("style") in _ABOUT_PICTURES and row.get("role") == "assistant":
+            if row.get("style") in _ABOUT_IMAGES and row.get("role") == "assistant":
                 yield from (f"frame {frame}: {text}" for text in _answer_faults(row, dataset))
 
 
@@ -80,9 +80,9 @@ def _entry_faults(row: Row, styles: set[Any], dataset: Dataset) -> Iterator[str]
         yield f"a {style} by {row.get('role')!r}"
     if not (row.get("content") or row.get("tool_calls")):
         yield f"a {style} that says nothing"
-    if style in _ABOUT_PICTURES and camera not in dataset.info.video_keys:
+    if style in _ABOUT_IMAGES and camera not in dataset.info.video_keys:
         yield f"a {style} about the camera {camera!r}, which the dataset does not have"
-    if style not in _ABOUT_PICTURES and camera is not None:
+    if style not in _ABOUT_IMAGES and camera is not None:
         yield f"a {style} about a camera"
 
 
@@ -99,7 +99,7 @@ def _answer_faults(row: Row, dataset: Dataset) -> Iterator[str]:
     height, width = feature.shape[:2]
     for x, y in _points(answer):
         if not (0 <= x < width and 0 <= y < height):
-            yield f"a point at ({x:g}, {y:g}), outside of the picture"
+            yield f"a point at ({x:g}, {y:g}), outside of the image"
             return
 
 
@@ -244,7 +244,7 @@ class _Boxes:
                 self._found.setdefault((path.stem, item.index), {})[item.object] = [x, y, x + width - 1, y + height - 1]
 
     def at(self, camera: str, episode: int, frame: int) -> dict[str, list[float]]:
-        """Name of the body -> (x_min, y_min, x_max, y_max), of all that a picture shows."""
+        """Name of the body -> (x_min, y_min, x_max, y_max), of all that an image shows."""
         return self._found.get((camera, self._first[episode] + frame), {})
 
 
@@ -260,7 +260,7 @@ def _wrong_answers(episode: SpokenEpisode, number: int, start: Surroundings, box
 
 
 def _against(answer: Row, seen: dict[str, list[float]], start: Surroundings) -> Iterator[str]:
-    """Faults of an answer, given what the picture shows."""
+    """Faults of an answer, given what the image shows."""
     if "count" in answer:
         count = sum(answer["label"] in start.thing(name).nouns for name in seen)
         if answer["count"] != count:

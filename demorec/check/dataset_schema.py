@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from demorec.check.base import Measurement, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import check_video, open_table, read_json
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, DatasetFeature
@@ -55,7 +55,7 @@ def _columns(dataset: Dataset) -> Iterator[str]:
 
 def _fits(found: pa.DataType, feature: DatasetFeature) -> bool:
     if feature.dtype not in _TYPES:
-        return True  # pictures in tables, which other writers have
+        return True  # images in tables, which other writers have
     size = None
     while pa.types.is_list(found) or pa.types.is_fixed_size_list(found) or pa.types.is_large_list(found):
         if pa.types.is_fixed_size_list(found):
@@ -106,7 +106,7 @@ def _videos(dataset: Dataset) -> Iterator[str]:
 
 
 def _stream(path: Path) -> tuple[dict[str, Any], float]:
-    """What an mp4 file says of its pictures, and how many a second it has."""
+    """What an mp4 file says of its images, and how many a second it has."""
     import av
 
     check_video(path)
@@ -117,7 +117,7 @@ def _stream(path: Path) -> tuple[dict[str, Any], float]:
             codec = {"libdav1d": "av1"}.get(context.name, context.name)
             found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}
     except (OSError, IndexError, av.FFmpegError) as error:
-        raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
+        raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
     return found, float(rate or 0)
 
 
@@ -144,7 +144,7 @@ def _splits(dataset: Dataset) -> Iterator[str]:
     measures="statements of info.json that the episodes' own descriptions contradict",
 )
 def dataset_description(dataset: Dataset) -> Measurement | None:
-    """Robot, rate, names of components and sizes of pictures are those of the scenes that the sidecar keeps."""
+    """Robot, rate, names of components and sizes of images are those of the scenes that the sidecar keeps."""
     if not dataset.infos:
         return None
     wrong = [

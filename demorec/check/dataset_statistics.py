@@ -11,7 +11,7 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, dataset_check, worst
 from demorec.check.dataset import Dataset, read_rows
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.layout import STATS_PATH
@@ -86,7 +86,7 @@ def read_statistics(dataset: Dataset) -> dict[str, Any]:
         if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
             raise ValueError("it holds no object of objects")
     except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The statistics cannot be read ({describe_error(error)}): {path}") from error
     return found
 
 

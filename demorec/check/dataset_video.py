@@ -12,26 +12,26 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.datasets.lerobot.reader import EpisodePlace
 
 _PARTS = 16
-"""Parts along the shorter side, about, whose mean colours stand for a picture."""
+"""Parts along the shorter side, about, whose mean colours stand for an image."""
 _FEWEST_PARTS, _MOST_PARTS = 8, 32
 """Where no square part of as many divides both sides, there are `_PARTS` by `_PARTS` that are not square."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EpisodePictures:
-    """The colour pictures of one camera in one episode.
+class EpisodeImages:
+    """The colour images of one camera in one episode.
 
     Attributes:
         count: How many there are.
         mean: (3,) mean red, green and blue, of 1.
-        cells: (count, rows, columns, 3) mean colours of the parts of each picture, 0 to 255.
+        cells: (count, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
     """
 
     count: int
@@ -39,11 +39,11 @@ class EpisodePictures:
     cells: NDArray[np.uint8]
 
 
-def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace], key: str) -> list[EpisodePictures]:
+def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace], key: str) -> list[EpisodeImages]:
     """Of every episode, in order, one episode in memory at a time.
 
     Raises:
-        ExportError: A video cannot be decoded, or has too few pictures.
+        ExportError: A video cannot be decoded, or has too few images.
     """
     files: dict[Path, Iterator[NDArray[np.uint8]]] = {}
     ends: dict[Path, int] = {}
@@ -54,19 +54,19 @@ def episode_pictures(root: Path, info: DatasetInfo, places: Sequence[EpisodePlac
         if path not in files:
             files[path] = _decoded(path, info.features[key].shape)
         lead, ends[path] = max(0, first - ends.get(path, 0)), first + place.length
-        pictures = list(islice(files[path], lead, lead + place.length))
-        if len(pictures) < place.length or not pictures:
+        images = list(islice(files[path], lead, lead + place.length))
+        if len(images) < place.length or not images:
             raise ExportError(
-                f"Episode {place.episode_index} has {place.length} frames, {len(pictures)} pictures decode: {path}"
+                f"Episode {place.episode_index} has {place.length} frames, {len(images)} images decode: {path}"
             )
-        cells = np.stack(pictures)
+        cells = np.stack(images)
         mean = cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255
-        found.append(EpisodePictures(count=len(cells), mean=mean, cells=cells))
+        found.append(EpisodeImages(count=len(cells), mean=mean, cells=cells))
     return found
 
 
 def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
-    """(rows, columns, 3) mean colours of the parts of every picture, 0 to 255."""
+    """(rows, columns, 3) mean colours of the parts of every image, 0 to 255."""
     import av
 
     check_video(path)
@@ -74,17 +74,17 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
     columns, rows = part_counts(width, height)
     try:
         with av.open(str(path), format="mp4") as container:
-            for stream in container.streams.video:  # a few bytes can announce pictures of gigabytes
+            for stream in container.streams.video:  # a few bytes can announce images of gigabytes
                 stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
             for frame in container.decode(video=0):
                 small = frame.reformat(width=columns, height=rows, format="rgb24", interpolation="AREA")
                 yield cast("NDArray[np.uint8]", small.to_ndarray())
     except (OSError, av.FFmpegError) as error:
-        raise ExportError(f"The video cannot be decoded ({in_words(error)}): {path}") from error
+        raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error
 
 
 def part_counts(width: int, height: int) -> tuple[int, int]:
-    """(columns, rows) of square parts that cover a picture of a size; (16, 16) where there are none."""
+    """(columns, rows) of square parts that cover an image of a size; (16, 16) where there are none."""
     shorter, common = min(width, height), math.gcd(width, height)
     sides = [side for side in range(1, common + 1) if common % side == 0]
     side = min(sides, key=lambda side: abs(math.log(shorter / side / _PARTS)))

@@ -1,12 +1,12 @@
 """What a camera must have seen, drawn anew from the recorded numbers, beside what was recorded.
 
-The renderer that draws a recording needs no simulator: poses follow from the recorded joints and objects. Pictures are
+The renderer that draws a recording needs no simulator: poses follow from the recorded joints and objects. Images are
 drawn small and compared with the recorded ones in cells (means over small areas), in which the coder's error nearly
 vanishes while a motion of a tenth of a cell still shows. Depth and labels are compared in the same way: depth as a
 brightness, labels as colours of a palette.
 
-Not every frame has to be drawn: where both the recorded picture and the recorded poses are what lies between those of
-the frames around, so is the drawn picture.
+Not every frame has to be drawn: where both the recorded image and the recorded poses are what lies between those of
+the frames around, so is the drawn image.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
 
 PIXELS_PER_CELL = 3
-"""Pixels that are drawn along the side of a cell, at most. With 2 a check costs a tenth less, and pictures that are as
+"""Pixels that are drawn along the side of a cell, at most. With 2 a check costs a tenth less, and images that are as
 they should be are a quarter more unlike the drawn ones; with 4 it is the other way round."""
 LOSSLESS_PIXELS_PER_CELL = 4
 """The same where depth or labels are drawn: these have no smooth edges, and every cell of them is compared."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DrawnPictures:
+class DrawnImages:
     """What the cameras must have seen, T frames.
 
     Attributes:
-        frames: (N,) frames that were drawn, in order, the first and the last among them; the pictures of the others are
+        frames: (N,) frames that were drawn, in order, the first and the last among them; the images of the others are
             means of the drawn ones before and after, weighted by time.
         cells: (camera, kind) -> (T, h, w, channels).
     """
@@ -56,7 +56,7 @@ def draw(
     frames: NDArray[np.int64],
     kinds: Mapping[str, Iterable[ImageKind]],
     counts: Mapping[str, tuple[int, int]],
-) -> DrawnPictures:
+) -> DrawnImages:
     """The frames of a world, up to the last of those that are drawn.
 
     Args:
@@ -93,31 +93,31 @@ def draw(
     painter.setup(world)
     for frame in frames.tolist():
         world.frame = frame
-        images = painter.images()
+        drawn = painter.images()
         for (name, kind), rows in cells.items():
-            image = images[name]
-            pictures = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
-            assert pictures is not None
-            rows[frame] = grids[name].read(kind, pictures).cells
+            image = drawn[name]
+            images = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
+            assert images is not None
+            rows[frame] = grids[name].read(kind, images).cells
     for rows in cells.values():
         fill_between(rows, frames)
-    return DrawnPictures(frames=frames, cells=cells)
+    return DrawnImages(frames=frames, cells=cells)
 
 
 _STRIDE = 3
-"""Every so many frames are drawn in any case; odd, so that both kinds of pictures of a GOP of 2 are among them."""
-_PICTURE_BETWEEN = 2.5
-"""Of 255, root mean square over the cells: a recorded picture that is farther from what lies between its neighbours is
-drawn. Less than half of what makes a picture odd or stale (`demorec.check.pictures`)."""
+"""Every so many frames are drawn in any case; odd, so that both kinds of images of a GOP of 2 are among them."""
+_IMAGE_BETWEEN = 2.5
+"""Of 255, root mean square over the cells: a recorded image that is farther from what lies between its neighbours is
+drawn. Less than half of what makes an image odd or stale (`demorec.check.images`)."""
 _POSE_BETWEEN = 0.005
 """Metres, or of a quaternion: the same for the poses."""
 
 
 def frames_to_draw(seen: Iterable[Cells], poses: Array) -> NDArray[np.int64]:
-    """(N,) frames whose drawn pictures tell those of the others, in order.
+    """(N,) frames whose drawn images tell those of the others, in order.
 
     Args:
-        seen: Pictures of each camera, T frames, or fewer where the rest cannot be read.
+        seen: Images of each camera, T frames, or fewer where the rest cannot be read.
         poses: (T, n, 7) of everything that can be seen: position, quaternion.
     """
     rows = [np.ascontiguousarray(cells).reshape(len(cells), -1) for cells in seen]
@@ -138,7 +138,7 @@ def _not_between(
     after: NDArray[np.int64],
     share: Array,
 ) -> NDArray[np.bool_]:
-    """(T,) frames whose pictures or poses are not what lies between those of the frames before and after."""
+    """(T,) frames whose images or poses are not what lies between those of the frames before and after."""
     from demorec.check import kernels
 
     weight = share[:, None, None]
@@ -148,7 +148,7 @@ def _not_between(
         off[len(there) : len(rows)] = True
         sums = np.zeros(len(there))
         kernels.squares_between(rows, before, after, share, sums)
-        off[there] |= sums > _PICTURE_BETWEEN**2 * max(rows.shape[1], 1)
+        off[there] |= sums > _IMAGE_BETWEEN**2 * max(rows.shape[1], 1)
     return np.asarray(off)
 
 
@@ -189,16 +189,16 @@ def small_camera(camera: SceneCamera, counts: tuple[int, int], most: int) -> Sce
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PictureComparison:
-    """Recorded pictures of a camera against the drawn ones, T frames.
+class ImageComparison:
+    """Recorded images of a camera against the drawn ones, T frames.
 
     Attributes:
-        shift: (2,) how far the recorded pictures are to the right of and below the drawn ones, of the height.
-        scale: Share by which things are larger in the recorded pictures.
-        lag: By how many frames the recorded pictures are late; None where too little moves to tell.
+        shift: (2,) how far the recorded images are to the right of and below the drawn ones, of the height.
+        scale: Share by which things are larger in the recorded images.
+        lag: By how many frames the recorded images are late; None where too little moves to tell.
         unlike: (T,) root mean square difference of the cells, of 255, but for shift and scale.
         motion: (T,) root mean square change of the drawn cells since the frame before, of 255.
-        shown: (T,) which share of that change the recorded picture shows: 1 for good ones, 0 for a repeated one.
+        shown: (T,) which share of that change the recorded image shows: 1 for good ones, 0 for a repeated one.
     """
 
     shift: Array
@@ -209,15 +209,15 @@ class PictureComparison:
     shown: Array
 
 
-def judge_unlike(compared: PictureComparison | NotMeasured, what: str) -> Found:
-    """By how much the usual picture of a camera (`what`) is unlike the drawn one."""
+def judge_unlike(compared: ImageComparison | NotMeasured, what: str) -> Found:
+    """By how much the usual image of a camera (`what`) is unlike the drawn one."""
     if isinstance(compared, NotMeasured):
         return compared
     return Measurement(value=float(np.median(compared.unlike)), detail=what)
 
 
-def judge_lag(compared: PictureComparison | NotMeasured, what: str, view: str) -> Found:
-    """By how many frames pictures (`what`) run behind the numbers, or before them; `view` names their camera."""
+def judge_lag(compared: ImageComparison | NotMeasured, what: str, view: str) -> Found:
+    """By how many frames images (`what`) run behind the numbers, or before them; `view` names their camera."""
     if isinstance(compared, NotMeasured):
         return compared
     if compared.lag is None:
@@ -228,7 +228,7 @@ def judge_lag(compared: PictureComparison | NotMeasured, what: str, view: str) -
 _STRAY: dict[ImageKind, float] = {"depth": 1.0, "labels": 4.0}
 """Of 255: what is off by more is another depth (12 mm) or label."""
 _TURNED_STRAY = 16.0
-"""The same where a camera's turn was found in its pictures: what is left of it moves edges by a twentieth of a cell."""
+"""The same where a camera's turn was found in its images: what is left of it moves edges by a twentieth of a cell."""
 _MAX_LAG = 3
 _MOVING = 1.0
 _MIN_MOVING = 12
@@ -236,7 +236,7 @@ _MIN_MOVING = 12
 
 
 def fit(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Array:
-    """(4,) by how much the recorded pictures are to the right, below (cells), larger (share) and turned (rad)."""
+    """(4,) by how much the recorded images are to the right, below (cells), larger (share) and turned (rad)."""
     from demorec.check import kernels
 
     # Frames that are something else altogether must not decide how far the others are shifted.
@@ -249,12 +249,12 @@ def fit(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Array:
     return np.asarray(np.linalg.solve(gram, right))
 
 
-def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> PictureComparison:
+def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> ImageComparison:
     """Least squares over the drawn frames: seen = drawn, but shifted, scaled and turned by one amount each.
 
     Args:
         seen: (T, h, w, channels) as recorded.
-        drawn: The same of at least T frames, as of `DrawnPictures.cells`.
+        drawn: The same of at least T frames, as of `DrawnImages.cells`.
         frames: Those that were drawn.
     """
     from demorec.check import kernels
@@ -266,7 +266,7 @@ def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> PictureComp
     moved, shown = np.zeros(len(seen)), np.zeros(len(seen))
     kernels.compare_steps(_flat(seen), _flat(drawn), moved, shown)
     motion = np.sqrt(moved / max(drawn[0].size, 1))
-    return PictureComparison(
+    return ImageComparison(
         shift=found[:2] / drawn.shape[1],
         scale=float(found[2]),
         lag=_lag(seen, fitted, frames[motion[frames] > _MOVING]),
@@ -280,7 +280,7 @@ def strays(seen: Cells, drawn: Cells, kind: ImageKind, *, is_turned: bool = Fals
     """(T,) share of the cells whose value lies outside those of the drawn cell and its eight neighbours.
 
     For depth and labels, which are coded without loss: edges may lie elsewhere by a cell, nothing else may differ.
-    Cells at the picture's border, some of whose neighbours are not in it, are left out.
+    Cells at the image's border, some of whose neighbours are not in it, are left out.
     """
     drawn = drawn[: len(seen)]
     height, width = (max(size - 2, 0) for size in drawn.shape[1:3])

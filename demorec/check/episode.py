@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import ImageKind, correlation
-from demorec.check.drawn import NOT_DRAWABLE, PictureComparison, compare, strays
+from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, strays
 from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size
 from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
@@ -24,7 +24,7 @@ from demorec.check.films import Films, films_of_recording, likeness_of_films
 from demorec.check.full_size import FullSize, compare_full_size, encoded_again, frames_to_compare, share_off, with_lead
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
-from demorec.check.summary import PictureSummary, summarise
+from demorec.check.summary import ImageSummary, summarise
 from demorec.check.topic_scan import TopicScan, scan_topics
 from demorec.core.errors import RecordingError, SceneError
 from demorec.core.geometry import Array
@@ -50,8 +50,8 @@ class CheckedEpisode(ExitStack):
     def __init__(self, path: Path, named_urdf: str = "") -> None:
         super().__init__()
         self.path, self._named_urdf = path, named_urdf
-        self._pictures: dict[tuple[str, ImageKind], PictureSummary] = {}
-        self._comparisons: dict[tuple[str, ImageKind], PictureComparison] = {}
+        self._images: dict[tuple[str, ImageKind], ImageSummary] = {}
+        self._comparisons: dict[tuple[str, ImageKind], ImageComparison] = {}
         self._full_sizes: dict[str, FullSize] = {}
         self._bodies: dict[str, Array] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
@@ -106,13 +106,13 @@ class CheckedEpisode(ExitStack):
 
     @cached_property
     def blocks(self) -> dict[str, Block]:
-        """topic -> all its messages, but for pictures, which would be too large to be in memory together."""
-        streams = channels.PICTURE_STREAMS
-        pictures = {channels.camera_topic(camera.name, stream) for camera in self.cameras for stream in streams}
-        return self.container.blocks([topic for topic in self.container.channels if topic not in pictures])
+        """topic -> all its messages, but for images, which would be too large to be in memory together."""
+        streams = channels.IMAGE_STREAMS
+        images = {channels.camera_topic(camera.name, stream) for camera in self.cameras for stream in streams}
+        return self.container.blocks([topic for topic in self.container.channels if topic not in images])
 
     def block(self, topic: str) -> Block:
-        """All messages of a topic that is none of pictures; an empty one where there is no such topic."""
+        """All messages of a topic that is none of images; an empty one where there is no such topic."""
         nothing = np.zeros(0, dtype=np.int64)
         return self.blocks.get(topic, Block(content=b"", time_ns=nothing, starts=nothing, lengths=nothing))
 
@@ -260,17 +260,17 @@ class CheckedEpisode(ExitStack):
         return self.info.scene.cameras
 
     def kinds(self, camera: str) -> tuple[ImageKind, ...]:
-        """Which pictures of a camera were recorded."""
+        """Which images of a camera were recorded."""
         depth: tuple[ImageKind, ...] = ("depth",) if self.recording.has_depth(camera) else ()
         labels: tuple[ImageKind, ...] = ("labels",) if self.recording.has_segmentation(camera) else ()
         return ("color", *depth, *labels)
 
-    def pictures(self, camera: SceneCamera, kind: ImageKind = "color") -> PictureSummary:
-        """What the checks need of a camera's decoded pictures; decoded once."""
-        if (camera.name, kind) not in self._pictures:
+    def images(self, camera: SceneCamera, kind: ImageKind = "color") -> ImageSummary:
+        """What the checks need of a camera's decoded images; decoded once."""
+        if (camera.name, kind) not in self._images:
             keep = () if kind == "color" else self.sampled[camera.name].tolist()[::2]
-            self._pictures[camera.name, kind] = summarise(self.recording, camera, kind, keep)
-        return self._pictures[camera.name, kind]
+            self._images[camera.name, kind] = summarise(self.recording, camera, kind, keep)
+        return self._images[camera.name, kind]
 
     @cached_property
     def films(self) -> Films:
@@ -288,7 +288,7 @@ class CheckedEpisode(ExitStack):
             return
         poses = self.columns.world_from_camera
         for camera, other in combinations(self.cameras, 2):
-            first, second = self.pictures(camera).cells, self.pictures(other).cells
+            first, second = self.images(camera).cells, self.images(other).cells
             count = min(len(first), len(second))
             is_near = np.abs(poses[camera.name] - poses[other.name]).max(initial=0.0) < 1e-3
             if first.shape[1:] == second.shape[1:] and count >= 2 and not is_near:
@@ -296,11 +296,11 @@ class CheckedEpisode(ExitStack):
 
     @cached_property
     def _drawn(self) -> DrawnEpisode | NotMeasured:
-        """The pictures as the recorded numbers make them; each single one where some are coded without loss."""
+        """The images as the recorded numbers make them; each single one where some are coded without loss."""
         kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
         is_exact = any(of_camera != ("color",) for of_camera in kinds.values())
         try:
-            colors = {camera.name: self.pictures(camera).cells for camera in self.cameras}
+            colors = {camera.name: self.images(camera).cells for camera in self.cameras}
             return draw_episode(self.info, self.columns, kinds, colors, draw_each=is_exact)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
@@ -309,11 +309,11 @@ class CheckedEpisode(ExitStack):
         """(T,) share of the cells of depth or labels that are not what the recorded numbers make of them."""
         if isinstance(self._drawn, NotMeasured):
             return self._drawn
-        seen = self.pictures(camera, kind).cells
+        seen = self.images(camera, kind).cells
         if not len(seen):
-            return NotMeasured(why=f"camera {camera.name} has no picture that can be read")
+            return NotMeasured(why=f"camera {camera.name} has no image that can be read")
         is_turned = camera.name in self._drawn.shift
-        return strays(seen, self._drawn.pictures.cells[camera.name, kind], kind, is_turned=is_turned)
+        return strays(seen, self._drawn.images.cells[camera.name, kind], kind, is_turned=is_turned)
 
     @cached_property
     def sampled(self) -> Mapping[str, NDArray[np.int64]]:
@@ -322,7 +322,7 @@ class CheckedEpisode(ExitStack):
         for camera in self.cameras:
             packets = self.recording.packets(camera.name)
             keyframes = np.array([packet.frame_index for packet in packets if packet.is_keyframe], dtype=np.int64)
-            detail = self.pictures(camera).detail
+            detail = self.images(camera).detail
             found[camera.name] = frames_to_compare(keyframes, len(detail), detail)
         return found
 
@@ -354,7 +354,7 @@ class CheckedEpisode(ExitStack):
             return drawn
         frames = self.sampled[camera.name]
         if len(frames) < 2:
-            return NotMeasured(why=f"camera {camera.name} has {len(frames)} pictures")
+            return NotMeasured(why=f"camera {camera.name} has {len(frames)} images")
         if camera.name not in self._full_sizes:
             wanted = with_lead(frames).tolist()
             seen = dict(zip(wanted, self.recording.images_at(camera.name, wanted), strict=True))
@@ -368,22 +368,22 @@ class CheckedEpisode(ExitStack):
         """Shares (N,) of the pixels of depth or labels that are others than drawn, and the frames (N,)."""
         if isinstance(drawn := self._full_size(camera, kind), NotMeasured):
             return drawn
-        kept = self.pictures(camera, kind).kept
+        kept = self.images(camera, kind).kept
         frames = np.array([frame for frame in sorted(kept) if frame in drawn], dtype=np.intp)
         return np.array([share_off(kept[frame], drawn[frame]) for frame in frames.tolist()]), frames
 
-    def compared(self, camera: SceneCamera, kind: ImageKind = "color") -> PictureComparison | NotMeasured:
-        """A camera's pictures against what the recorded numbers make of them."""
+    def compared(self, camera: SceneCamera, kind: ImageKind = "color") -> ImageComparison | NotMeasured:
+        """A camera's images against what the recorded numbers make of them."""
         renderer = self.info.config.get("renderer", "raster")
         if kind == "color" and renderer != "raster":
             return NotMeasured(why=f"colours of the renderer {renderer!r} are others than those that are drawn here")
         if isinstance(self._drawn, NotMeasured):
             return self._drawn
-        seen = self.pictures(camera, kind).cells
+        seen = self.images(camera, kind).cells
         if len(seen) < 3:
-            return NotMeasured(why=f"camera {camera.name} has {len(seen)} pictures")
+            return NotMeasured(why=f"camera {camera.name} has {len(seen)} images")
         if (camera.name, kind) not in self._comparisons:
-            drawn = self._drawn.pictures
+            drawn = self._drawn.images
             compared = compare(seen, drawn.cells[camera.name, kind], drawn.frames)
             shift = compared.shift + self._drawn.shift.get(camera.name, 0.0)
             self._comparisons[camera.name, kind] = replace(compared, shift=shift)

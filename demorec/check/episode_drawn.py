@@ -1,8 +1,8 @@
-"""The pictures of an episode as its recorded numbers make them.
+"""The images of an episode as its recorded numbers make them.
 
 Recorded camera poses may be off on purpose, as those of a real camera are (`--variation full`). The recording tells by
-how much, so that the pictures are drawn from where the camera was. Older recordings tell the error's offset, and how
-far but not about which axis it turns: there the turn is found in the pictures, as far as it is no larger than told.
+how much, so that the images are drawn from where the camera was. Older recordings tell the error's offset, and how
+far but not about which axis it turns: there the turn is found in the images, as far as it is no larger than told.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
-from demorec.check.drawn import DrawnPictures, draw, fit, frames_to_draw, warm_renderer
+from demorec.check.drawn import DrawnImages, draw, fit, frames_to_draw, warm_renderer
 from demorec.core.geometry import Array, Pose
 from demorec.episode.camera_error import told_error, true_camera
 from demorec.episode.episode import Columns
@@ -37,11 +37,11 @@ class DrawnEpisode:
     """What the cameras of an episode must have seen.
 
     Attributes:
-        pictures: Of all frames, but for the cameras' calibration errors.
-        shift: Camera name -> (2,) by how much the errors' turn moves its pictures to the right and down, of the height.
+        images: Of all frames, but for the cameras' calibration errors.
+        shift: Camera name -> (2,) by how much the errors' turn moves its images to the right and down, of the height.
     """
 
-    pictures: DrawnPictures
+    images: DrawnImages
     shift: Mapping[str, Array]
 
 
@@ -53,18 +53,18 @@ def draw_episode(
     *,
     draw_each: bool = True,
 ) -> DrawnEpisode:
-    """The pictures of an episode, as the recorded numbers make them.
+    """The images of an episode, as the recorded numbers make them.
 
     Args:
         info, columns: Of the recording.
         kinds: Camera name -> what is to be drawn of it.
-        colors: Camera name -> its recorded colour pictures, by which turns are found and frames chosen.
+        colors: Camera name -> its recorded colour images, by which turns are found and frames chosen.
         draw_each: Whether every frame is drawn, also those that can be told from their neighbours.
 
     Raises:
         SceneError, RenderError: A model is not there, or cannot be drawn.
     """
-    # The recorded pictures' grid: the small ones' own may have a row more or less.
+    # The recorded images' grid: the small ones' own may have a row more or less.
     counts = {camera.name: cell_counts(camera.width, camera.height) for camera in info.scene.cameras}
     scene = drawable_scene(info)
     world = RecordedWorld(info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses)
@@ -75,7 +75,7 @@ def draw_episode(
     else:
         frames = frames_to_draw(colors.values(), world.all_poses[: columns.num_frames])
     return DrawnEpisode(
-        pictures=draw(world, cameras, frames, kinds, counts),
+        images=draw(world, cameras, frames, kinds, counts),
         shift={
             camera.name: np.array([turns[camera.name][1], -turns[camera.name][0]]) / _height(camera)
             for camera in cameras
@@ -114,7 +114,7 @@ def draw_full_size(
 def drawable_scene(info: EpisodeInfo) -> Scene:
     """The recorded scene, its cameras without their calibration error; in older recordings without its offset.
 
-    One shift of all pictures makes up for most of a turn, but not for an offset: what is near moves farther by it than
+    One shift of all images makes up for most of a turn, but not for an offset: what is near moves farther by it than
     what is far.
     """
     return replace(info.scene, cameras=tuple(_moved_back(camera, info.behaviour) for camera in info.scene.cameras))
@@ -142,7 +142,7 @@ def _turned_back(camera: SceneCamera, turn: Array | None) -> SceneCamera:
 def _turns(
     info: EpisodeInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
 ) -> dict[str, Array]:
-    """Camera name -> (3,) rotation vector of its calibration error, rad in its own axes, where pictures show one."""
+    """Camera name -> (3,) rotation vector of its calibration error, rad in its own axes, where images show one."""
     told = {
         camera.name: info.behaviour.get(f"calibration_{camera.name}_angle", 0.0)
         for camera in world.scene.cameras
@@ -166,5 +166,5 @@ def _turns(
 
 
 def _height(camera: SceneCamera) -> float:
-    """Of the picture, at a distance of 1."""
+    """Of the image, at a distance of 1."""
     return float(2 * np.tan(camera.fov_y / 2))

@@ -12,7 +12,7 @@ import numpy as np
 from demorec.check.base import IMAGES, Found, Measurement, NotMeasured, check, external_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.films import Filmed, is_blank
-from demorec.episode.episode import NO_PICTURE
+from demorec.episode.episode import NO_IMAGE
 
 _NANOSECONDS = 1_000_000_000
 
@@ -86,20 +86,20 @@ def sample_age(subject: CheckedEpisode) -> Iterator[Found]:
 def image_age(subject: CheckedEpisode) -> Iterator[Found]:
     """The images that a frame holds were taken at about its time."""
     columns = subject.columns
-    for camera, numbers in columns.pictures.items():
-        frames = np.flatnonzero(numbers != NO_PICTURE)
-        yield worst_frame(np.abs(columns.picture_age_ns(camera)) / _NANOSECONDS, f"camera {camera}", frames=frames)
+    for camera, numbers in columns.images.items():
+        frames = np.flatnonzero(numbers != NO_IMAGE)
+        yield worst_frame(np.abs(columns.image_age_ns(camera)) / _NANOSECONDS, f"camera {camera}", frames=frames)
 
 
 @external_check(
-    group="pictures",
+    group="images",
     measures="the share of frames that have no image of a camera",
     fail=0.5,
 )
 def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
     """Every frame has an image of every camera."""
-    for camera, numbers in subject.columns.pictures.items():
-        without = np.flatnonzero(numbers == NO_PICTURE)
+    for camera, numbers in subject.columns.images.items():
+        without = np.flatnonzero(numbers == NO_IMAGE)
         if len(numbers):
             first = int(without[0]) if len(without) else None
             told = f"camera {camera}: {len(without)} of {len(numbers)} frames"
@@ -107,11 +107,11 @@ def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
 
 
 @check(
-    group="pictures",
+    group="images",
     on=("external", "dataset"),
     measures="cameras whose images are of one colour, or show no distance, in more than half of them",
     needs=IMAGES,
-    needs_pictures=True,
+    needs_images=True,
 )
 def images_show_something(subject: Filmed) -> Found:
     """No camera is covered, and none of depth sees nothing."""

@@ -45,7 +45,7 @@ def topics(episode: CheckedEpisode) -> Measurement:
     for stream in frame_streams(episode.info):
         expected[stream.topic] = (stream.schema, episode.num_frames)
     for camera in episode.cameras:
-        expected |= {topic: (schema, episode.num_frames) for topic, schema in _picture_streams(episode, camera.name)}
+        expected |= {topic: (schema, episode.num_frames) for topic, schema in _image_streams(episode, camera.name)}
         expected[channels.camera_topic(camera.name, "camera_info")] = (messages.CAMERA_INFO, None)
     wrong = []
     for topic, (schema, count) in expected.items():
@@ -66,7 +66,7 @@ def topics(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(expected)} topics")
 
 
-def _picture_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, str]]:
+def _image_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, str]]:
     recording = episode.recording
     codec = recording.video_settings(camera).codec
     schema = messages.PROTOBUF_VIDEO if codec == "av1" else messages.COMPRESSED_IMAGE

@@ -18,7 +18,7 @@ from PIL import Image
 from demorec.check.cells import correlation
 from demorec.check.dataset_video import part_counts
 from demorec.core.geometry import Array
-from demorec.episode.episode import NO_PICTURE, Columns
+from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.features import STATE
 from demorec.mcap import Recording
 from demorec.mcap.video import decode
@@ -90,8 +90,8 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
     found = {}
     for camera in recording.cameras:
         cells = cells_of(decode(recording.video_settings(camera), recording.packets(camera)))
-        held, frames = np.unique(columns.pictures[camera], return_index=True)
-        shown = (held != NO_PICTURE) & (held < len(cells))
+        held, frames = np.unique(columns.images[camera], return_index=True)
+        shown = (held != NO_IMAGE) & (held < len(cells))
         rows = frames[shown]
         film = Film(
             where=f"camera {camera}",

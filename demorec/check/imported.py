@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _TIMES = frozenset(
     ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
 ) | {"duplicates", "late_start", "early_end", "cut_off", "repeats", "skips"}
-_PICTURES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
+_IMAGES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
 _MOST_TOLD = 5
 
 import_check = partial(check, on=("external run",), needs="a run that was imported", fail=math.inf)
@@ -35,12 +35,12 @@ def import_times(run: CheckedRun) -> Found:
 
 
 @import_check(
-    group="pictures",
+    group="images",
     measures="findings about cameras in the bags that were imported: frozen, swapped, of several sizes",
 )
-def import_pictures(run: CheckedRun) -> Found:
-    """Each camera showed its own pictures, of one size and kind."""
-    return _found(run, lambda kind: kind in _PICTURES)
+def import_images(run: CheckedRun) -> Found:
+    """Each camera showed its own images, of one size and kind."""
+    return _found(run, lambda kind: kind in _IMAGES)
 
 
 @import_check(
@@ -49,7 +49,7 @@ def import_pictures(run: CheckedRun) -> Found:
 )
 def import_numbers(run: CheckedRun) -> Found:
     """The numbers of the bags were such as robots have."""
-    return _found(run, lambda kind: kind not in _TIMES | _PICTURES)
+    return _found(run, lambda kind: kind not in _TIMES | _IMAGES)
 
 
 @import_check(

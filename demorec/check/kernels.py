@@ -1,6 +1,6 @@
 """The loops over pixels and cells, compiled by Numba; imported when first used, since Numba takes a second to start.
 
-They do not check that arrays have the sizes that they are said to have: their callers do. Where a picture is added up
+They do not check that arrays have the sizes that they are said to have: their callers do. Where an image is added up
 in cells, `rows` (h + 1) and `columns` (w + 1) say where these begin, and where the last one ends.
 """
 
@@ -18,12 +18,12 @@ _njit: Any = numba.njit(cache=True)
 
 @_njit  # type: ignore[untyped-decorator]
 def sum_colors(
-    picture: NDArray[np.uint8], rows: NDArray[np.int64], columns: NDArray[np.int64], sums: NDArray[np.float64]
+    image: NDArray[np.uint8], rows: NDArray[np.int64], columns: NDArray[np.int64], sums: NDArray[np.float64]
 ) -> tuple[int, int]:
-    """Fill sums (h, w, 3) of a picture (H, W, 3); how many pixels are nearly black (below 12) or white (above 250)."""
+    """Fill sums (h, w, 3) of an image (H, W, 3); how many pixels are nearly black (below 12) or white (above 250)."""
     # Down first and then across: so the compiler adds many bytes at once, three times as fast as cell by cell.
-    width = picture.shape[1]
-    lines = picture.reshape(picture.shape[0], 3 * width)
+    width = image.shape[1]
+    lines = image.reshape(image.shape[0], 3 * width)
     down = np.empty(3 * width, dtype=np.uint32)
     dark = bright = 0
     for i in range(len(rows) - 1):
@@ -85,13 +85,13 @@ def sum_labels(
 
 @_njit  # type: ignore[untyped-decorator]
 def _bases(drawn: NDArray[np.float32], i: int, j: int, channel: int) -> tuple[float, float, float, float]:
-    """How a cell of a picture (h, w, channels) changes when it is shifted right, down, enlarged, or turned."""
+    """How a cell of an image (h, w, channels) changes when it is shifted right, down, enlarged, or turned."""
     height, width, _ = drawn.shape
     above, below, before, after = max(i - 1, 0), min(i + 1, height - 1), max(j - 1, 0), min(j + 1, width - 1)
     down = (drawn[below, j, channel] - drawn[above, j, channel]) / (below - above)
     right = (drawn[i, after, channel] - drawn[i, before, channel]) / (after - before)
     x, y = j - (width - 1) / 2, i - (height - 1) / 2
-    # A picture that is shifted to the right by one cell is drawn(x - 1) = drawn - slope; and so on.
+    # An image that is shifted to the right by one cell is drawn(x - 1) = drawn - slope; and so on.
     return -right, -down, -(x * right + y * down), -(x * down - y * right)
 
 
@@ -179,13 +179,13 @@ def compare_steps(
 
 
 @_njit  # type: ignore[untyped-decorator]
-def amount_of_detail(picture: NDArray[np.uint8]) -> float:
+def amount_of_detail(image: NDArray[np.uint8]) -> float:
     """The mean second difference along every fourth row of an image (H, W, 3), of green: noise, and sharp edges."""
-    height, width, _ = picture.shape
+    height, width, _ = image.shape
     total = count = 0
     for y in range(2, height, 4):
         for x in range(1, width - 1):
-            total += abs(2 * np.int32(picture[y, x, 1]) - picture[y, x - 1, 1] - picture[y, x + 1, 1])
+            total += abs(2 * np.int32(image[y, x, 1]) - image[y, x - 1, 1] - image[y, x + 1, 1])
         count += width - 2
     return total / max(count, 1)
 

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, picture_check
+from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
 from demorec.check.evidence import Flags
 from demorec.check.films import Film, Filmed, difference, flat_images, is_blank
 from demorec.check.rows import longest_run
@@ -32,7 +32,7 @@ _OTHER_VIEW = 0.7
 _STANDS = 0.02
 """Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
 
-film_check = partial(picture_check, on=("external", "dataset"), needs=IMAGES)
+film_check = partial(image_check, on=("external", "dataset"), needs=IMAGES)
 
 
 def _all(subject: Filmed) -> Iterator[Film]:

@@ -24,10 +24,19 @@ from demorec.runs.run_file import DATASET
 
 _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 """Groups of the checks that look at the file itself, not at what was recorded."""
-_WORTH_PROCESSES = {"with pictures": 4, "without": 50}
+_WORTH_PROCESSES = {"with images": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
 SubjectKind = Literal["recording", "run", "dataset"]
 RENAMED = {
+    "pictures_decode": "images_decode",
+    "pictures_as_drawn": "images_as_drawn",
+    "odd_pictures": "odd_images",
+    "repeated_pictures": "repeated_images",
+    "picture_lag": "image_lag",
+    "import_pictures": "import_images",
+    "dataset_picture_statistics": "dataset_image_statistics",
+    "dataset_pictures_as_drawn": "dataset_images_as_drawn",
+    "dataset_picture_lag": "dataset_image_lag",
     "collected_opens": "opens",
     "collected_checksums": "checksums",
     "collected_readable": "readable",
@@ -54,7 +63,7 @@ RENAMED = {
     "pictures_exposed": "exposure",
     "effort_bears_the_arm": "effort_matches_dynamics",
     "wrench_holds_the_hand": "wrench_bears_the_hand",
-    "dataset_pictures": "stray_images",
+    "dataset_images": "stray_images",
     "dataset_frozen": "frozen_images",
     **dict.fromkeys(
         ("latched_messages", "metadata_agrees", "phase_events", "picture_messages", "moving_frames", "derived_values",
@@ -72,7 +81,7 @@ class CheckOptions:
     """Which checks are run.
 
     Attributes:
-        pictures: Whether pictures are decoded.
+        images: Whether images are decoded.
         only: Names of checks; empty for all.
         workers: Processes; 1 works in this one.
         allowed: The user's own modules beside which models of robots may be read.
@@ -80,7 +89,7 @@ class CheckOptions:
         motors: The servos whose values LeRobot recorded in datasets with elements of their names.
     """
 
-    pictures: bool = True
+    images: bool = True
     only: tuple[str, ...] = ()
     workers: int = 1
     allowed: tuple[str, ...] = ()
@@ -176,10 +185,10 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
     return list(dict.fromkeys(found))
 
 
-def useful_workers(subjects: Sequence[Subject], *, pictures: bool, cores: int) -> int:
+def useful_workers(subjects: Sequence[Subject], *, images: bool, cores: int) -> int:
     """How many processes check fastest: one for each core, or one where that many do not pay."""
     count = sum(subject.kind == "recording" for subject in subjects)
-    return cores if count >= _WORTH_PROCESSES["with pictures" if pictures else "without"] else 1
+    return cores if count >= _WORTH_PROCESSES["with images" if images else "without"] else 1
 
 
 def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterator[SubjectReport]:
@@ -224,7 +233,7 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     found += [
         check.not_applicable()
         for check in options.checks(*scene)
-        if check.name not in known and (options.pictures or not check.needs_pictures)
+        if check.name not in known and (options.images or not check.needs_images)
     ]
     models = [name for info in infos for name in (info.robot.urdf, *(body.shape.file for body in info.scene.bodies))]
     modules = tuple(name for name in modules_of_models(models) if not is_allowed(name, options.allowed))
@@ -245,7 +254,7 @@ def _run(options: CheckOptions, subject: Checked, gates: tuple[str, ...], read: 
 
     The checks of file and time look at the file itself and are run as far as it can be opened.
     """
-    checks = [check for check in options.checks(subject.form) if options.pictures or not check.needs_pictures]
+    checks = [check for check in options.checks(subject.form) if options.images or not check.needs_images]
     results: list[Result] = []
     told: set[str] = set()
     unreadable = ""

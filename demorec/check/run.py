@@ -12,7 +12,7 @@ from typing import Any
 from demorec.check.base import SCENE, Form, Found, Lacking, Measurement, NotMeasured, run_check, worst
 from demorec.check.coverage import MIN_EPISODES, motion_vector, start_vector, twins, worst_gap
 from demorec.check.dataset import Dataset
-from demorec.core.errors import ConfigError, RecordingError, in_words, resource_error
+from demorec.core.errors import ConfigError, RecordingError, describe_error, resource_error
 from demorec.core.files import open_regular, read_json_limited
 from demorec.core.geometry import Array
 from demorec.core.plain import digest
@@ -78,7 +78,7 @@ class CheckedRun:
             unusable = ConfigError(f"{RUN_NAME} cannot be used ({error.strerror}): {self.path}")
             raise resource_error(error) or unusable from error
         except (ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{RUN_NAME} cannot be used ({in_words(error)}): {self.path}") from error
+            raise ConfigError(f"{RUN_NAME} cannot be used ({describe_error(error)}): {self.path}") from error
         return dict(run)
 
     @property
@@ -273,6 +273,6 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
     try:
         episodes = int(read_json(path)["total_episodes"])
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ConfigError(f"info.json of the dataset cannot be used ({in_words(error)}): {path}") from error
+        raise ConfigError(f"info.json of the dataset cannot be used ({describe_error(error)}): {path}") from error
     successes = sum(1 for line in run.lines if line["success"] and line["episode_index"] < run.run["num_episodes"])
     return Measurement(value=abs(episodes - successes), detail=f"{episodes} in the dataset, {successes} successes")

@@ -14,7 +14,7 @@ import numpy as np
 from demorec.check.base import Measurement, run_check
 from demorec.check.dataset import Dataset, Rows, read_rows
 from demorec.check.run import CheckedRun
-from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.options import ExportOptions
@@ -35,7 +35,7 @@ class DatasetEpisode:
     Attributes:
         number: In the dataset.
         rows: Feature -> (T, D).
-        videos: Camera feature -> SHA-256 (hex) of its coded pictures.
+        videos: Camera feature -> SHA-256 (hex) of its coded images.
         tasks: Instructions.
         told: The sidecar's row.
     """
@@ -51,7 +51,7 @@ class DatasetEpisode:
     measures="episodes of the run's dataset that are not what was recorded",
 )
 def run_dataset_content(run: CheckedRun) -> Measurement | None:
-    """Every number and coded picture of each episode is that of its recording, exported with the same options."""
+    """Every number and coded image of each episode is that of its recording, exported with the same options."""
     path = run.path / "dataset"
     if not is_dataset(path):
         return None
@@ -110,7 +110,9 @@ def export_options(dataset: Path) -> ExportOptions:
         )
         options.validate()
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"The dataset does not say how it was exported ({in_words(error)}): {dataset}") from error
+        raise ConfigError(
+            f"The dataset does not say how it was exported ({describe_error(error)}): {dataset}"
+        ) from error
     return options
 
 
@@ -135,7 +137,7 @@ def episode_differences(
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        yield f"its recording gives no such episode ({in_words(error)})", ()
+        yield f"its recording gives no such episode ({describe_error(error)})", ()
         return
     if episode.tasks != (expected.task,):
         yield "instruction", ()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.cells import CellGrid, Cells, ImageKind, PictureCells
+from demorec.check.cells import CellGrid, Cells, ImageCells, ImageKind
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.episode.scene import SceneCamera
@@ -17,8 +17,8 @@ from demorec.mcap import Recording
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PictureSummary:
-    """What is known of N pictures of a camera after decoding them.
+class ImageSummary:
+    """What is known of N images of a camera after decoding them.
 
     Attributes:
         error: Why decoding ended early, or "".
@@ -26,7 +26,7 @@ class PictureSummary:
         dark, bright: (N,) share of pixels that are nearly black or nearly white.
         cells: (N, h, w, channels) means over small areas, 0..255.
         detail: (N,) how much fine structure colours have.
-        kept: Frame -> some of the pictures as they are.
+        kept: Frame -> some of the images as they are.
     """
 
     error: str
@@ -38,13 +38,13 @@ class PictureSummary:
     kept: Mapping[int, NDArray[Any]] = field(default_factory=dict)
 
     @property
-    def num_pictures(self) -> int:
+    def num_images(self) -> int:
         """N: how many could be decoded."""
         return len(self.cells)
 
 
-def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind, keep: Collection[int] = ()) -> PictureSummary:
-    """Decode all pictures of a camera once, and keep those of some frames."""
+def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind, keep: Collection[int] = ()) -> ImageSummary:
+    """Decode all images of a camera once, and keep those of some frames."""
     from demorec.check import kernels
 
     read: dict[ImageKind, Callable[[str], Iterator[NDArray[Any]]]] = {
@@ -53,24 +53,24 @@ def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind, keep: 
         "labels": recording.segmentation,
     }
     grid = CellGrid(camera.width, camera.height)
-    found: list[PictureCells] = []
+    found: list[ImageCells] = []
     detail: list[float] = []
     kept: dict[int, NDArray[Any]] = {}
     error = ""
     try:
-        for frame, picture in enumerate(read[kind](camera.name)):
-            found.append(grid.read(kind, picture))  # what came before the damage counts
-            detail.append(kernels.amount_of_detail(picture) if kind == "color" else 0.0)
+        for frame, image in enumerate(read[kind](camera.name)):
+            found.append(grid.read(kind, image))  # what came before the damage counts
+            detail.append(kernels.amount_of_detail(image) if kind == "color" else 0.0)
             if frame in keep:
-                kept[frame] = picture
+                kept[frame] = image
     except RecordingError as problem:
         error = str(problem)
-    return PictureSummary(
+    return ImageSummary(
         error=error,
-        mean=np.array([picture.mean for picture in found]),
-        dark=np.array([picture.dark for picture in found]),
-        bright=np.array([picture.bright for picture in found]),
-        cells=np.array([picture.cells for picture in found]) if found else np.empty((0, 2, 2, 1), dtype=np.float32),
+        mean=np.array([image.mean for image in found]),
+        dark=np.array([image.dark for image in found]),
+        bright=np.array([image.bright for image in found]),
+        cells=np.array([image.cells for image in found]) if found else np.empty((0, 2, 2, 1), dtype=np.float32),
         detail=np.array(detail, dtype=np.float32),
         kept=kept,
     )

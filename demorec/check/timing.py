@@ -43,10 +43,10 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @time_check(
-    measures="pictures missing, surplus, off their frame's time, or too far from a keyframe",
+    measures="images missing, surplus, off their frame's time, or too far from a keyframe",
 )
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
-    """Each camera has one coded picture a frame at the frame's time, and a keyframe at least every GOP."""
+    """Each camera has one coded image a frame at the frame's time, and a keyframe at least every GOP."""
     expected = episode.frame_times
     for camera in episode.cameras:
         settings = episode.recording.video_settings(camera.name)
@@ -58,7 +58,7 @@ def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
         if len(times) != len(expected) or len(off):
             number = abs(len(times) - len(expected)) + len(off)
             frame = int(off[0]) if len(off) else count
-            detail = f"camera {camera.name}: {len(times)} pictures for {len(expected)} frames"
+            detail = f"camera {camera.name}: {len(times)} images for {len(expected)} frames"
             yield Measurement(value=number, frame=frame, detail=detail)
             continue
         keyframes = [packet.frame_index for packet in episode.recording.packets(camera.name) if packet.is_keyframe]

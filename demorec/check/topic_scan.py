@@ -52,17 +52,17 @@ def scan_topics(container: Container, blocks: Mapping[str, Block]) -> dict[str, 
     """
     schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
     found = {topic: _scan(schemas[topic], block) for topic, block in blocks.items()}
-    pictures = [topic for topic in schemas if topic not in found]
-    times: dict[str, list[int]] = {topic: [] for topic in pictures}
-    stamps: dict[str, list[int]] = {topic: [] for topic in pictures}
+    images = [topic for topic in schemas if topic not in found]
+    times: dict[str, list[int]] = {topic: [] for topic in images}
+    stamps: dict[str, list[int]] = {topic: [] for topic in images}
     first: dict[str, bytes] = {}
-    for topic, time_ns, data in container.messages(pictures):
+    for topic, time_ns, data in container.messages(images):
         times[topic].append(time_ns)
         stamps[topic].append(_stamp(data))
         first.setdefault(topic, data)
     for name in container.attachment_names:
         container.attachment(name)
-    for topic in pictures:
+    for topic in images:
         found[topic] = TopicScan(
             schema=schemas[topic],
             time_ns=np.array(times[topic], dtype=np.int64),

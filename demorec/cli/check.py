@@ -17,8 +17,8 @@ from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths, places_read, reading, refuse_inside, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
-from demorec.core.errors import ConfigError, OptionError, in_words
-from demorec.core.replacing import PICTURE, check_replaceable
+from demorec.core.errors import ConfigError, OptionError, describe_error
+from demorec.core.replacing import IMAGE, check_replaceable
 from demorec.robots.motors import MotorUnits
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Check:
 
     Examples:
       demorec check recordings/cubes
-      demorec check recordings/cubes --no-pictures --strict
+      demorec check recordings/cubes --no-images --strict
       demorec check datasets/cubes --json
       demorec check monday.mcap --mapping robot.toml
       demorec check datasets/so101_cups --motor-units degrees
@@ -56,8 +56,8 @@ class Check:
     mapping: Path | None = None
     """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
     that leaves nothing to decide)."""
-    pictures: bool = True
-    """Decode all pictures; without, a recording is checked at about 50 times real time."""
+    images: bool = True
+    """Decode all images; without, a recording is checked at about 50 times real time."""
     only: tuple[str, ...] = ()
     """Names of the checks to run; default: all."""
     urdf: Path | None = None
@@ -75,11 +75,11 @@ class Check:
     """Also replay this many episodes of each run or dataset, spread evenly, and every recording given by itself."""
     deep: bool = False
     """Also make every recording, and every episode of a dataset, again from config and seed, and compare every number
-    and picture; takes about as long as generating them."""
-    coverage_picture: Path | None = None
+    and image; takes about as long as generating them."""
+    coverage_image: Path | None = None
     """Draw start places, goals and ranges of all episodes into this PNG file."""
     overwrite: bool = False
-    """Replace the picture of --coverage-picture, if it is there."""
+    """Replace the image of --coverage-image, if it is there."""
     workers: int | None = None
     """Processes (auto: one for each core, or one alone where starting them would take longer than the checks)."""
     verbose: bool = False
@@ -95,11 +95,11 @@ class Check:
         need_paths(self.paths, "check")
         if self.replay < 0:
             raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
-        if (picture := self.coverage_picture) is not None:
-            if picture.suffix.lower() != ".png":
-                raise ConfigError(f"--coverage-picture writes a .png file, found the name {picture.name!r}.")
-            check_replaceable(picture, PICTURE, overwrite=self.overwrite, sources=places_read(self.paths))
-            refuse_inside([picture])
+        if (image := self.coverage_image) is not None:
+            if image.suffix.lower() != ".png":
+                raise ConfigError(f"--coverage-image writes a .png file, found the name {image.name!r}.")
+            check_replaceable(image, IMAGE, overwrite=self.overwrite, sources=places_read(self.paths))
+            refuse_inside([image])
         with reading(self.paths, self.mapping) as paths:
             return replace(self, paths=paths)._check()
 
@@ -111,9 +111,9 @@ class Check:
         subjects = find_subjects(self.paths)
         workers = self.workers
         if workers is None:
-            workers = useful_workers(subjects, pictures=self.pictures, cores=available_cores())
+            workers = useful_workers(subjects, images=self.images, cores=available_cores())
         options = CheckOptions(
-            pictures=self.pictures,
+            images=self.images,
             only=self.only,
             workers=workers,
             allowed=allowed,
@@ -136,8 +136,8 @@ class Check:
                 if not self.json:
                     say(told(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
-        if self.coverage_picture is not None:
-            self._draw(self.coverage_picture, subjects)
+        if self.coverage_image is not None:
+            self._draw(self.coverage_image, subjects)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
@@ -161,7 +161,7 @@ class Check:
             text = read_text_limited(self.urdf, MAX_BYTES)
             Urdf.parse(text)
         except (OSError, ValueError) as error:
-            raise ConfigError(f"--urdf is no robot's description ({in_words(error)}): {self.urdf}") from error
+            raise ConfigError(f"--urdf is no robot's description ({describe_error(error)}): {self.urdf}") from error
         return text
 
     def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:

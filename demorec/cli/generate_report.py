@@ -39,8 +39,8 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
     sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
-    workers = useful_workers(subjects, pictures=False, cores=available_cores())
-    options = CheckOptions(pictures=False, workers=workers, allowed=result.run.config.modules)
+    workers = useful_workers(subjects, images=False, cores=available_cores())
+    options = CheckOptions(images=False, workers=workers, allowed=result.run.config.modules)
     warnings = 0
     failures: list[str] = []
     failed_attempts = 0

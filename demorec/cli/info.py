@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
 from demorec.cli.shared.paths import need_paths, reading
-from demorec.core.errors import ExportError, RecordingError, in_words, resource_error, without_path
+from demorec.core.errors import ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import Found, expect
@@ -150,7 +150,7 @@ def _camera(summary: RecordingSummary, camera: CameraSummary) -> Iterator[str]:
         yield f"quality {video.jpeg_quality}" if video.codec == "jpeg" else f"GOP {video.gop}, crf {video.crf}"
         yield from (name for name, there in (("depth", camera.depth), ("segmentation", camera.segmentation)) if there)
         return
-    yield counted(camera.pictures, "image")
+    yield counted(camera.images, "image")
     yield f"at most {1000 * camera.oldest:.3g} ms old"
     if camera.frames_without:
         yield f"{counted(camera.frames_without, 'frame')} without"
@@ -281,7 +281,7 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
             shape = "x".join(map(str, feature["shape"]))
             rows.append((name, str(feature["dtype"]), shape, _names(feature.get("names"))))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-        raise RecordingError(f"The dataset's info.json is damaged ({in_words(error)}): {file}") from error
+        raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error
     plain = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
     return plain, [*aligned(facts), "", *aligned(rows)]
 

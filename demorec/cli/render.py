@@ -110,7 +110,7 @@ class Render:
         compared, differing = sum(len(r.compared) for r in reports), sum(len(r.differing) for r in reports)
         if kept := sum(report.was_there for report in reports):
             say(f"{kept} of {len(jobs)} had been rendered before and are unchanged (--overwrite renders them again).")
-        say(f"{counted(len(jobs), 'recording')}, {sum(r.num_pictures for r in reports)} images: {self.out}")
+        say(f"{counted(len(jobs), 'recording')}, {sum(r.num_images for r in reports)} images: {self.out}")
         if compared:
             say(f"{compared - differing} of {compared} unchanged cameras reproduce the recorded images bit-exactly.")
         return 1 if differing else 0

@@ -28,7 +28,7 @@ class Report:
     Examples:
       demorec report recordings/cubes --out cubes.html
       demorec report datasets/cubes --out cubes.html --camera wrist
-      demorec report recordings/cubes --out cubes.html --pictures --workers 4
+      demorec report recordings/cubes --out cubes.html --images --workers 4
       demorec report datasets/cubes --against datasets/sorted --out sorted.html
     """
 
@@ -45,7 +45,7 @@ class Report:
     """Camera for the filmstrips; default: the first one."""
     checks: bool = True
     """Run the checks."""
-    pictures: bool = False
+    images: bool = False
     """Also run the checks that decode all images."""
     workers: int = 1
     """Processes that read and check recordings."""
@@ -59,8 +59,8 @@ class Report:
         if self.out.suffix.lower() not in (".html", ".htm"):
             raise ConfigError(f"--out names an .html file, found the name {self.out.name!r}.")
         check_option("workers", self.workers, 1, 1024)
-        if self.pictures and not self.checks:
-            raise ConfigError("--pictures chooses checks, and --no-checks runs none: leave one of them out.")
+        if self.images and not self.checks:
+            raise ConfigError("--images chooses checks, and --no-checks runs none: leave one of them out.")
         read = [self.path]
         if self.against is None:
             expect(self.path, "recording", "dataset", *IMPORTED, *EPISODE_FOLDERS)
@@ -77,7 +77,7 @@ class Report:
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
-        checks = CheckOptions(pictures=self.pictures, allowed=allowed_modules(self.allow)) if self.checks else None
+        checks = CheckOptions(images=self.images, allowed=allowed_modules(self.allow)) if self.checks else None
         with (
             reading([self.path], self.mapping) as (path,),
             ProgressBar("reading", unit="item") as bar,

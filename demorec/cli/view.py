@@ -14,7 +14,7 @@ from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
 from demorec.cli.shared.paths import places_read, reading, refuse_inside, tell_unfinished
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.replacing import PICTURE, RERUN_FILE, check_replaceable
+from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
 from demorec.robots.assets import allow_models
 from demorec.runs.find import expect
 
@@ -162,7 +162,7 @@ class View:
     def _check_targets(self, saved: Sequence[Path]) -> None:
         """Refuse to replace anything but an .rrd file by --save and an image by --screenshot, before any work."""
         kinds = [(target, RERUN_FILE) for target in saved]
-        kinds += [] if self.screenshot is None else [(self.screenshot, PICTURE)]
+        kinds += [] if self.screenshot is None else [(self.screenshot, IMAGE)]
         for target, kind in kinds:
             check_replaceable(target, kind, overwrite=self.overwrite, sources=places_read(self.paths))
         refuse_inside(target for target, _ in kinds)

@@ -154,7 +154,7 @@ _PLAIN_WORDS: tuple[tuple[type[BaseException], str], ...] = (
 """What errors of Python mean about a file that is read; their own words are about the program that reads it."""
 
 
-def in_words(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """What an error of Python or of a library says about what was read, for the inside of a sentence.
 
     Neither class names nor error numbers, and no path: the sentence around it has that.
@@ -184,7 +184,7 @@ def without_path(error: BaseException, path: Path) -> str:
 
 def as_reason(error: BaseException) -> str:
     """The message of an error as the rest of a sentence, behind "since"."""
-    text = in_words(error)
+    text = describe_error(error)
     return text[:1].lower() + text[1:].rstrip(".")
 
 

@@ -17,7 +17,7 @@ from demorec.core.errors import ConfigError, ExportError
 from demorec.core.plain import digest, to_json
 from demorec.core.registry import nearest_match
 from demorec.datasets.options import CommonOptions
-from demorec.episode.episode import NO_PICTURE, Columns, interventions
+from demorec.episode.episode import NO_IMAGE, Columns, interventions
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -289,17 +289,17 @@ class ExportEpisode:
 
     def _held_numbers(self, camera: str) -> NDArray[np.int64]:
         columns = self.columns
-        numbers, stamps = columns.pictures[camera].copy(), columns.picture_stamps[camera]
-        longest = round(self.options.hold_pictures * _SECOND_NS)
-        without = np.flatnonzero(numbers == NO_PICTURE)
+        numbers, stamps = columns.images[camera].copy(), columns.image_stamps[camera]
+        longest = round(self.options.hold_images * _SECOND_NS)
+        without = np.flatnonzero(numbers == NO_IMAGE)
         for frame in without.tolist():
-            before = int(numbers[frame - 1]) if frame else NO_PICTURE
-            age = int(columns.time_ns[frame] - stamps[before]) if before != NO_PICTURE else None
+            before = int(numbers[frame - 1]) if frame else NO_IMAGE
+            age = int(columns.time_ns[frame] - stamps[before]) if before != NO_IMAGE else None
             if age is None or age > longest:
                 last, hold = "none came before it", ""
                 if age is not None:
                     last = f"the last one is {age / _SECOND_NS:.3g} s old"
-                    hold = "allow that one to be held (--hold-pictures SECONDS), or "
+                    hold = "allow that one to be held (--hold-images SECONDS), or "
                 raise ExportError(
                     f"Frame {frame} has no image of the camera {camera}, as {len(without)} of {len(numbers)} "
                     f"frames, and {last}: {hold}leave the camera (--features) or the episode (--episodes) out: "

@@ -39,7 +39,7 @@ class CommonOptions:
     """Add depth images of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
-    hold_pictures: float = 0.0
+    hold_images: float = 0.0
     """Of external episodes: seconds for which a frame without an image of a camera shows the camera's last one, as a
     policy would see it; 0: such a frame is an error."""
     overwrite: bool = False
@@ -52,7 +52,7 @@ class CommonOptions:
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
         parse_episodes(self.episodes)
-        check_option("hold_pictures", self.hold_pictures, 0, 3600, "s")
+        check_option("hold_images", self.hold_images, 0, 3600, "s")
         if self.fps is not None and self.fps < 1:
             raise OptionError("fps", f"is {self.fps}, it must be at least 1.")
 

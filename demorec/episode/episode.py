@@ -32,7 +32,7 @@ INTERJECTION_EVENT = "interjection"
 TIME_LIMIT = "time_limit"
 """Reason of a failure that had not ended when its time was over."""
 
-NO_PICTURE = -1
+NO_IMAGE = -1
 """Stands for the number of an image where a frame has none."""
 
 Vector = NDArray[np.float32] | NDArray[np.float64]
@@ -220,7 +220,7 @@ class SampledFrame:
     Attributes:
         time_ns: Its stamp; frames come in order, at whatever distances. What it holds is `time_ns - stamp_ns` old.
         samples: Feature -> what it holds; every feature.
-        pictures: Camera -> number of the image that it holds, counted from 0 in each camera. One image may be held
+        images: Camera -> number of the image that it holds, counted from 0 in each camera. One image may be held
             by several frames, or by none; a camera that is left out has no image at this frame.
         subtask: What the robot begins to do with this frame, in the words of whoever said it; "" where nothing new was
             said.
@@ -228,7 +228,7 @@ class SampledFrame:
 
     time_ns: int
     samples: Mapping[str, Sample]
-    pictures: Mapping[str, int] = field(default_factory=dict)
+    images: Mapping[str, int] = field(default_factory=dict)
     subtask: str = ""
 
 
@@ -285,8 +285,8 @@ class Columns:
     world_from_camera: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7)
     features: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # feature -> (T, D) in its own dtype
     stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # feature -> (T,) stamps of the samples
-    pictures: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (T,) number of the image held
-    picture_stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (P,) stamps of its images
+    images: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (T,) number of the image held
+    image_stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (P,) stamps of its images
 
     @property
     def num_frames(self) -> int:
@@ -297,11 +297,11 @@ class Columns:
         """(T,) how old each frame's sample of a feature is."""
         return self.time_ns - self.stamps[feature]
 
-    def picture_age_ns(self, camera: str) -> NDArray[np.int64]:
+    def image_age_ns(self, camera: str) -> NDArray[np.int64]:
         """(N,) how old the images are, of the N frames that hold one of this camera."""
-        numbers = self.pictures[camera]
-        held = np.flatnonzero(numbers != NO_PICTURE)
-        ages: NDArray[np.int64] = self.time_ns[held] - self.picture_stamps[camera][numbers[held]]
+        numbers = self.images[camera]
+        held = np.flatnonzero(numbers != NO_IMAGE)
+        ages: NDArray[np.int64] = self.time_ns[held] - self.image_stamps[camera][numbers[held]]
         return ages
 
 

@@ -34,7 +34,7 @@ ACTION = "action"
 COMMAND = "command"
 """What the motors were sent: the action in joint space plus exploration noise."""
 IMAGE_PREFIX, DEPTH_SUFFIX = "observation.images.", "_depth"
-"""A camera's pictures are called IMAGE_PREFIX + its name, its distances have the suffix, too."""
+"""A camera's images are called IMAGE_PREFIX + its name, its distances have the suffix, too."""
 
 ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
 """What the action column holds; `action_vectors` defines each."""

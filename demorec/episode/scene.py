@@ -258,7 +258,7 @@ class Scene:
         bodies: In loading order, which is part of the physics' determinism.
         goals: What shall be where at the end, in the order of execution.
         physics, light: Parameters.
-        cameras: All cameras, in order; empty without pictures.
+        cameras: All cameras, in order; empty without images.
         hold: How the hand holds things: by friction alone, or by a rigid constraint from the moment when both
             fingers press on something until the gripper is told to open (a shortcut of many tutorials).
     """

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import ConfigError, DemorecError, in_words, resource_error, without_path
+from demorec.core.errors import ConfigError, DemorecError, describe_error, resource_error, without_path
 from demorec.core.own_versions import differences
 from demorec.core.plain import to_plain
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
@@ -185,7 +185,7 @@ def survey(
         except (DemorecError, OSError, MemoryError) as error:
             if (lack := resource_error(error, path)) is not None:
                 raise lack from error
-            set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else in_words(error)
+            set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else describe_error(error)
             path.rename(free_name(folder / UNFINISHED / path.name))
             sync_folder(path.parent)
         progress(number + 1, len(files))

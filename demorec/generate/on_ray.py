@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import EpisodePlan
-from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, in_words
+from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, describe_error
 from demorec.core.processes import available_cores
 from demorec.generate.executor import SINGLE_THREADED, Executor, Report, attempt_episode, lost
 from demorec.generate.options import RunOptions
@@ -203,7 +203,7 @@ def _knock(address: str) -> None:
             pass
     except (OSError, OverflowError) as error:
         raise ConfigError(
-            f"The Ray cluster at {address!r} cannot be reached ({in_words(error)}): give the address that "
+            f"The Ray cluster at {address!r} cannot be reached ({describe_error(error)}): give the address that "
             "`ray start --head` has printed, or --address auto on a machine of the cluster."
         ) from error
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import GenerateConfig, deciding_versions, parse_config
-from demorec.core.errors import ConfigError, DemorecError, RecordingError, in_words, resource_error
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.replacing import use_as_source
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
@@ -192,7 +192,9 @@ def _read_dataset(source: Path) -> Original:
             ),
         )
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ConfigError(f"The dataset does not say enough about itself ({in_words(error)}): {source}") from error
+        raise ConfigError(
+            f"The dataset does not say enough about itself ({describe_error(error)}): {source}"
+        ) from error
 
 
 def _dataset_digests(dataset: Path) -> dict[Key, str]:

@@ -2,7 +2,7 @@
 
     episode = prepare(EpisodePlan(config=GenerateConfig(), episode_index=0))  # info, task, behaviour; no simulator
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:  # both reusable
-        session = Session.of_episode(world, episode, renderer)  # renderer=None for no pictures
+        session = Session.of_episode(world, episode, renderer)  # renderer=None for no images
         for frame in session.run(ScriptAgent(episode)):  # the world is reset here, then one control step a frame
             print(frame.frame_index, frame.phase, frame.observation.gripper_width)
         print(session.outcome)

@@ -36,7 +36,7 @@ class Session:
         world: Of the scene's robot; left open.
         scene: What the world is reset to.
         task: Whose conditions are judged; None for none.
-        painter: For the pictures, or None.
+        painter: For the images, or None.
         max_frames: Time limit of `run`; None: until the agent is done.
 
     Attributes:
@@ -64,7 +64,7 @@ class Session:
     def of_episode(
         cls, world: World, episode: Episode, renderer: Renderer | None = None, *, only_color: bool = False
     ) -> Self:
-        """A session of a prepared episode with its cameras and time limit; without a renderer it has no pictures.
+        """A session of a prepared episode with its cameras and time limit; without a renderer it has no images.
 
         `only_color` leaves out the depth and the segmentation that its config asks for.
         """

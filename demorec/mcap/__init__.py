@@ -5,7 +5,7 @@ with open_recording(path) as recording:
     recording.images("front")      # decoded images
 """
 
-from demorec.mcap.pictures import PixelStatistics
+from demorec.mcap.images import PixelStatistics
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.recover import Recovered, is_whole, recover
 from demorec.mcap.video import VideoPacket, VideoSettings

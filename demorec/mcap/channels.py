@@ -88,7 +88,7 @@ _VIDEO_STREAMS = {
     "16UC1": "depth",
     "32FC1": "depth",
 }
-PICTURE_STREAMS = (
+IMAGE_STREAMS = (
     *(stream for codec, stream in _VIDEO_STREAMS.items() if codec in ("h264", "av1", "jpeg")),
     "depth",
     "segmentation",

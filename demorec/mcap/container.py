@@ -27,7 +27,7 @@ from mcap.records import (
     Statistics,
 )
 
-from demorec.core.errors import DemorecError, RecordingError, ResourceError, in_words, resource_error
+from demorec.core.errors import DemorecError, RecordingError, ResourceError, describe_error, resource_error
 from demorec.core.files import open_regular
 from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content, records_in
 from demorec.mcap.limits import LimitError, Limits
@@ -66,7 +66,7 @@ def damage_as_recording_error(path: Path) -> Iterator[None]:
 def _damage(error: BaseException, path: Path) -> DemorecError:
     if "not enough memory" in str(error):  # zstandard has no error of its own for that
         error = MemoryError()
-    return resource_error(error, path) or RecordingError(f"The recording is damaged ({in_words(error)}): {path}")
+    return resource_error(error, path) or RecordingError(f"The recording is damaged ({describe_error(error)}): {path}")
 
 
 class Container:

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import SceneError, in_words
+from demorec.core.errors import SceneError, describe_error
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba
 from demorec.robots.assets import asset_path, mesh_path, surface_file
@@ -115,7 +115,7 @@ def _mesh_primitives(path: Path, scale: tuple[float, ...]) -> list[Primitive]:
     try:
         vertices, faces = _load_mesh(path)
     except (OSError, ValueError, IndexError) as error:
-        raise SceneError(f"A mesh of the scene cannot be read ({in_words(error)}): {path}") from error
+        raise SceneError(f"A mesh of the scene cannot be read ({describe_error(error)}): {path}") from error
     return fit_primitives(vertices * np.array(scale), faces)
 
 

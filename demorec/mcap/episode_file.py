@@ -20,9 +20,9 @@ from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
 from demorec.mcap.channels import GRIPPER, camera_topic, description_topic, video_topic
 from demorec.mcap.container import Container, damage_as_recording_error
+from demorec.mcap.images import PixelCounter, PixelStatistics, read_pixel_statistics
 from demorec.mcap.lossless import decode_distances
 from demorec.mcap.metadata import CameraStreams
-from demorec.mcap.pictures import PixelCounter, PixelStatistics, read_pixel_statistics
 from demorec.mcap.streams import FRAMES
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 
@@ -185,16 +185,16 @@ class EpisodeFile(Closing):
         """The encoded images of a camera, in order; `frame_index` is their number, by which frames hold them."""
         codec = self.video_settings(camera).codec
         read = _READERS.get(codec, messages.read_compressed_image)
-        for number, (time_ns, data) in enumerate(self._pictures(video_topic(camera, codec), read)):
+        for number, (time_ns, data) in enumerate(self._read_images(video_topic(camera, codec), read)):
             yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
-    def _pictures[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+    def _read_images[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
         """As `_read`, of a topic of images; RecordingError unless a simulated episode has one at each frame's time."""
         count, is_simulated = 0, self.info.simulation is not None
-        for time_ns, picture in self._read(topic, read):
+        for time_ns, image in self._read(topic, read):
             if is_simulated and (count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps)):
                 raise self._wrong_times(topic)
-            yield time_ns, picture
+            yield time_ns, image
             count += 1
         if is_simulated and count != self.num_frames:
             raise self._wrong_times(topic)
@@ -215,7 +215,7 @@ class EpisodeFile(Closing):
         def read(data: bytes) -> NDArray[np.uint16] | NDArray[np.float32]:
             return decode_distances(codec, _READERS.get(codec, messages.read_compressed_image)(data), size)
 
-        for _, distances in self._pictures(video_topic(camera, codec), read):
+        for _, distances in self._read_images(video_topic(camera, codec), read):
             yield distances
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
@@ -230,7 +230,7 @@ class EpisodeFile(Closing):
         codec = self.video_settings(camera).codec
         return codec if codec in DEPTH_UNITS else "16UC1"
 
-    def picture(self, camera: str, number: int) -> Rgb:
+    def numbered_image(self, camera: str, number: int) -> Rgb:
         """One decoded image of a camera, (H, W, 3) uint8 RGB, by its own number."""
         return next(self._images(camera, [number]))
 
@@ -258,6 +258,6 @@ class EpisodeFile(Closing):
         for _, statistics in self._read(camera_topic(camera, "histogram"), read_pixel_statistics):
             return statistics
         counter = PixelCounter()
-        for picture in self.images(camera):
-            counter.add(picture)
+        for image in self.images(camera):
+            counter.add(image)
         return counter.statistics()

@@ -134,10 +134,10 @@ class SampledFrameCheck:
         self._features = {feature.name: feature for feature in info.features}
         self._cameras = {camera.name: camera for camera in info.cameras}
         self._last: dict[str, int] = {}
-        self._num_pictures = dict.fromkeys(self._cameras, 0)
+        self._num_images = dict.fromkeys(self._cameras, 0)
         self._num_frames = 0
 
-    def check_picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> None:
+    def check_image(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> None:
         """Raise RecordingError unless it can be the next image of the camera."""
         known = self._cameras.get(camera)
         if known is None:
@@ -145,13 +145,13 @@ class SampledFrameCheck:
                 f"Unknown camera {camera!r}.{nearest_match(camera, self._cameras)} The cameras are: "
                 f"{', '.join(self._cameras) or 'none'}."
             )
-        _check_picture(known, data)
+        _check_image(known, data)
         self._check_stamp(f"the image of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
 
-    def note_picture(self, camera: str, stamp_ns: int) -> None:
+    def note_image(self, camera: str, stamp_ns: int) -> None:
         """The camera's next image was taken."""
         self._last["camera " + camera] = int(stamp_ns)
-        self._num_pictures[camera] += 1
+        self._num_images[camera] += 1
 
     def check_frame(self, frame: SampledFrame) -> None:
         """Raise RecordingError unless it can be the next frame."""
@@ -170,9 +170,9 @@ class SampledFrameCheck:
                     f"The feature {name!r} of {what} is {vector[wrong]} in its element {feature.names[wrong]!r}, "
                     "numbers must be finite."
                 )
-        for camera, number in frame.pictures.items():
-            if camera not in self._cameras or not 0 <= number < self._num_pictures[camera]:
-                count = self._num_pictures.get(camera, 0)
+        for camera, number in frame.images.items():
+            if camera not in self._cameras or not 0 <= number < self._num_images[camera]:
+                count = self._num_images.get(camera, 0)
                 raise RecordingError(f"The camera {camera!r} has no image {number} for {what}, it has {count} so far.")
         if len(frame.subtask) > MAX_SUBTASK or not frame.subtask.isprintable():
             raise RecordingError(f"The subtask of {what} is no single line of at most {MAX_SUBTASK} characters.")
@@ -202,7 +202,7 @@ class SampledFrameCheck:
             )
 
 
-def _check_picture(camera: Camera, data: NDArray[Any] | bytes) -> None:
+def _check_image(camera: Camera, data: NDArray[Any] | bytes) -> None:
     if camera.kept and not camera.is_depth:
         if not isinstance(data, bytes) or not data:
             raise RecordingError(

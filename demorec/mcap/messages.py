@@ -64,19 +64,19 @@ def _stamp(time_ns: int) -> tuple[int, int]:
     return divmod(time_ns, 1_000_000_000)
 
 
-class PictureMessages:
+class ImageMessages:
     """sensor_msgs/CompressedImage and foxglove_msgs/CompressedVideo of one camera and format, laid out once.
 
     Args:
         frame_id: Coordinate frame of the camera.
-        picture_format: As the type wants it.
+        image_format: As the type wants it.
     """
 
-    def __init__(self, frame_id: str, picture_format: str) -> None:
+    def __init__(self, frame_id: str, image_format: str) -> None:
         header = (_stamp(0), frame_id)
-        self._image = encode(COMPRESSED_IMAGE, header, picture_format, b"")
+        self._image = encode(COMPRESSED_IMAGE, header, image_format, b"")
         self._video = encode(COMPRESSED_VIDEO, *header, b"")
-        self._format = struct.pack("<I", len(picture_format) + 1) + picture_format.encode() + b"\x00"
+        self._format = struct.pack("<I", len(image_format) + 1) + image_format.encode() + b"\x00"
 
     def compressed_image(self, time_ns: int, data: bytes) -> bytes:
         """sensor_msgs/CompressedImage."""
@@ -113,10 +113,10 @@ def read_compressed_image(data: bytes) -> bytes:
     """The encoded image of a `compressed_image`."""
     start = _compressed_image_start(data)
     (length,) = _U32.unpack_from(data, start - 4)
-    picture = data[start : start + length]
-    if len(picture) != length:
+    image = data[start : start + length]
+    if len(image) != length:
         raise ValueError("an image that is cut off")
-    return picture
+    return image
 
 
 def _compressed_image_start(data: bytes) -> int:
@@ -130,7 +130,7 @@ def _compressed_image_start(data: bytes) -> int:
     return position + 4
 
 
-def coded_pictures(block: Block, codec: str) -> Block:
+def coded_images(block: Block, codec: str) -> Block:
     """The encoded images alone, given the messages of a camera; ValueError for what is no image."""
     if codec == "av1":
         return _one_by_one(block, read_protobuf_video)
@@ -149,11 +149,9 @@ def coded_pictures(block: Block, codec: str) -> Block:
 
 
 def _one_by_one(block: Block, read: Callable[[bytes], bytes]) -> Block:
-    pictures = [read(message) for message in block.messages()]
-    lengths = np.array([len(picture) for picture in pictures], dtype=np.int64)
-    return Block(
-        content=b"".join(pictures), time_ns=block.time_ns, starts=np.cumsum(lengths) - lengths, lengths=lengths
-    )
+    images = [read(message) for message in block.messages()]
+    lengths = np.array([len(image) for image in images], dtype=np.int64)
+    return Block(content=b"".join(images), time_ns=block.time_ns, starts=np.cumsum(lengths) - lengths, lengths=lengths)
 
 
 def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:
@@ -215,9 +213,9 @@ def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequ
     """sensor_msgs/CameraInfo of (height, width) pixels and K (3, 3), with the distortion of the plumb bob model."""
     projection = np.hstack((k, np.zeros((3, 1))))
     matrices = (matrix.reshape(-1) for matrix in (k, np.eye(3), projection))
-    whole_picture = (0, 0, 0, 0, False)  # as the region of interest; without binning
+    whole_image = (0, 0, 0, 0, False)  # as the region of interest; without binning
     header = (_stamp(0), frame_id)
-    return encode(CAMERA_INFO, header, *size, "plumb_bob", distortion, *matrices, 0, 0, whole_picture)
+    return encode(CAMERA_INFO, header, *size, "plumb_bob", distortion, *matrices, 0, 0, whole_image)
 
 
 def read_camera_info(data: bytes) -> Calibration:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from demorec.core.errors import RecordingError, in_words
+from demorec.core.errors import RecordingError, describe_error
 from demorec.core.plain import from_plain, to_json, to_plain
 from demorec.episode.episode import Outcome
 from demorec.episode.info import DEPTH_UNITS, EXTERNAL_VERSION, FORMAT_VERSION, EpisodeInfo
@@ -133,7 +133,7 @@ def read_episode_metadata(
         return info, cameras, metadata["urdf_sha256"] if record == EXTERNAL else ""
     except (KeyError, ValueError) as error:
         what = f"format version {version}" if record == EPISODE else "an external episode"
-        raise RecordingError(f"The recording's metadata is not that of {what} ({in_words(error)})") from error
+        raise RecordingError(f"The recording's metadata is not that of {what} ({describe_error(error)})") from error
 
 
 def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
@@ -167,7 +167,7 @@ def read_outcome_metadata(record: str, metadata: Mapping[str, str]) -> Outcome:
         if min(outcome.num_frames, outcome.num_retries, *outcome.drops.values(), 0) < 0:
             raise ValueError("a number of frames, retries or drops below 0")
     except (KeyError, ValueError) as error:
-        raise RecordingError(f"The recording's outcome cannot be read ({in_words(error)})") from error
+        raise RecordingError(f"The recording's outcome cannot be read ({describe_error(error)})") from error
     return outcome
 
 

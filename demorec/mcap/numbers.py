@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import NO_PICTURE, Columns
+from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import channels, messages
 from demorec.mcap.chunks import Block
@@ -57,7 +57,7 @@ class _Table:
 
 
 def read_columns(
-    container: Container, info: EpisodeInfo, num_frames: int, picture_topics: Mapping[str, str]
+    container: Container, info: EpisodeInfo, num_frames: int, image_topics: Mapping[str, str]
 ) -> tuple[Columns, Said]:
     """The columns of an episode, and its events, which lie among the numbers in the file.
 
@@ -65,7 +65,7 @@ def read_columns(
         container: The open file.
         info: Of the episode.
         num_frames: T.
-        picture_topics: Recorded camera -> topic of its images, in the order of `info`.
+        image_topics: Recorded camera -> topic of its images, in the order of `info`.
 
     Raises:
         RecordingError: A stream is damaged, not at the times of the frames, or a frame holds an image that is none.
@@ -94,12 +94,12 @@ def read_columns(
             misses = _held(said[channels.DELIBERATE_MISS], messages.read_boolean, time_ns, False)
             columns["is_deliberate_miss"] = np.array(misses, dtype=np.bool_)
     if is_simulated:
-        columns["world_from_camera"] = {name: columns["world_from_camera"][name] for name in picture_topics}
-        columns["pictures"] = dict.fromkeys(picture_topics, np.arange(num_frames, dtype=np.int64))
-        columns["picture_stamps"] = dict.fromkeys(picture_topics, time_ns)
+        columns["world_from_camera"] = {name: columns["world_from_camera"][name] for name in image_topics}
+        columns["images"] = dict.fromkeys(image_topics, np.arange(num_frames, dtype=np.int64))
+        columns["image_stamps"] = dict.fromkeys(image_topics, time_ns)
     else:
-        columns["picture_stamps"] = {name: _stamps(container, topic) for name, topic in picture_topics.items()}
-        _check_pictures(columns["pictures"], columns["picture_stamps"], container)
+        columns["image_stamps"] = {name: _stamps(container, topic) for name, topic in image_topics.items()}
+        _check_images(columns["images"], columns["image_stamps"], container)
     return Columns(time_ns=time_ns, **columns), said.get(channels.EVENTS, [])
 
 
@@ -111,13 +111,13 @@ def _held[V](said: Said, read: Callable[[bytes], V], times: NDArray[np.int64], f
     return [values[number] for number in numbers.tolist()]
 
 
-def _check_pictures(
-    pictures: Mapping[str, NDArray[np.int64]], stamps: Mapping[str, Sequence[int]], container: Container
+def _check_images(
+    images: Mapping[str, NDArray[np.int64]], stamps: Mapping[str, Sequence[int]], container: Container
 ) -> None:
     """Raise RecordingError when a frame holds an image that is not there."""
-    for name, numbers in pictures.items():
+    for name, numbers in images.items():
         count = len(stamps[name])
-        if len(numbers) and not NO_PICTURE <= int(numbers.min()) <= int(numbers.max()) < count:
+        if len(numbers) and not NO_IMAGE <= int(numbers.min()) <= int(numbers.max()) < count:
             raise RecordingError(
                 f"A frame holds an image of the camera {name!r} that is none of its {count}: {container.path}"
             )

@@ -12,7 +12,7 @@ import foxglove
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CompressedVideo
 
-from demorec.core.errors import ConfigError, RecordingError, in_words
+from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.core.replacing import RECORDING, check_replaceable, lock_part
 from demorec.mcap import messages
 from demorec.mcap.ros2 import DEFINITIONS
@@ -124,7 +124,7 @@ class PartFile:
         check_replaceable(self.path, RECORDING, overwrite=self._overwrite)
 
     def _unwritable(self, error: Exception) -> RecordingError:
-        return RecordingError(f"The recording cannot be written ({in_words(error)}): {self.path}")
+        return RecordingError(f"The recording cannot be written ({describe_error(error)}): {self.path}")
 
     def log(self, topic: str, schema: str, data: bytes, time_ns: int, *, latched: bool = False) -> None:
         """Add a message; every topic has one type."""

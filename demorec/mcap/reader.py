@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json
-from demorec.episode.episode import NO_PICTURE, Columns, Event, JointSample
+from demorec.episode.episode import NO_IMAGE, Columns, Event, JointSample
 from demorec.mcap import channels, messages
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
@@ -42,7 +42,7 @@ class RecordingReader(EpisodeFile):
     _said: Said | None = None
     """Messages of all events, once `columns` has come by them: they lie among the numbers in the file."""
     _packed_labels: Mapping[str, Block] = MappingProxyType({})
-    """topic -> segmentation images and the names in them, once `coded_pictures` has come by them."""
+    """topic -> segmentation images and the names in them, once `coded_images` has come by them."""
 
     def columns(self) -> Columns:
         """All numbers, one row a frame, bit-exact as they were written, and which images the frames hold."""
@@ -51,7 +51,7 @@ class RecordingReader(EpisodeFile):
     @cached_property
     def _columns(self) -> Columns:
         """Read once: an export and a check look at them from several sides."""
-        topics = {name: self._picture_topic(name) for name, _ in self._cameras_in_order}
+        topics = {name: self._image_topic(name) for name, _ in self._cameras_in_order}
         columns, self._said = read_columns(self._container, self.info, self.num_frames, topics)
         return columns
 
@@ -66,7 +66,7 @@ class RecordingReader(EpisodeFile):
             found.append((frame, text))
         return tuple(found)
 
-    def _picture_topic(self, camera: str) -> str:
+    def _image_topic(self, camera: str) -> str:
         return channels.video_topic(camera, self.video_settings(camera).codec)
 
     def description(self, body: str = "") -> str:
@@ -93,26 +93,26 @@ class RecordingReader(EpisodeFile):
             if event.name != channels.PHASE_EVENT:
                 yield time_ns, event
 
-    def coded_pictures(self, cameras: Sequence[str]) -> dict[str, Block]:
+    def coded_images(self, cameras: Sequence[str]) -> dict[str, Block]:
         """camera -> all its encoded images, read in one pass; they are in memory together."""
-        topics = {camera: self._picture_topic(camera) for camera in cameras}
+        topics = {camera: self._image_topic(camera) for camera in cameras}
         labels = [self._segmentation_topic(camera) for camera in cameras if self.has_segmentation(camera)]
         labels += [channels.LABELS] if labels else []
         found = self._container.blocks((*topics.values(), *labels))
         self._packed_labels = {topic: found[topic] for topic in labels}
-        pictures = {}
+        images = {}
         for camera, topic in topics.items():
             times = frame_times(self.num_frames, self.info.fps)
             if self.info.simulation is not None and not np.array_equal(found[topic].time_ns, times):
                 raise self._wrong_times(topic)
             with damage_as_recording_error(self.path):
-                pictures[camera] = messages.coded_pictures(found[topic], self.video_settings(camera).codec)
-        return pictures
+                images[camera] = messages.coded_images(found[topic], self.video_settings(camera).codec)
+        return images
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation images, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
         topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
-        for _, labels in self._pictures(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
+        for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
             yield labels
 
     def segmentation_at(
@@ -166,7 +166,7 @@ class RecordingReader(EpisodeFile):
     def _shown(self, camera: str) -> NDArray[np.int64]:
         """(T,) number of the image of a camera that each frame holds."""
         self._camera(camera)
-        return self.columns().pictures[camera] if self.info.simulation is None else np.arange(self.num_frames)
+        return self.columns().images[camera] if self.info.simulation is None else np.arange(self.num_frames)
 
     def image(self, camera: str, frame: int) -> Rgb | None:
         """The decoded image that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
@@ -177,11 +177,11 @@ class RecordingReader(EpisodeFile):
             IndexError: There is no such frame; negative ones count from the end.
         """
         number = int(self._shown(camera)[range(self.num_frames)[frame]])
-        return None if number == NO_PICTURE else self.picture(camera, number)
+        return None if number == NO_IMAGE else self.numbered_image(camera, number)
 
     def num_images(self, camera: str) -> int:
         """How many images there are of a camera."""
-        return self._container.counts.get(self._picture_topic(camera), 0)
+        return self._container.counts.get(self._image_topic(camera), 0)
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
         """What some frames, in rising order, show of a camera that has images, (H, W, 3) uint8 RGB; in one pass.
@@ -208,7 +208,7 @@ class RecordingReader(EpisodeFile):
         columns = self.columns()
         if self.info.simulation is None:
             result.update(columns.time_ns.tobytes())
-            for mapping in (columns.features, columns.stamps, columns.pictures, columns.picture_stamps):
+            for mapping in (columns.features, columns.stamps, columns.images, columns.image_stamps):
                 for name in sorted(mapping):
                     result.update(name.encode() + mapping[name].tobytes())
             for frame, text in self.subtasks:
@@ -236,7 +236,7 @@ class RecordingReader(EpisodeFile):
         return result.hexdigest()
 
 
-_NOT_RECORDED = ("features", "stamps", "pictures", "picture_stamps")
+_NOT_RECORDED = ("features", "stamps", "images", "image_stamps")
 """Columns that are the same of every simulated episode, and no part of its digest."""
 
 

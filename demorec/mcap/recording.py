@@ -185,8 +185,8 @@ def _frames_with_images(recording: RecordingReader) -> Iterator[Frame]:
 def _images_at(recording: RecordingReader, columns: Columns, frame: int) -> Mapping[str, CameraImages]:
     """The images of one frame; only those from the keyframe before it on are decoded."""
 
-    def at[P](pictures: Callable[[str], Iterator[P]], camera: str) -> P:
-        return next(islice(pictures(camera), frame, None))
+    def at[P](images: Callable[[str], Iterator[P]], camera: str) -> P:
+        return next(islice(images(camera), frame, None))
 
     return {
         name: CameraImages(
@@ -200,7 +200,7 @@ def _images_at(recording: RecordingReader, columns: Columns, frame: int) -> Mapp
 
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_MOMENTS, _PICTURE_HEIGHT = 5, 120
+_MOMENTS, _IMAGE_HEIGHT = 5, 120
 _OUTCOMES = {True: "success", None: "unknown"}
 
 
@@ -233,16 +233,16 @@ def _html_page(recording: RecordingReader) -> str:
     ]
     moments = np.linspace(0, recording.num_frames - 1, _MOMENTS).round().astype(int).tolist()
     for camera in (name for name in recording.cameras if recording.num_frames and recording.num_images(name)):
-        pictures = "".join(map(_picture, recording.images_at(camera, moments)))
-        rows.append(f"<tr><th>{html.escape(printable(camera))}</th><td style='text-align: left'>{pictures}</td></tr>")
+        images = "".join(map(_image, recording.images_at(camera, moments)))
+        rows.append(f"<tr><th>{html.escape(printable(camera))}</th><td style='text-align: left'>{images}</td></tr>")
     return f"<table>{''.join(rows)}</table>"
 
 
-def _picture(pixels: NDArray[np.uint8]) -> str:
+def _image(pixels: NDArray[np.uint8]) -> str:
     buffer = io.BytesIO()
-    picture = Image.fromarray(pixels)
-    picture.thumbnail((4 * _PICTURE_HEIGHT, _PICTURE_HEIGHT))
-    picture.save(buffer, format="JPEG", quality=85)
+    image = Image.fromarray(pixels)
+    image.thumbnail((4 * _IMAGE_HEIGHT, _IMAGE_HEIGHT))
+    image.save(buffer, format="JPEG", quality=85)
     data = base64.b64encode(buffer.getvalue()).decode()
     return f"<img style='display: inline' src='data:image/jpeg;base64,{data}'>"
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import NO_PICTURE, Action, Columns, Frame, Observation, SampledFrame
+from demorec.episode.episode import NO_IMAGE, Action, Columns, Frame, Observation, SampledFrame
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.episode.sensed import STREAMS, Sensed, Stream
 from demorec.mcap import messages
@@ -140,7 +140,7 @@ def _moving_frames(tree: FrameTree | None, *, is_simulated: bool) -> Iterator[Fr
 def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
     """The columns of several streams as arguments of `Columns`; the mappings are there even when empty."""
     merged: dict[str, Any] = {
-        name: {} for name in ("sensed", "object_poses", "world_from_camera", "features", "stamps", "pictures")
+        name: {} for name in ("sensed", "object_poses", "world_from_camera", "features", "stamps", "images")
     }
     for columns in found:
         for name, rows in columns.items():
@@ -302,13 +302,13 @@ def _held(info: EpisodeInfo) -> FrameStream:
     def rows(frames: Sequence[SampledFrame]) -> NDArray[np.int64]:
         table = [
             [int(frame.samples[name].stamp_ns) for name in features]
-            + [int(frame.pictures.get(name, NO_PICTURE)) for name in cameras]
+            + [int(frame.images.get(name, NO_IMAGE)) for name in cameras]
             for frame in frames
         ]
         return np.array(table, dtype=np.int64)
 
     def columns(values: NDArray[Any]) -> ColumnArrays:
-        names = {"stamps": features, "pictures": cameras}
+        names = {"stamps": features, "images": cameras}
         taken = iter(values.T.copy())
         return {column: {name: next(taken) for name in of} for column, of in names.items()}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.episode.episode import NO_PICTURE, Outcome, SuccessCheck
+from demorec.episode.episode import NO_IMAGE, Outcome, SuccessCheck
 from demorec.episode.info import Origin
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.video import VideoSettings
@@ -44,7 +44,7 @@ class CameraSummary:
         video: How its images are encoded.
         depth, segmentation: Whether these were recorded: of a simulated camera beside colour, of a depth camera alone.
         is_kept: Whether its images are encoded as they came.
-        pictures: How many images there are.
+        images: How many images there are.
         frames_without: How many frames hold none.
         oldest: Of those that frames hold, in seconds.
         source: Where they came from, in words.
@@ -56,7 +56,7 @@ class CameraSummary:
     depth: bool
     segmentation: bool = False
     is_kept: bool = False
-    pictures: int
+    images: int
     frames_without: int = 0
     oldest: float = 0.0
     source: str = ""
@@ -192,8 +192,8 @@ def _cameras(recording: Recording) -> Iterator[CameraSummary]:
             depth=recording.has_depth(camera.name),
             segmentation=recording.has_segmentation(camera.name),
             is_kept=bool(camera.kept),
-            pictures=recording.num_images(camera.name),
-            frames_without=int((columns.pictures[camera.name] == NO_PICTURE).sum()),
-            oldest=float(np.abs(columns.picture_age_ns(camera.name)).max(initial=0)) / 1e9,
+            images=recording.num_images(camera.name),
+            frames_without=int((columns.images[camera.name] == NO_IMAGE).sum()),
+            oldest=float(np.abs(columns.image_age_ns(camera.name)).max(initial=0)) / 1e9,
             source=camera.source,
         )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, RecordingError, in_words
+from demorec.core.errors import ConfigError, RecordingError, describe_error
 
 Rgb = NDArray[np.uint8]
 Codec = Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
@@ -114,7 +114,7 @@ class Encoder(Protocol):
 
     settings: VideoSettings
 
-    def encode(self, picture: Rgb) -> list[bytes]:
+    def encode(self, image: Rgb) -> list[bytes]:
         """Take one image; return the packets that are ready, oldest first."""
 
     def finish(self) -> list[bytes]:
@@ -184,15 +184,15 @@ class _StreamEncoder:
         except (av.FFmpegError, ValueError) as error:
             raise ConfigError(
                 f"The video encoder {encoder} does not start with {width}x{height} pixels, crf {self.settings.crf}, "
-                f"preset {self.settings.preset} ({in_words(error)}): choose another preset, or --codec jpeg."
+                f"preset {self.settings.preset} ({describe_error(error)}): choose another preset, or --codec jpeg."
             ) from error
         self._context = context
-        self._num_pictures = 0
+        self._num_images = 0
 
-    def encode(self, picture: Rgb) -> list[bytes]:
-        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-        frame.pts, frame.time_base = self._num_pictures, self._time_base
-        self._num_pictures += 1
+    def encode(self, image: Rgb) -> list[bytes]:
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        frame.pts, frame.time_base = self._num_images, self._time_base
+        self._num_images += 1
         return _bare(self._context.encode(frame))
 
     def finish(self) -> list[bytes]:
@@ -213,9 +213,9 @@ class _JpegEncoder:
         settings = settings_of_coded("jpeg", width, height, fps)
         self.settings = replace(settings, jpeg_quality=video.jpeg_quality)
 
-    def encode(self, picture: Rgb) -> list[bytes]:
+    def encode(self, image: Rgb) -> list[bytes]:
         buffer = io.BytesIO()
-        Image.fromarray(picture).save(buffer, format="JPEG", quality=self.settings.jpeg_quality, subsampling="4:2:0")
+        Image.fromarray(image).save(buffer, format="JPEG", quality=self.settings.jpeg_quality, subsampling="4:2:0")
         return [buffer.getvalue()]
 
     def finish(self) -> list[bytes]:
@@ -229,14 +229,14 @@ def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[
         RecordingError: A packet cannot be decoded, has another size, or images are missing at the end.
     """
     shape = (settings.height, settings.width, 3)
-    pictures = _decode_jpeg(settings, packets) if settings.codec == "jpeg" else _decode_stream(settings, packets)
-    for picture in pictures:
-        if picture.shape != shape:
+    images = _decode_jpeg(settings, packets) if settings.codec == "jpeg" else _decode_stream(settings, packets)
+    for image in images:
+        if image.shape != shape:
             raise RecordingError(
-                f"An image is {picture.shape[1]}x{picture.shape[0]} pixels where the metadata says "
+                f"An image is {image.shape[1]}x{image.shape[0]} pixels where the metadata says "
                 f"{settings.width}x{settings.height}."
             )
-        yield picture
+        yield image
 
 
 def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
@@ -249,7 +249,7 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
         except UnidentifiedImageError as error:
             raise RecordingError(f"The image of frame {packet.frame_index} is no JPEG.") from error
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            reason = in_words(error)
+            reason = describe_error(error)
             raise RecordingError(f"The image of frame {packet.frame_index} is no valid JPEG ({reason}).") from error
 
 
@@ -258,22 +258,22 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
     context.thread_count = 1
     # A few bytes can announce images of gigabytes; encoded images are whole blocks of at most 128 pixels.
     context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
-    num_packets = num_pictures = 0
+    num_packets = num_images = 0
     try:
         for packet in packets:
             raw = av.Packet(packet.data)
             raw.pts = num_packets
             num_packets += 1
             for frame in context.decode(raw):
-                num_pictures += 1
+                num_images += 1
                 yield cast(Rgb, frame.to_ndarray(format="rgb24"))
         for frame in context.decode(None):
-            num_pictures += 1
+            num_images += 1
             yield cast(Rgb, frame.to_ndarray(format="rgb24"))
     except (av.FFmpegError, ValueError) as error:
-        raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_pictures}.") from error
-    if num_pictures != num_packets:
-        raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_pictures} images.")
+        raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_images}.") from error
+    if num_images != num_packets:
+        raise RecordingError(f"{num_packets} packets of {settings.codec} video gave {num_images} images.")
 
 
 def is_keyframe(codec: str, data: bytes) -> bool:

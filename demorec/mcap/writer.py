@@ -31,8 +31,8 @@ from demorec.mcap import channels, messages, metadata
 from demorec.mcap.cdr import encode
 from demorec.mcap.channels import Message
 from demorec.mcap.frame_check import FrameCheck, SampledFrameCheck, check_images, check_joint_names
+from demorec.mcap.images import CameraWriter
 from demorec.mcap.part_file import PartFile
-from demorec.mcap.pictures import CameraWriter
 from demorec.mcap.recover import can_be_made_again
 from demorec.mcap.streams import SUBTASK, FrameValues, frame_streams
 from demorec.mcap.transforms import FrameTree
@@ -63,14 +63,14 @@ class _Pending(NamedTuple):
     Attributes:
         time_ns: When.
         values: What the streams that have one message a frame are made of.
-        pictures: Camera -> number of the image that it holds.
+        images: Camera -> number of the image that it holds.
         changes: Messages of what is written only when it changes.
         joint_samples: Joint states since the frame before.
     """
 
     time_ns: int
     values: FrameValues | SampledFrame
-    pictures: Mapping[str, int]
+    images: Mapping[str, int]
     changes: list[Message]
     joint_samples: tuple[JointSample, ...] = ()
 
@@ -161,7 +161,7 @@ class EpisodeWriter(Closing):
             self._file.discard()
             raise
 
-    def picture(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
+    def image(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
         """Add the next image of a camera, and return its number, by which frames hold it; not of a simulated episode.
 
         Args:
@@ -174,8 +174,8 @@ class EpisodeWriter(Closing):
         Raises:
             RecordingError: An unknown camera, another size or type, or a stamp that goes backwards.
         """
-        self._check.check_picture(camera, stamp_ns, data)
-        self._check.note_picture(camera, stamp_ns)
+        self._check.check_image(camera, stamp_ns, data)
+        self._check.note_image(camera, stamp_ns)
         return self._cameras[camera].add(int(stamp_ns), data)
 
     def write(self, frame: Frame | SampledFrame) -> None:
@@ -195,7 +195,7 @@ class EpisodeWriter(Closing):
         self._check.note_frame(frame)
         text = frame.subtask
         changes = [(SUBTASK, messages.STRING, encode(messages.STRING, text))] if text else []
-        return _Pending(frame.time_ns, frame, frame.pictures, changes)
+        return _Pending(frame.time_ns, frame, frame.images, changes)
 
     def _of_simulation(self, check: FrameCheck, frame: Frame) -> _Pending:
         due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
@@ -209,13 +209,13 @@ class EpisodeWriter(Closing):
             self._open_cameras(frame)
             self._write_description()
         cameras = {name: check_images(frame, one.camera, one.streams) for name, one in self._cameras.items()}
-        pictures = {
+        numbers = {
             name: self._cameras[name].add(
                 frame.time_ns, images.color, depth=images.depth, segmentation=images.segmentation
             )
             for name, images in cameras.items()
         }
-        return _Pending(frame.time_ns, FrameValues.of(frame), pictures, self._changes(frame), frame.joint_samples)
+        return _Pending(frame.time_ns, FrameValues.of(frame), numbers, self._changes(frame), frame.joint_samples)
 
     def _open_cameras(self, first: Frame) -> None:
         for camera in self._info.cameras:
@@ -255,13 +255,13 @@ class EpisodeWriter(Closing):
             return
         self._write_numbers(frames)
         if is_simulated:
-            self._write_images({name: number + 1 for name, number in frames[-1].pictures.items()})
+            self._write_images({name: number + 1 for name, number in frames[-1].images.items()})
         del self._pending[: len(frames)]
 
     def _count_ready(self) -> int:
         """Of the pending frames, how many have images that have all left the encoders."""
         for index, frame in enumerate(self._pending):
-            if any(number >= self._cameras[name].num_ready for name, number in frame.pictures.items()):
+            if any(number >= self._cameras[name].num_ready for name, number in frame.images.items()):
                 return index
         return len(self._pending)
 

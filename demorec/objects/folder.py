@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.annotate.situation import COLOR_WORDS
-from demorec.core.errors import ConfigError, in_words
+from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import open_regular
 from demorec.core.geometry import Array
 from demorec.core.tables import OBJECTS
@@ -136,7 +136,7 @@ def read_solid(path: Path, scale: float = 1.0) -> SolidMesh:
     try:
         points, faces = _read(path)
     except Exception as error:  # trimesh raises what it happens to stumble over
-        raise ConfigError(f"The mesh cannot be read ({in_words(error)}): {path}") from error
+        raise ConfigError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
     if not len(faces) or not np.isfinite(points).all():
         raise ConfigError(f"The mesh has no triangles, or points that are no numbers: {path}")
     points = scale * points

@@ -1,4 +1,4 @@
-"""Pictures of bodies whose shapes and poses are plain data: colour, depth, segmentation, by any of several renderers.
+"""Images of bodies whose shapes and poses are plain data: colour, depth, segmentation, by any of several renderers.
 
 Where shapes and poses come from does not matter to a renderer: from the simulator (`demorec.sim.world.World`) or from a
 recording (`demorec.render.recorded.RecordedWorld`). `demorec.render.painter` brings the two together.
@@ -79,14 +79,14 @@ class RenderSetup:
     """What a renderer needs to know about a scene, but for where things are.
 
     Attributes:
-        bodies: What can be seen. Segmentation pictures number a body by its place here.
+        bodies: What can be seen. Segmentation images number a body by its place here.
         cameras: The cameras to draw, in order.
         mounts: Mount name -> the link that carries its cameras.
         light: Light and sky.
         depth, segmentation: Whether these are drawn beside colour.
         antialias: Whether edges are smoothed, where the renderer can.
-        detail: Camera name -> of which height pictures are whose level of detail is drawn, where a renderer has such;
-            its own for the others. For small pictures that shall show what a large one shows.
+        detail: Camera name -> of which height images are whose level of detail is drawn, where a renderer has such;
+            its own for the others. For small images that shall show what a large one shows.
     """
 
     bodies: tuple[VisualBody, ...]
@@ -102,7 +102,7 @@ class RenderSetup:
 class Renderer(Protocol):
     """Draws bodies; a context manager, warm across scenes.
 
-    `setup` is called for each scene and whenever its looks change, `render` at each frame. Pictures are a function of
+    `setup` is called for each scene and whenever its looks change, `render` at each frame. Images are a function of
     setup and poses alone, on one type of machine.
     """
 
@@ -135,7 +135,7 @@ def first_rows(bodies: Sequence[VisualBody]) -> list[int]:
 
 
 MAX_SAMPLES = 1 << 28
-"""Of a picture; beyond, buffers would take several GB. (PyBullet ends the process on sizes that it cannot draw.)"""
+"""Of an image; beyond, buffers would take several GB. (PyBullet ends the process on sizes that it cannot draw.)"""
 
 
 def check_setup(setup: RenderSetup) -> None:
@@ -147,7 +147,7 @@ def check_setup(setup: RenderSetup) -> None:
         samples = camera.width * camera.height * (4 if setup.antialias else 1)
         if samples > MAX_SAMPLES:
             raise RenderError(
-                f"{name} is {size}, {samples} samples a picture; allowed are {MAX_SAMPLES}: make it smaller"
+                f"{name} is {size}, {samples} samples an image; allowed are {MAX_SAMPLES}: make it smaller"
                 f"{' or draw without antialiasing' if setup.antialias else ''}."
             )
         if not 0 < camera.near < camera.far < math.inf:

@@ -13,16 +13,16 @@ from demorec.robots.robot import RobotSpec
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPreset:
-    """A camera before it knows its picture size and robot.
+    """A camera before it knows its image size and robot.
 
     Attributes:
         summary: One line for `demorec list cameras`.
         mount: "world", or "tcp" for a camera that the hand carries.
         eye, target: Where it is and what it looks at, in the mount's frame, metres; in the world for an arm of
             task_scale 1, nearer to a small one. A robot may have its own mount for a camera on the hand.
-        up: Direction that is up in the picture, in the mount's frame.
+        up: Direction that is up in the image, in the mount's frame.
         fov_y: Vertical field of view, rad.
-        fov_x: Horizontal field that it has at least, rad: of a picture that is too narrow for it the vertical field
+        fov_x: Horizontal field that it has at least, rad: of an image that is too narrow for it the vertical field
             becomes wider than `fov_y`.
     """
 
@@ -35,7 +35,7 @@ class CameraPreset:
     fov_x: float = 0.0
 
     def camera(self, name: str, robot: RobotSpec, *, width: int, height: int) -> SceneCamera:
-        """The camera for a picture size and a robot."""
+        """The camera for an image size and a robot."""
         eye, target, up = self.eye, self.target, self.up
         if self.mount == "tcp":
             eye, target, up = robot.wrist_camera or (eye, target, up)
@@ -72,7 +72,7 @@ TOP = CameraPreset(
 )
 
 # The hand stands behind what it reaches for and hides little of it. The region where objects are placed
-# (demorec.tasks.sampling.WORKSPACE) fills pictures of 7 to 5: 11 mm a pixel at 56 x 40.
+# (demorec.tasks.sampling.WORKSPACE) fills images of 7 to 5: 11 mm a pixel at 56 x 40.
 WORKSPACE = CameraPreset(
     summary="from in front and above, close: sees the objects, the fingers and little else, for small images",
     eye=(1.05, 0.0, 1.0),

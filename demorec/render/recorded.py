@@ -1,6 +1,6 @@
 """Recorded states as renderers want them, without a simulator.
 
-Bodies, their numbers and all poses are those of `demorec.sim.world.World`, to the bit, so that pictures drawn from a
+Bodies, their numbers and all poses are those of `demorec.sim.world.World`, to the bit, so that images drawn from a
 recording are those that were drawn while it was made.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.core.errors import SceneError, in_words
+from demorec.core.errors import SceneError, describe_error
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba, Scene
 from demorec.render import Mount, Visual, VisualBody
@@ -129,7 +129,7 @@ def _load_urdf(urdf: str, scale: float, *, name: str, is_fixed: bool) -> tuple[V
         model = BulletBody(text, scale=scale)
         links = {link.name: link for link in read_links(text, scale=scale)}
     except (OSError, ValueError) as error:
-        raise SceneError(f"The model of {name!r} cannot be read from {urdf!r} ({in_words(error)}).") from error
+        raise SceneError(f"The model of {name!r} cannot be read from {urdf!r} ({describe_error(error)}).") from error
     visuals = []
     for number, link in enumerate(model.link_names, start=-1):
         for shape in links[link].seen:

@@ -74,7 +74,7 @@ class Demonstration:
         tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.
         source: The recording's file; None for an episode of a dataset.
         digest: Of its content.
-        recorded: The recorded frames, without pictures, where every one of them is replayed.
+        recorded: The recorded frames, without images, where every one of them is replayed.
         recorded_checks: Conditions of the task as recorded.
         gave_up: Whether the recording shows why it failed whatever the conditions say (`gave_up`).
     """

@@ -86,7 +86,7 @@ def replay(
         demonstration: What to do.
         world: Of its robot and rate (`World(info.robot, fps=demonstration.fps)`); is reset.
         options: How.
-        painter: For the pictures of the frames, or None.
+        painter: For the images of the frames, or None.
         sink: Is given every frame of the replay before its command is sent.
 
     Returns:
@@ -312,7 +312,7 @@ def replay_all(
 def record_replay(
     demonstration: Demonstration, simulators: SimulatorCache, options: ReplayOptions, out: Path, *, overwrite: bool
 ) -> tuple[ReplayReport, tuple[Path, Path] | None]:
-    """Replay and record it, with pictures of the recording's cameras, into a file of the same name in `out`.
+    """Replay and record it, with images of the recording's cameras, into a file of the same name in `out`.
 
     Returns:
         As `replay_all` yields.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from demorec.core.config import read_toml
-from demorec.core.errors import ConfigError, in_words
+from demorec.core.errors import ConfigError, describe_error
 from demorec.core.geometry import Pose, look_at
 from demorec.core.plain import from_plain
 from demorec.episode.scene import SceneCamera
@@ -22,7 +22,7 @@ class FreeCamera:
     Attributes:
         position: In the mount's frame.
         look_at: Point that it looks at, in the mount's frame; this or `quat_xyzw`.
-        up: Direction that is up in the picture.
+        up: Direction that is up in the image.
         quat_xyzw: Rotation mount_from_camera, OpenCV axes, in place of `look_at`.
         fov_y_degrees: Vertical field of view.
         mount: "world", or a link of the robot.
@@ -72,7 +72,9 @@ def read_cameras(path: Path) -> dict[str, FreeCamera]:
         try:
             cameras[name] = from_plain(table, FreeCamera)
         except ValueError as error:
-            raise ConfigError(f"The camera {name!r} of the file cannot be used ({in_words(error)}): {path}") from error
+            raise ConfigError(
+                f"The camera {name!r} of the file cannot be used ({describe_error(error)}): {path}"
+            ) from error
     if not cameras:
         raise ConfigError(f"The file describes no camera; write a table, e.g. [side] with position and look_at: {path}")
     return cameras

@@ -1,7 +1,7 @@
-"""Recorded states, new pictures: any camera, size, renderer or looks, without simulating anything.
+"""Recorded states, new images: any camera, size, renderer or looks, without simulating anything.
 
 A new recording keeps every number of the old one and names it as its origin. With the recording's own cameras and
-looks the pictures come out again as they were before coding, so the coded packets are equal, byte for byte.
+looks the images come out again as they were before coding, so the coded packets are equal, byte for byte.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from demorec.tasks.vary import vary_looks
 
 @dataclass(frozen=True, kw_only=True)
 class RerenderOptions:
-    """What the new pictures shall be; None keeps what was recorded.
+    """What the new images shall be; None keeps what was recorded.
 
     Attributes:
         cameras: Names: of the recording, of `free_cameras`, of the cameras' table, or "module:CAMERA" of one's own.
@@ -71,8 +71,8 @@ class RerenderReport:
 
     Attributes:
         source, path: The recording and the new one.
-        num_frames, num_pictures: In it.
-        compared: Cameras whose coded pictures were compared with the recorded ones, because nothing about them was
+        num_frames, num_images: In it.
+        compared: Cameras whose coded images were compared with the recorded ones, because nothing about them was
             to change.
         differing: Of these, camera -> first frame whose packet differs.
         was_there: Whether an earlier call had drawn it, so that nothing was drawn now.
@@ -81,7 +81,7 @@ class RerenderReport:
     source: Path
     path: Path
     num_frames: int
-    num_pictures: int
+    num_images: int
     compared: tuple[str, ...] = ()
     differing: Mapping[str, int] = field(default_factory=dict)
     was_there: bool = False
@@ -89,7 +89,7 @@ class RerenderReport:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneView:
-    """Where the pictures of an episode are taken from.
+    """Where the images of an episode are taken from.
 
     Attributes:
         scene: As it is drawn and recorded; its cameras are where they are believed to be.
@@ -120,7 +120,7 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
             plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
             episode = prepare(plan)
         except NotAllowedError:
-            raise  # else the pictures would be taken from wrong places without a word
+            raise  # else the images would be taken from wrong places without a word
         except (ValueError, DemorecError):
             episode = None
         if episode is not None and episode.info.scene == info.scene:
@@ -139,7 +139,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     """The view that the options ask for.
 
     Raises:
-        ConfigError: An unknown camera, or a picture size that cannot be coded.
+        ConfigError: An unknown camera, or an image size that cannot be coded.
     """
     old = recorded_view(info, options.allowed)
     names = options.cameras or tuple(dict.fromkeys((*(c.name for c in info.scene.cameras), *options.free_cameras)))
@@ -219,7 +219,7 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
 
 
 def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
-    """The recording's config with what the options change about the pictures."""
+    """The recording's config with what the options change about the images."""
     config = dict(info.config)
     same_names = ("renderer", "antialias", "depth", "segmentation", "width", "height")
     changes = {name: getattr(options, name) for name in same_names} | {
@@ -280,7 +280,7 @@ def rerender(
         source=source,
         path=out,
         num_frames=columns.num_frames,
-        num_pictures=columns.num_frames * len(view.scene.cameras),
+        num_images=columns.num_frames * len(view.scene.cameras),
         compared=tuple(compared),
         differing={name: frame for name, frame in compared.items() if frame is not None},
         was_there=was_there,
@@ -288,7 +288,7 @@ def rerender(
 
 
 def _write_drawn(writer: EpisodeWriter, recording: Recording, columns: Columns, painter: Painter, scene: Scene) -> None:
-    """All frames of a recording with new pictures of the scene, and its outcome."""
+    """All frames of a recording with new images of the scene, and its outcome."""
     world = RecordedWorld(
         recording.info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses
     )
@@ -325,7 +325,7 @@ def _outcome(recording: Recording) -> Outcome:
 
 
 def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[str, int | None]:
-    """The packets of the cameras that were to stay as they were: equal pictures give equal packets.
+    """The packets of the cameras that were to stay as they were: equal images give equal packets.
 
     Returns:
         Camera -> first frame whose packet differs, or None.

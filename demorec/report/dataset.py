@@ -13,7 +13,7 @@ from demorec.check.base import Result
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.check.scoring.neighbours import FEWEST
 from demorec.check.scoring.score import SOUND, score_dataset
-from demorec.core.errors import ConfigError, ExportError, in_words, without_path
+from demorec.core.errors import ConfigError, ExportError, describe_error, without_path
 from demorec.datasets.lerobot.files import read_json, read_table
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
@@ -54,7 +54,7 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
     stride = max(1, -(-info.total_episodes // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
-    flags = {} if checks is None else _flags(root, info, missing, images=checks.pictures)
+    flags = {} if checks is None else _flags(root, info, missing, images=checks.images)
     for number, place in enumerate(episode_places(root, info)):
         columns = {} if reader is None else reader.read(place)
         _count_components(components, root, info, columns)
@@ -133,7 +133,7 @@ def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row], _Row]:
     try:
         configs = read_json(root / CONFIGS_PATH) if episodes else {}
     except (OSError, ValueError) as error:
-        raise ExportError(f"The sidecar's configs.json cannot be read ({in_words(error)}): {root}") from error
+        raise ExportError(f"The sidecar's configs.json cannot be read ({describe_error(error)}): {root}") from error
     rows = {row["episode_index"]: row for row in episodes}
     return rows, [row for row in attempts if not row["in_dataset"]], configs if isinstance(configs, dict) else {}
 
@@ -185,7 +185,7 @@ def _episode(place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]],
             info=read_episode_info(row["episode_info"]),
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise ExportError(f"The sidecar's row of {name} cannot be used ({in_words(error)})") from error
+        raise ExportError(f"The sidecar's row of {name} cannot be used ({describe_error(error)})") from error
 
 
 def _outcome(row: _Row) -> Outcome | None:

@@ -108,8 +108,8 @@ def _recordings_report(
         for number, subject in enumerate(folders, len(subjects) + 1):
             summaries.add(check_subject(subject, checks).results, f"the {subject.kind}")
             advance(number, total)
-        if not checks.pictures:
-            missing.append("The checks that decode all images were not run; --pictures runs them, too.")
+        if not checks.images:
+            missing.append("The checks that decode all images were not run; --images runs them, too.")
     if run is not None:
         episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
     configs = {episode.info.config_digest: episode.info.config for episode in episodes if episode.info is not None}

@@ -1,6 +1,6 @@
 """Where PyBullet says that a body's links are, to the bit and without PyBullet.
 
-Recorded pictures and camera poses were made from what PyBullet tells. To draw them again from the recording alone, its
+Recorded images and camera poses were made from what PyBullet tells. To draw them again from the recording alone, its
 steps are followed in their order: forward kinematics from one centre of mass to the next with quaternions in float64
 (Featherstone's articulated bodies), then the frames of the links through matrices in float32, which is the precision
 of PyBullet's interface. `tests/contract/test_recorded_world.py` compares every bit with PyBullet's.

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from demorec.core.errors import ConfigError, in_words
+from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.geometry import Array
 from demorec.core.plain import from_plain, listed, parse_json
@@ -186,7 +186,7 @@ def read_calibration(path: Path, names: tuple[str, ...]) -> dict[str, MotorCalib
                 raise ValueError(f"the drive_mode of {name} is {motor.drive_mode}, allowed are 0 and 1")
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"This is no calibration that LeRobot saved ({in_words(error)}): {path}; lerobot-calibrate writes one, "
-            "below ~/.cache/huggingface/lerobot/calibration/robots."
+            f"This is no calibration that LeRobot saved ({describe_error(error)}): {path}; lerobot-calibrate writes "
+            "one, below ~/.cache/huggingface/lerobot/calibration/robots."
         ) from error
     return found

@@ -18,7 +18,7 @@ class Material:
 
     Attributes:
         color: (3,) diffuse RGB, 0..1.
-        texture: Picture, if it is there.
+        texture: Image, if it is there.
     """
 
     color: Array

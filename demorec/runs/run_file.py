@@ -22,7 +22,7 @@ from demorec.core.errors import (
     DemorecError,
     NotSimulatedError,
     RecordingError,
-    in_words,
+    describe_error,
     resource_error,
 )
 from demorec.core.files import MAX_JSON_BYTES, open_regular, read_json_limited, replace_text
@@ -298,7 +298,7 @@ def load_any_run_file(folder: Path) -> RunFile:
     except FileNotFoundError as error:
         raise ConfigError(f"No run.json, so this is no run of generate-dataset: {folder}") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        damaged = DamagedRunFileError(f"run.json is damaged ({in_words(error)}): {path}")
+        damaged = DamagedRunFileError(f"run.json is damaged ({describe_error(error)}): {path}")
         raise resource_error(error, path) or damaged from error
 
 

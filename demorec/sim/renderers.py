@@ -42,7 +42,7 @@ class _ClientRenderer:
     def __init__(self) -> None:
         self._client: Any = None
         self._setup: RenderSetup | None = None
-        # By the number of a shape's body in the client: the row of its pose and its pose there; its number in pictures.
+        # By the number of a shape's body in the client: the row of its pose and its pose there; its number in images.
         self._places: dict[int, tuple[int, Pose]] = {}
         self._segments: dict[int, int] = {}
 
@@ -185,7 +185,7 @@ class TinyRenderer(_ClientRenderer):
 class EglRenderer(_ClientRenderer):
     """PyBullet's OpenGL renderer without a window (EGL plugin): fast on a GPU, needs libEGL.
 
-    One per process, or a client's pictures are silently wrong.
+    One per process, or a client's images are silently wrong.
 
     Raises:
         RenderError: The plugin does not work on this machine.
@@ -202,7 +202,7 @@ class EglRenderer(_ClientRenderer):
                 "libgl1-mesa-dri), or use --renderer raster or tiny."
             )
         self._plugin = -1
-        self._is_first_picture = True
+        self._is_first_image = True
 
     def _connect(self) -> Any:
         client = super()._connect()
@@ -210,7 +210,7 @@ class EglRenderer(_ClientRenderer):
         if self._plugin < 0:
             client.disconnect()
             raise RenderError("The EGL renderer could not be loaded into PyBullet: use --renderer raster.")
-        self._is_first_picture = True
+        self._is_first_image = True
         return client
 
     def close(self) -> None:
@@ -221,9 +221,9 @@ class EglRenderer(_ClientRenderer):
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
         """As `_ClientRenderer.render`."""
-        if self._is_first_picture:  # it differs from all later ones in some pixels
+        if self._is_first_image:  # it differs from all later ones in some pixels
             super().render(poses)
-            self._is_first_picture = False
+            self._is_first_image = False
         return super().render(poses)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from demorec.core.errors import DemorecError, in_words, resource_error
+from demorec.core.errors import DemorecError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular
 from demorec.mcap.limits import LimitError, Unpacked
 from demorec.mcap.scan import MAX_CHANNELS, MAX_SCHEMA_BYTES, CutOffError, ScannedChannel, ScannedMessage, scan
@@ -51,7 +51,7 @@ def read_mcap(path: Path, tell: Callable[[str], None], unpacked: Unpacked) -> It
             raise resource_error(error, path) or error from error
         except Exception as error:
             is_told = isinstance(error, LimitError | CutOffError)
-            tell(str(error) if is_told else f"a record is damaged: {in_words(error)}")
+            tell(str(error) if is_told else f"a record is damaged: {describe_error(error)}")
 
 
 SQLITE_MAGIC = b"SQLite format 3\0"

@@ -23,7 +23,7 @@ from demorec.robots.motors import Motors
 from demorec.runs.external import open_external_run
 from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
-from demorec.sources.frames_writer import FramesImport, Picture, importing_versions, write_frames
+from demorec.sources.frames_writer import FramesImport, Image, importing_versions, write_frames
 
 
 def import_lerobot(
@@ -66,7 +66,7 @@ def import_lerobot(
                     outcome=recording.outcome,
                     video=video or VideoConfig(),
                     leads={
-                        camera.name: int(recording.columns().pictures[camera.name][0])
+                        camera.name: int(recording.columns().images[camera.name][0])
                         for camera in info.cameras
                         if camera.kept
                     },
@@ -126,10 +126,10 @@ def _vectors(recording: DatasetRecording) -> Iterator[dict[str, Vector]]:
         yield {name: values[row] for name, values in features.items()}
 
 
-def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Picture]:
+def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Image]:
     """Of the camera's lead, where packets pass through, and of every frame."""
     if camera.is_depth:
         return recording.distances(camera.name)
     if camera.kept:
         return (packet.data for packet in recording.packets(camera.name))
-    return islice(recording.images(camera.name), int(recording.columns().pictures[camera.name][0]), None)
+    return islice(recording.images(camera.name), int(recording.columns().images[camera.name][0]), None)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import in_words
+from demorec.core.errors import describe_error
 from demorec.core.plain import MAX_DEPTH, parse_json
 from demorec.mcap.cdr import Values
 from demorec.mcap.limits import Budget, SpentError
@@ -142,7 +142,7 @@ def _protobuf_decoder(type_name: str, schema: bytes, budgets: Budgets) -> Decode
         try:
             methods.ParseFromString(message, data)
         except DecodeError as error:
-            raise ValueError(in_words(error)) from error
+            raise ValueError(describe_error(error)) from error
         return _protobuf_values(message, descriptor, methods, budgets.values)
 
     return decode

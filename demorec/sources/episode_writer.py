@@ -22,9 +22,9 @@ from demorec.mcap.cdr import Values
 from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import Int
-from demorec.sources.fields import picture_bytes
+from demorec.sources.fields import image_bytes
 from demorec.sources.frames_writer import imported_feature
-from demorec.sources.picture_messages import decode_picture
+from demorec.sources.image_messages import decode_image
 from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, Timelines
 from demorec.sources.streams import BagStreams
 
@@ -53,7 +53,7 @@ class _Waiting:
     first: int
     places: Int
     num_written: int = 0
-    pictures: dict[int, tuple[bytes | Any, int]] = field(default_factory=dict)
+    images: dict[int, tuple[bytes | Any, int]] = field(default_factory=dict)
     num_bytes: int = 0
 
 
@@ -106,14 +106,14 @@ class ImportedEpisodeWriter(Closing):
 
     def _take(self, name: str, waiting: _Waiting, place: int, values: Values) -> None:
         is_coded = waiting.plan.kept and waiting.plan.kept not in DEPTH_UNITS
-        data: Any = picture_bytes(values) if is_coded else decode_picture(values)
+        data: Any = image_bytes(values) if is_coded else decode_image(values)
         size = len(data) if isinstance(data, bytes) else data.nbytes
-        waiting.pictures[place] = (data, size)
+        waiting.images[place] = (data, size)
         waiting.num_bytes += size
-        while waiting.num_written in waiting.pictures:
-            picture, size = waiting.pictures.pop(waiting.num_written)
+        while waiting.num_written in waiting.images:
+            image, size = waiting.images.pop(waiting.num_written)
             waiting.num_bytes -= size
-            self._writer.picture(name, int(waiting.plan.stamps_ns[waiting.num_written]), picture)
+            self._writer.image(name, int(waiting.plan.stamps_ns[waiting.num_written]), image)
             waiting.num_written += 1
         if waiting.num_bytes > _MAX_WAITING:
             raise BagError(f"The images of {waiting.plan.topic} are too far out of order to be read in bounded memory.")
@@ -128,9 +128,9 @@ class ImportedEpisodeWriter(Closing):
                 name: Sample(stamp_ns=time_ns - int(feature.ages_ns[row]), vector=feature.values[row])
                 for name, feature in self._rows.features.items()
             }
-            pictures = {name: int(waiting.plan.positions[row]) for name, waiting in self._waiting.items()}
+            images = {name: int(waiting.plan.positions[row]) for name, waiting in self._waiting.items()}
             subtask = self._subtasks.get(row, "")
-            self._writer.write(SampledFrame(time_ns=time_ns, samples=samples, pictures=pictures, subtask=subtask))
+            self._writer.write(SampledFrame(time_ns=time_ns, samples=samples, images=images, subtask=subtask))
             self._next_row += 1
 
     def finish(self) -> None:

@@ -138,7 +138,7 @@ def frame_id_of(values: Values) -> str:
     return found if isinstance(found, str) else ""
 
 
-def picture_bytes(values: Mapping[str, Any]) -> bytes:
+def image_bytes(values: Mapping[str, Any]) -> bytes:
     """The bytes of an image; JSON has them in base64."""
     data = values["data"]
     if isinstance(data, str):

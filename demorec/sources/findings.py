@@ -54,7 +54,7 @@ class Finding:
 def stream_findings(line: Timeline, skew: Numbers) -> Iterator[Finding]:
     """What is odd in a stream; (K,) its skews, as they compare with those of the others."""
     found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skew))
-    for kind, text in (*found, *_picture_findings(line), *_value_findings(line)):
+    for kind, text in (*found, *_image_findings(line), *_value_findings(line)):
         yield of_stream(line.stream, kind, text)
 
 
@@ -232,7 +232,7 @@ def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
     return int(edges[longest]), int(edges[longest + 1]) - 1
 
 
-def _picture_findings(line: Timeline) -> Iterator[tuple[str, str]]:
+def _image_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     stream = line.stream
     if not stream.heads:
         return

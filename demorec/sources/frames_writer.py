@@ -20,8 +20,8 @@ from demorec.robots.urdf import Urdf
 from demorec.runs.external import ExternalFolder, episode_path
 from demorec.sources.mapping import SourceMapping, recorded_unit
 
-Picture = bytes | NDArray[Any]
-"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `EpisodeWriter.picture` takes them."""
+Image = bytes | NDArray[Any]
+"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `EpisodeWriter.image` takes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ def write_frames(
     folder: ExternalFolder,
     info: EpisodeInfo,
     frames: Iterable[Mapping[str, Vector]],
-    pictures: Mapping[str, Iterator[Picture]],
+    images: Mapping[str, Iterator[Image]],
     *,
     outcome: Outcome,
     video: VideoConfig,
@@ -120,7 +120,7 @@ def write_frames(
         folder: The run.
         info: What is known of the episode.
         frames: Feature -> its vector, of each frame.
-        pictures: Camera -> its images, one a frame, its lead in front.
+        images: Camera -> its images, one a frame, its lead in front.
         outcome: How it ended, of as many frames.
         video: How pixels are encoded.
         leads: Camera -> how many of its images come before the first frame; 0 where not given.
@@ -137,14 +137,14 @@ def write_frames(
     with EpisodeWriter(path, info, video=video, keeps_part=False) as writer:
         for name, lead in leads.items():
             for number in range(begin - lead, begin):
-                writer.picture(name, frame_time_ns(number, info.fps), next(pictures[name]))
+                writer.image(name, frame_time_ns(number, info.fps), next(images[name]))
         count = 0
         for vectors in frames:
             time_ns = frame_time_ns(begin + count, info.fps)
-            shown = {name: writer.picture(name, time_ns, next(images)) for name, images in pictures.items()}
+            shown = {name: writer.image(name, time_ns, next(stream)) for name, stream in images.items()}
             samples = {name: Sample(stamp_ns=time_ns, vector=vector) for name, vector in vectors.items()}
             subtask = (subtasks or {}).get(count, "")
-            writer.write(SampledFrame(time_ns=time_ns, samples=samples, pictures=shown, subtask=subtask))
+            writer.write(SampledFrame(time_ns=time_ns, samples=samples, images=shown, subtask=subtask))
             count += 1
         writer.finish(replace(outcome, num_frames=count))
     folder.add(path)

@@ -16,9 +16,9 @@ from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, Feature, Kept
 from demorec.mcap.cdr import Values
 from demorec.sources.fields import FieldError, converted
-from demorec.sources.frames_writer import Picture, imported_feature
+from demorec.sources.frames_writer import Image, imported_feature
+from demorec.sources.image_messages import ImageHead, decode_image, image_head
 from demorec.sources.mapping import MAX_ELEMENTS, CameraSource, Source, conversion_factor
-from demorec.sources.picture_messages import PictureHead, decode_picture, picture_head
 
 _BLOCK_ROWS = 1024
 _EXACT = 2**53
@@ -172,7 +172,7 @@ class StoredCamera:
         self._scale = 0.0
         self.kept: Kept = ""
         shape = array.shape
-        form = picture_form(array)
+        form = image_form(array)
         if form is None:
             found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
             raise Hdf5FitError(
@@ -204,7 +204,7 @@ class StoredCamera:
         """The camera as recordings know it."""
         return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=self._camera.dataset)
 
-    def pictures(self) -> Iterator[Picture]:
+    def images(self) -> Iterator[Image]:
         """One a row.
 
         Raises:
@@ -216,8 +216,8 @@ class StoredCamera:
                 yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
                 continue
             if self._form == "pixels":
-                picture = row if row.shape[2] == 3 else row.transpose(1, 2, 0)
-                scaled = np.rint(picture.astype(np.float64) * self._scale) if self._scale else picture
+                image = row if row.shape[2] == 3 else row.transpose(1, 2, 0)
+                scaled = np.rint(image.astype(np.float64) * self._scale) if self._scale else image
                 yield self._ordered(np.ascontiguousarray(scaled, dtype=np.uint8))
                 continue
             data, head = self._head(row, number)
@@ -225,12 +225,12 @@ class StoredCamera:
                 raise Hdf5FitError(
                     f"{self._array.place} changes its size to {head.width}x{head.height} in row {number}"
                 )
-            yield data if self.kept else self._ordered(self._used(decode_picture, data, number))
+            yield data if self.kept else self._ordered(self._used(decode_image, data, number))
 
-    def _ordered(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return picture if self._camera.colors == "rgb" else np.ascontiguousarray(picture[:, :, ::-1])
+    def _ordered(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return image if self._camera.colors == "rgb" else np.ascontiguousarray(image[:, :, ::-1])
 
-    def _head(self, row: NDArray[np.generic], number: int) -> tuple[bytes, PictureHead]:
+    def _head(self, row: NDArray[np.generic], number: int) -> tuple[bytes, ImageHead]:
         """The JPEG file of a row and its head, without what pads it: it ends with its own mark, never with a zero."""
         data = row.tobytes().rstrip(b"\0")
         if not data.endswith(_JPEG_END):
@@ -240,7 +240,7 @@ class StoredCamera:
                 f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
                 "that compress_len tells"
             )
-        head = self._used(picture_head, data, number)
+        head = self._used(image_head, data, number)
         if head.format != "jpeg":
             raise Hdf5FitError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
         return data, head
@@ -274,7 +274,7 @@ def is_camera(array: StoredArray) -> bool:
     Raises:
         Hdf5Error: Its first row cannot be read.
     """
-    form, place = picture_form(array), array.place.rpartition("/")[2]
+    form, place = image_form(array), array.place.rpartition("/")[2]
     if form == "jpeg":
         return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)
     if form == "pixels" and array.dtype.kind == "f":  # points and transforms are arrays like these
@@ -284,7 +284,7 @@ def is_camera(array: StoredArray) -> bool:
     return form == "pixels" or (form == "depth" and (is_image or "depth" in place))
 
 
-def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
+def image_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
     """What the rows of a dataset can be as images; None for numbers that are none."""
     shape, kind = array.shape, array.dtype
     if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
@@ -295,7 +295,7 @@ def picture_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | Non
     return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None
 
 
-def picture_lengths(array: StoredArray, num_rows: int) -> NDArray[np.generic]:
+def image_lengths(array: StoredArray, num_rows: int) -> NDArray[np.generic]:
     """(C, T) of ALOHA's `compress_len`; Hdf5FitError when it is of another shape."""
     if len(array.shape) != 2 or array.shape[1] != num_rows:
         raise Hdf5FitError(f"{array.place} has the shape {array.shape}, it must have {num_rows} columns")

@@ -30,7 +30,7 @@ from demorec.runs.find import expect
 from demorec.runs.run_file import sha256_of
 from demorec.sources.episode_writer import urdf_text
 from demorec.sources.frames_writer import FramesImport, imported_info, joints_of, write_frames
-from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, is_camera, picture_lengths
+from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, image_lengths, is_camera
 from demorec.sources.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.sources.mapping_file import read_mapping
 from demorec.sources.words import in_natural_order, quoted, task_in_name
@@ -85,7 +85,7 @@ def import_hdf5(
         for path, place, info, outcome in missing:
             with ForeignFile(path) as file, _named(path):
                 episode = _Stored(file, place, mapping)
-                images = {camera.name: camera.pictures() for camera in episode.cameras}
+                images = {camera.name: camera.images() for camera in episode.cameras}
                 write_frames(folder, info, episode.frames(), images, outcome=outcome, video=video or VideoConfig())
     return FramesImport(
         num_episodes=len(plans),
@@ -114,7 +114,7 @@ class _Stored:
         cameras = {
             name: (camera, array(camera.dataset, may_be_ragged=True)) for name, camera in mapping.cameras.items()
         }
-        observed = [pictures for _, pictures in cameras.values()]
+        observed = [images for _, images in cameras.values()]
         others: list[StoredArray] = []
         for feature in self.features:
             arrays = others if not feature.name.startswith("observation.") else observed
@@ -126,15 +126,15 @@ class _Stored:
             raise Hdf5FitError(
                 f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
             )
-        files = [pictures for _, pictures in cameras.values() if len(pictures.shape) == 2]
+        files = [images for _, images in cameras.values() if len(images.shape) == 2]
         is_told = files and file.has(f"{place}/{_LENGTHS}")
-        lengths = picture_lengths(array(_LENGTHS), len(files[0])) if is_told else None
+        lengths = image_lengths(array(_LENGTHS), len(files[0])) if is_told else None
         self.num_frames = min(num_rows, len(observed[0]) - max(feature.shift for feature in self.features))
         if self.num_frames < 1:
             raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
         self.cameras = [
-            StoredCamera(name, camera, pictures, lengths if len(pictures.shape) == 2 else None)
-            for name, (camera, pictures) in cameras.items()
+            StoredCamera(name, camera, images, lengths if len(images.shape) == 2 else None)
+            for name, (camera, images) in cameras.items()
         ]
 
     def frames(self) -> Iterator[dict[str, Vector]]:

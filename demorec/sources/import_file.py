@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.core.errors import ConfigError, in_words, resource_error
+from demorec.core.errors import ConfigError, describe_error, resource_error
 from demorec.core.files import read_text_limited, replace_text
 from demorec.core.plain import from_json, to_json
 from demorec.runs.run_file import IMPORT_NAME
@@ -253,7 +253,7 @@ def load_import_file(folder: Path) -> ImportFile | None:
             f"import.json cannot be read ({error.strerror}): {path}"
         ) from error
     except ValueError as error:
-        raise BagError(f"import.json is damaged ({in_words(error)}): {path}") from error
+        raise BagError(f"import.json is damaged ({describe_error(error)}): {path}") from error
 
 
 def save_import_file(content: ImportFile, folder: Path) -> None:

@@ -147,7 +147,7 @@ class _Importer:
             episodes.append(episode)
             reports.append(_report(window, begin, episode))
         _check_alike(bag, episodes)
-        _check_pictures(bag, episodes)
+        _check_images(bag, episodes)
         report = BagReport(
             name=bag.path.name,
             files=files,
@@ -211,11 +211,11 @@ class _Importer:
         filmed = [episode for episode in waiting if episode.rows.cameras]
         if not filmed:
             return
-        beginning = _first_pictures(filmed)
+        beginning = _first_images(filmed)
         begun: set[int] = set()
         with ExitStack() as stack:
             under_way: list[tuple[PlannedEpisode, ImportedEpisodeWriter]] = []
-            for topic, number, values in _pictures(bag, filmed):
+            for topic, number, values in _images(bag, filmed):
                 for episode in beginning.get((topic, number), []):
                     if episode.info.episode_index not in begun:
                         begun.add(episode.info.episode_index)
@@ -237,7 +237,7 @@ class _Importer:
         return ImportedEpisodeWriter(path, episode, video=self.video)
 
 
-def _check_pictures(bag: Bag, episodes: Sequence[PlannedEpisode]) -> None:
+def _check_images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> None:
     """BagError when the images unpack to more than a bag of its size holds: a PNG file of zeros is small."""
     limits = Limits.of_file(bag.num_bytes)
     plans = [plan for episode in episodes for plan in episode.rows.cameras.values()]
@@ -254,7 +254,7 @@ def _check_alike(bag: Bag, episodes: Sequence[PlannedEpisode]) -> None:
             raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {bag.path}")
 
 
-def _pictures(bag: Bag, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str, int, dict[str, object]]]:
+def _images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str, int, dict[str, object]]]:
     """(topic, number, values) of the images that any episode takes."""
     taken: dict[str, list[Int]] = {}
     for episode in episodes:
@@ -277,7 +277,7 @@ def _unusable(bag: Bag, topic: str, error: ValueError) -> BagError:
     return BagError(f"An image of {topic} cannot be used, since {error}: {bag.path}")
 
 
-def _first_pictures(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:
+def _first_images(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:
     """(topic, number) -> the episodes whose first image of that topic it is; a topic's messages come in order."""
     found: dict[tuple[str, int], list[PlannedEpisode]] = {}
     for episode in episodes:

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import ConfigError, in_words
+from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.plain import MAX_TOLD, from_plain, listed
 from demorec.core.registry import nearest_match
@@ -38,7 +38,7 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"The mapping is no valid TOML ({in_words(error)}): {path}") from error
+        raise ConfigError(f"The mapping is no valid TOML ({describe_error(error)}): {path}") from error
     problems = (
         [problem]
         if (problem := _excess(data))

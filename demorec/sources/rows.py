@@ -14,8 +14,8 @@ from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline
 from demorec.sources.episodes import Window
+from demorec.sources.image_messages import KEPT_FORMATS, VIDEO_FORMATS, ImageHead
 from demorec.sources.mapping import ROWS, CameraSource, Sampling, Source, SourceMapping
-from demorec.sources.picture_messages import KEPT_FORMATS, VIDEO_FORMATS, PictureHead
 from demorec.sources.streams import BagStreams, Stream
 
 RATE = 0.05
@@ -66,7 +66,7 @@ class CameraRows:
     """
 
     topic: str
-    head: PictureHead
+    head: ImageHead
     kept: Kept
     taken: Int
     stamps_ns: Int

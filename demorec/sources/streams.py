@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import in_words
+from demorec.core.errors import describe_error
 from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
 from demorec.mcap.cdr import Values
@@ -33,13 +33,13 @@ from demorec.sources.fields import (
     converted,
     follow,
     frame_id_of,
+    image_bytes,
     layout_of,
     parse_path,
-    picture_bytes,
     stamp_of,
 )
+from demorec.sources.image_messages import ImageHeads, image_head
 from demorec.sources.mapping import Source, SourceMapping
-from demorec.sources.picture_messages import PictureHeads, picture_head
 from demorec.sources.ros_types import Budgets
 from demorec.sources.service_calls import CallReader
 from demorec.sources.words import quoted
@@ -93,7 +93,7 @@ class Stream:
     places: array[int] = field(default_factory=lambda: array("q"))
     vectors: bytearray = field(default_factory=bytearray)
     dtype: np.dtype[np.floating[Any]] | None = None
-    heads: PictureHeads = field(default_factory=PictureHeads)
+    heads: ImageHeads = field(default_factory=ImageHeads)
     sums: array[int] = field(default_factory=lambda: array("I"))
     image_sums: array[int] = field(default_factory=lambda: array("I"))
     frame_ids: list[str] = field(default_factory=list)
@@ -112,15 +112,15 @@ class Stream:
                     self.reader = SourceReader(self.source, layout_of(self.source, values))
                 self._add_vector(self.reader.read(values))
             else:
-                head, picture_sum = picture_head(values), zlib.crc32(picture_bytes(values))
+                head, image_sum = image_head(values), zlib.crc32(image_bytes(values))
                 self.heads.append(head)  # both or neither
-                self.image_sums.append(picture_sum)
+                self.image_sums.append(image_sum)
                 self.places.append(number)
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)
             return
         except (ValueError, RecursionError, OverflowError, TypeError) as error:
-            self.malformed(in_words(error))
+            self.malformed(describe_error(error))
             return
         stamp = stamp_of(values)
         self.logged.append(message.log_ns)
@@ -275,7 +275,7 @@ class BagStreams:
             for stream in streams:
                 stream.malformed(str(error))
             if topic in self.texts or topic in self.calls:
-                self._refused[topic] = in_words(error)
+                self._refused[topic] = describe_error(error)
             return
         checksum = zlib.crc32(message.data)
         for stream in streams:

@@ -28,8 +28,8 @@ from demorec.sources.choice import choose_features
 from demorec.sources.clock import NS, SKEW_S
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import FieldError, follow, stamp_of
+from demorec.sources.image_messages import ImageHead, image_head
 from demorec.sources.mapping import Clock
-from demorec.sources.picture_messages import PictureHead, picture_head
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
 _KEPT = 64
@@ -185,9 +185,9 @@ def _names(vector: Vector, values: Values) -> tuple[str, ...]:
     return tuple(names) if are_texts and len(names) == count == len(set(names)) else ()
 
 
-def _head(values: Values) -> PictureHead | None:
+def _head(values: Values) -> ImageHead | None:
     try:
-        return picture_head(values)
+        return image_head(values)
     except FieldError:
         return None
 
@@ -255,10 +255,10 @@ def _timed(vector: Vector, parts: Sequence[Sequence[int]]) -> Vector:
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
     """Name of each camera -> topic: of several topics of the same one, the encoded one."""
     heads = {name: _head(topic.values[0]) for name, topic in topics.items() if topic.values}
-    pictures = [name for name, head in heads.items() if head is not None]
+    images = [name for name, head in heads.items() if head is not None]
     cameras: dict[str, str] = {}
-    for name in sorted(pictures):
-        if any(other != name and other.startswith(f"{name}/") for other in pictures):
+    for name in sorted(images):
+        if any(other != name and other.startswith(f"{name}/") for other in images):
             continue  # image_raw beside image_raw/compressed: the same images
         head = heads[name]
         is_depth = head is not None and head.encoding in DEPTH_UNITS

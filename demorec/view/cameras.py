@@ -1,4 +1,4 @@
-"""Cameras: poses, pinholes (frusta in the 3D view) and pictures."""
+"""Cameras: poses, pinholes (frusta in the 3D view) and images."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from demorec.view.paths import Paths, indexes, log_pose, send_poses
 from demorec.view.style import FRUSTUM, segment_colors
 
 _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
-_PACKETS_AT_ONCE, _PICTURES_AT_ONCE = 256, 64
+_PACKETS_AT_ONCE, _IMAGES_AT_ONCE = 256, 64
 _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
 
 
 def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
-    """Every camera with what it saw; the coded pictures are passed on as they are."""
+    """Every camera with what it saw; the coded images are passed on as they are."""
     if episode.scene is not None:
         _log_calibrations(recording, paths, episode, episode.scene)
         _log_segmentations(recording, paths, episode, episode.scene)
@@ -53,7 +53,7 @@ def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: Play
 
 
 def _send_video(recording: rr.RecordingStream, entity: str, frame_times: NDArray[np.int64], video: Video) -> None:
-    """Coded pictures as they are, each at its time."""
+    """Coded images as they are, each at its time."""
     if video.codec in _CODECS:
         recording.log(entity, rr.VideoStream(codec=_CODECS[video.codec]), static=True)
     for batch in batched(video.packets(), _PACKETS_AT_ONCE):
@@ -73,7 +73,7 @@ def _send_images(
     kind: type[rr.DepthImage] | type[rr.SegmentationImage] = rr.DepthImage,
 ) -> None:
     """Distances (H, W), uint16 millimetres or float32 metres, or numbers of segments, uint16; each at its time."""
-    for batch in batched(images, _PICTURES_AT_ONCE):
+    for batch in batched(images, _IMAGES_AT_ONCE):
         height, width = batch[0][1].shape
         is_float = batch[0][1].dtype == np.float32
         datatype = rr.ChannelDatatype.F32 if is_float else rr.ChannelDatatype.U16
@@ -91,8 +91,8 @@ def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Pla
     for camera in scene.cameras:
         if camera.name not in episode.segmentation:
             continue
-        pictures = timed(episode.time_ns, episode.segmentation[camera.name])
-        numbers = ((time_ns, np.searchsorted(known, values).astype(np.uint16)) for time_ns, values in pictures)
+        images = timed(episode.time_ns, episode.segmentation[camera.name])
+        numbers = ((time_ns, np.searchsorted(known, values).astype(np.uint16)) for time_ns, values in images)
         entity = paths.camera(camera.name, "/segmentation")
         _send_images(recording, entity, episode.time_ns, numbers, rr.SegmentationImage)
     if episode.segmentation:

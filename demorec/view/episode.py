@@ -18,7 +18,7 @@ from demorec.robots.robot import RobotSpec
 Distances = NDArray[np.uint16] | NDArray[np.float32]
 """(H, W) millimetres or metres."""
 Depth = Callable[[], Iterator[tuple[int, Distances]]]
-"""Reads the distances of a camera, each picture with its time_ns."""
+"""Reads the distances of a camera, each image with its time_ns."""
 Box = tuple[float, float, float, float]
 Statements = tuple[tuple[int, str, str], ...]
 """(time_ns, kind, sentence), each holds until the next one of its kind."""
@@ -41,7 +41,7 @@ class Curves:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Video:
-    """Coded pictures of a camera.
+    """Coded images of a camera.
 
     Attributes:
         codec: "h264", "h265", "av1" or "jpeg".
@@ -156,8 +156,8 @@ def sensed_curves(sensed: Mapping[str, Array], robot: RobotSpec, time_ns: NDArra
     return result
 
 
-def timed[Picture](time_ns: NDArray[np.int64], read: Callable[[], Iterator[Picture]]) -> Iterator[tuple[int, Picture]]:
-    """Pictures with their times (P,), as far as there are any."""
+def timed[Image](time_ns: NDArray[np.int64], read: Callable[[], Iterator[Image]]) -> Iterator[tuple[int, Image]]:
+    """Images with their times (P,), as far as there are any."""
     return zip(time_ns.tolist(), read(), strict=False)
 
 

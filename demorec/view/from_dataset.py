@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import RecordingError, in_words, resource_error
+from demorec.core.errors import RecordingError, describe_error, resource_error
 from demorec.core.geometry import Array, Pose
 from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.files import read_json
@@ -60,7 +60,7 @@ def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpiso
     try:
         episode = _read_episode(LeRobotDataset(root), episode_index)
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and odd values in its tables
-        unreadable = RecordingError(f"The dataset cannot be read ({in_words(error)}): {root}")
+        unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {root}")
         raise resource_error(error) or unreadable from error
     yield episode
 

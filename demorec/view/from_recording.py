@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.datasets.lerobot.recording import DatasetRecording
-from demorec.episode.episode import NO_PICTURE, Columns
+from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import ObservationRows
 from demorec.mcap import Recording, open_recording
@@ -26,7 +26,7 @@ from demorec.view.episode import Curves, PlayedEpisode, Video, sensed_curves, ti
 
 @contextmanager
 def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
-    """The episode of a recording; its pictures can be read until the context is left.
+    """The episode of a recording; its images can be read until the context is left.
 
     Raises:
         RecordingError: It cannot be read.
@@ -91,31 +91,31 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
         videos={
             camera: video_of(recording, camera, shown_at(columns, camera, time_ns))
             for camera in recording.cameras
-            if len(columns.picture_stamps[camera])
+            if len(columns.image_stamps[camera])
         },
         depth={
             camera: partial(timed, shown_at(columns, camera, time_ns), partial(recording.distances, camera))
             for camera in recording.depth_cameras
-            if len(columns.picture_stamps[camera])
+            if len(columns.image_stamps[camera])
         },
         statements=tuple((int(time_ns[frame]), "subtask", text) for frame, text in recording.subtasks),
     )
 
 
 def shown_at(columns: Columns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(P,) when each picture of a camera is shown: with the first frame that holds it, or the next one after it.
+    """(P,) when each image of a camera is shown: with the first frame that holds it, or the next one after it.
 
     Not at its own stamp, which may be of another clock.
     """
-    frames = np.flatnonzero(columns.pictures[camera] != NO_PICTURE)
-    numbers = np.maximum.accumulate(columns.pictures[camera][frames])
-    count = len(columns.picture_stamps[camera])
+    frames = np.flatnonzero(columns.images[camera] != NO_IMAGE)
+    numbers = np.maximum.accumulate(columns.images[camera][frames])
+    count = len(columns.image_stamps[camera])
     places = np.minimum(np.searchsorted(numbers, np.arange(count)), max(len(frames) - 1, 0))
     return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
 
 
 def video_of(recording: Recording | DatasetRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
-    """The coded pictures of a camera, each at its time (P,)."""
+    """The coded images of a camera, each at its time (P,)."""
 
     def packets() -> Iterator[tuple[int, bytes, bool]]:
         for packet in recording.packets(camera):

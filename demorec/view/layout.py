@@ -52,18 +52,18 @@ def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blu
 def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
     """The layout of two episodes in one recording: below /a and /b, the same streams over each other."""
     roots = [A, B]
-    pictures: list[rrb.View | rrb.Container] = []
+    images: list[rrb.View | rrb.Container] = []
     for name in [name for name in a.videos if name in b.videos]:
         views = [
             rrb.Spatial2DView(origin=paths.camera(name), contents=["$origin"], name=f"{name} {label}")
             for paths, label in zip(roots, "AB", strict=True)
         ]
-        pictures.append(rrb.Horizontal(*views))
+        images.append(rrb.Horizontal(*views))
     return _blueprint(
         a,
         is_alone=True,
         three_d=_view_3d(a, roots, "A (white) and B (orange)"),
-        cameras=pictures,
+        cameras=images,
         curves=_curve_views(roots, a),
         states=[rrb.StateTimelineView(origin="/", contents=[paths.phase for paths in roots], name="phases A, B")],
         texts=[
@@ -75,7 +75,7 @@ def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
             rrb.TimeSeriesView(origin=f"{DIFFERENCES}/distance", name="distance of A and B (mm)"),
             rrb.TimeSeriesView(origin=f"{DIFFERENCES}/joints", name="joint difference (rad)"),
         ],
-        pictures_share=1.5,
+        images_share=1.5,
     )
 
 
@@ -89,11 +89,11 @@ def _blueprint(
     states: list[rrb.View],
     texts: list[rrb.View],
     more_curves: list[rrb.View] | None = None,
-    pictures_share: float = 1.0,
+    images_share: float = 1.0,
 ) -> rrb.Blueprint:
     top: list[rrb.View | rrb.Container] = [] if three_d is None else [three_d]
     if three_d is not None and cameras:
-        shares = [3.0 - pictures_share, pictures_share]
+        shares = [3.0 - images_share, images_share]
         top = [rrb.Horizontal(three_d, rrb.Vertical(*cameras), column_shares=shares)]
     elif cameras:
         top = [rrb.Horizontal(*cameras)]

@@ -19,7 +19,7 @@ import platformdirs
 import trimesh
 from numpy.typing import NDArray
 
-from demorec.core.errors import DemorecError, RecordingError, in_words
+from demorec.core.errors import DemorecError, RecordingError, describe_error
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import mesh_path
@@ -150,7 +150,7 @@ def mesh_file(path: Path) -> SurfaceMesh:
                 return SurfaceMesh(**{name: arrays[name] for name in ("vertices", "normals", "triangles", "colors")})
         mesh = _read_mesh_file(path)
     except (OSError, ValueError, KeyError) as error:
-        raise RecordingError(f"The mesh cannot be read ({in_words(error)}): {path}") from error
+        raise RecordingError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
     _keep(cached, mesh)
     return mesh
 

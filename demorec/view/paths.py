@@ -49,7 +49,7 @@ class Paths:
         return f"{self.world}/ends/{name}"
 
     def camera(self, name: str, more: Literal["", "/depth", "/segmentation", "/boxes"] = "") -> str:
-        """A camera: its pose, its pinhole and its pictures; or more pictures of it, or boxes around what it sees."""
+        """A camera: its pose, its pinhole and its images; or more images of it, or boxes around what it sees."""
         return f"{self.world}/cameras/{name}{more}"
 
     def curves(self, name: str) -> str:

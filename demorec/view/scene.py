@@ -83,7 +83,7 @@ def log_words(
 
 
 def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
-    """Boxes around what each camera sees, frame by frame; their names, which would hide small pictures, on pointing."""
+    """Boxes around what each camera sees, frame by frame; their names, which would hide small images, on pointing."""
     names = sorted({name for frames in episode.boxes.values() for seen in frames.values() for name, _ in seen})
     colors = segment_colors(names)
     for camera, frames in episode.boxes.items():

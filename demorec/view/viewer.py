@@ -1,4 +1,4 @@
-"""Rerun's viewer: in a window, without a screen (for pictures), or in the browser."""
+"""Rerun's viewer: in a window, without a screen (for images), or in the browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rerun.experimental import ViewerClient
 
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.processes import start_program
-from demorec.core.replacing import PICTURE, written_whole
+from demorec.core.replacing import IMAGE, written_whole
 from demorec.view.paths import SECONDS
 from demorec.view.programs import free_port, has_display, viewer_environment, viewer_program
 
@@ -65,7 +65,7 @@ def why_it_ended(said: str) -> DemorecError:
     message = panic["message"] if panic else ""
     if message.startswith(_NO_DRIVER):
         return RecordingError(
-            f"Rerun's viewer found no Vulkan driver to draw a picture with ({message.rstrip('.')}): "
+            f"Rerun's viewer found no Vulkan driver to draw an image with ({message.rstrip('.')}): "
             "apt-get install mesa-vulkan-drivers brings one that needs no graphics card."
         )
     glyph = _NO_GLYPH.match(message)
@@ -149,7 +149,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         if len(listed) > 1:
             for shown in (*listed[1:], listed[0]):
                 self.client.set_location(shown.location)
-                self._picture()
+                self._image()
 
     @property
     def end(self) -> float:
@@ -158,7 +158,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         return max((line.end / 1e9 for line in first.timelines if line.name == SECONDS), default=0.0)
 
     def seek(self, seconds: float) -> None:
-        """Pause at a time of the episode, and wait until the picture has settled (videos are decoded)."""
+        """Pause at a time of the episode, and wait until the image has settled (videos are decoded)."""
         for recording in self.client.get_state().recordings:
             self.client.set_time(timeline=SECONDS, duration=seconds, play_state="paused", recording=recording.store_id)
         self._settle()
@@ -168,10 +168,10 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         deadline = time.monotonic() + _SETTLE_SECONDS
         while same < 3 and time.monotonic() < deadline:
             time.sleep(0.4)
-            now = self._picture()
+            now = self._image()
             before, same = now, same + 1 if now == before else 0
 
-    def _picture(self, *view: Any) -> bytes:
+    def _image(self, *view: Any) -> bytes:
         """PNG of the window or of one view; the client waits for some seconds only, too short for a busy machine."""
         deadline = time.monotonic() + _START_SECONDS
         while True:
@@ -182,20 +182,20 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
                     raise
                 if time.monotonic() > deadline:
                     raise RecordingError(
-                        f"Rerun's viewer has not drawn a picture within {_START_SECONDS:.0f} s: is the machine busy?"
+                        f"Rerun's viewer has not drawn an image within {_START_SECONDS:.0f} s: is the machine busy?"
                     ) from error
 
-    def save_picture(self, target: Path) -> None:
+    def save_image(self, target: Path) -> None:
         """The whole window as PNG, whole or not at all; OSError when it cannot be written."""
-        picture = self._picture()
-        with written_whole(target, PICTURE) as part:
-            part.write_bytes(picture)
+        image = self._image()
+        with written_whole(target, IMAGE) as part:
+            part.write_bytes(image)
 
-    def view_picture(self, name: str) -> bytes:
+    def view_image(self, name: str) -> bytes:
         """One view as PNG; KeyError when no view has that name."""
         for view in self.client.get_state().views:
             if view.name == name:
-                return self._picture(view.view_id)
+                return self._image(view.view_id)
         raise KeyError(name)
 
     def reports(self) -> list[tuple[str, Any]]:
@@ -226,7 +226,7 @@ def moment(seconds: float | None, end: float) -> float:
 
 
 def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | None, width: int, height: int) -> None:
-    """A picture of the viewer with .rrd files at a time of the first of them, by default its middle.
+    """An image of the viewer with .rrd files at a time of the first of them, by default its middle.
 
     Raises:
         ConfigError: The time is outside of it.
@@ -238,9 +238,9 @@ def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | Non
             if report.severity == "error":
                 raise RecordingError(f"The view {view!r} cannot be drawn: {report.summary}.")
         try:
-            viewer.save_picture(target)
+            viewer.save_image(target)
         except OSError as error:
-            raise RecordingError(f"The picture cannot be written ({error.strerror}): {target}") from error
+            raise RecordingError(f"The image cannot be written ({error.strerror}): {target}") from error
 
 
 @contextmanager

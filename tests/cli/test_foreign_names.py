@@ -84,7 +84,7 @@ def dataset_of(name: str, folder: Path, source: Path) -> Path:
 COMMANDS = {
     "info": ["info", "{path}"],
     "view": ["view", "{path}", "--save", "{out}/view.rrd"],
-    "check": ["check", "{path}", "--replay", "1", "--no-pictures"],
+    "check": ["check", "{path}", "--replay", "1", "--no-images"],
     "report": ["report", "{path}", "--out", "{path}.html"],
     "replay": ["replay", "{path}", "--out", "{out}/replayed"],
     "replay states": ["replay", "{path}", "--out", "{out}/replayed", "--states"],
@@ -126,7 +126,7 @@ def test_no_command_imports_what_a_file_names(
 
 @pytest.mark.parametrize(
     "words",
-    [["check", "--no-pictures", "--replay", "1"], ["replay"], ["render", "--workers", "1", "--out", "new.mcap"]],
+    [["check", "--no-images", "--replay", "1"], ["replay"], ["render", "--workers", "1", "--out", "new.mcap"]],
     ids=lambda words: words[0],
 )
 def test_allowed_modules_are_imported(

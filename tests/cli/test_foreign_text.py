@@ -141,7 +141,7 @@ def test_that_the_fields_are_printed_at_all(hostile: Path) -> None:
 def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
     path = hostile / name
     for arguments in (
-        ["info", path], ["info", path, "--json"], ["check", path, "--no-pictures", "--verbose"],
+        ["info", path], ["info", path, "--json"], ["check", path, "--no-images", "--verbose"],
         ["view", path, "--save", tmp_path / "view.rrd"], ["replay", path],
         ["report", path, "--out", tmp_path / "report.html"],
         ["export", "lerobot", hostile / "good.mcap", "--out", path, "--append", "--no-verify"],

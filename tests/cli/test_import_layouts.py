@@ -71,7 +71,7 @@ def test_a_suggestion_is_right_unedited_or_refused(
         for camera in recording.info.cameras:
             topic = camera.source.partition(",")[0]
             stamps = {note.header_ns for note in notes if note.topic == topic and note.header_ns <= times[-1]}
-            assert set(columns.picture_stamps[camera.name].tolist()) == stamps
+            assert set(columns.image_stamps[camera.name].tolist()) == stamps
 
 
 def _uncommented(text: str, field: str) -> str:

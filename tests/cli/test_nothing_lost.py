@@ -23,7 +23,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.replacing import (
-    PICTURE,
+    IMAGE,
     RECORDING,
     REPORT_MARK,
     RERUN_FILE,
@@ -370,7 +370,7 @@ def test_what_only_has_the_name_of_an_evaluation_is_kept(evaluation: Path, conte
     assert files_of(evaluation) == before
 
 
-# Commands that write recordings, and those that write pictures and .rrd files.
+# Commands that write recordings, and those that write images and .rrd files.
 
 
 def test_recover_replaces_recordings_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -455,8 +455,8 @@ def test_view_saves_over_rerun_files_only(place: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("command", ["view", "check"])
-def test_pictures_replace_pictures_only(place: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
-    flag = {"view": "--screenshot", "check": "--coverage-picture"}[command]
+def test_images_replace_images_only(place: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    flag = {"view": "--screenshot", "check": "--coverage-image"}[command]
     (place / "thesis.png").write_text("years of work")
     (place / "link.png").symlink_to(place / "alone.mcap")
     frame = place / "dataset" / "images" / "front" / "episode-000000" / "frame-000000.png"
@@ -487,7 +487,7 @@ def test_an_empty_file_is_not_replaced(place: Path, capsys: pytest.CaptureFixtur
         "hdf5": ("export", "hdf5", recording, "--out", target),
         "rrd": ("view", recording, "--save", target),
         "html": ("report", recording, "--out", target),
-        "png": ("check", place / "runs/run", "--coverage-picture", target),
+        "png": ("check", place / "runs/run", "--coverage-image", target),
     }
     for flags in ((), ("--overwrite",)):
         assert exit_code(*commands[suffix], *flags) == 2
@@ -536,7 +536,7 @@ def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixtu
 INSIDE: dict[str, Sequence[str]] = {
     "view --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/v.rrd", "dataset/data/v.rrd"),
     "view --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png"),
-    "check --coverage-picture": ("runs/other/episodes/v.png", "dataset/v.png"),
+    "check --coverage-image": ("runs/other/episodes/v.png", "dataset/v.png"),
     "report --out": ("runs/other/episodes/v.html", "dataset/v.html"),
     "render --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
     "replay --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),
@@ -583,7 +583,7 @@ def test_what_is_made_beside_the_parts_of_a_run_is_taken(place: Path) -> None:
 # The rule itself.
 
 
-@pytest.mark.parametrize("kind", [RECORDING, RERUN_FILE, PICTURE])
+@pytest.mark.parametrize("kind", [RECORDING, RERUN_FILE, IMAGE])
 def test_special_files_are_never_replaced(tmp_path: Path, kind: object) -> None:
     os.mkfifo(tmp_path / "fifo")  # reading it would wait for ever
     for target in (tmp_path / "fifo", Path("/dev/null")):
@@ -594,16 +594,16 @@ def test_special_files_are_never_replaced(tmp_path: Path, kind: object) -> None:
 def test_an_unfinished_file_of_somebody_else_is_kept(tmp_path: Path) -> None:
     part = tmp_path / ".x.png.demorec-part"
     part.write_text("mine")
-    with pytest.raises(ConfigError, match="not the unfinished"), written_whole(tmp_path / "x.png", PICTURE):
+    with pytest.raises(ConfigError, match="not the unfinished"), written_whole(tmp_path / "x.png", IMAGE):
         pass
     assert part.read_text() == "mine"
 
 
 def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
     target = tmp_path / "x.png"
-    with written_whole(target, PICTURE) as part:
+    with written_whole(target, IMAGE) as part:
         part.write_bytes(b"\x89PNG\r\n\x1a\n1")
-        with pytest.raises(ConfigError, match="Another process"), written_whole(target, PICTURE):
+        with pytest.raises(ConfigError, match="Another process"), written_whole(target, IMAGE):
             pass
     assert target.read_bytes().endswith(b"1")
 

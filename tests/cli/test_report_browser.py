@@ -47,7 +47,7 @@ def show(page: Chromium, path: Path, *, width: int, scheme: str) -> dict[str, An
         """JSON.stringify({
             title: document.title,
             episodes: document.querySelectorAll('article').length,
-            pictures: [...document.images].filter(image => image.naturalWidth > 0).length,
+            images: [...document.images].filter(image => image.naturalWidth > 0).length,
             foreign: [...document.querySelectorAll('p')].filter(p => p.textContent.startsWith('<script>')).length,
             wide: document.documentElement.scrollWidth > innerWidth,
             filters: !document.querySelector('.filters').hidden,
@@ -70,15 +70,15 @@ def test_a_browser_shows_it_and_nothing_foreign_runs(report: Path) -> None:
                 assert show(page, report, width=width, scheme=scheme) == {
                     "title": "cubes: demorec report",
                     "episodes": 6,
-                    "pictures": 6,
+                    "images": 6,
                     "foreign": 1,
                     "wide": False,
                     "filters": True,
                     "loaded": 0,
                 }
-                picture = pixels(page.picture())
-                assert num_colors(picture) > 100
-                brightness[scheme] = float(np.median(picture))
+                image = pixels(page.image())
+                assert num_colors(image) > 100
+                brightness[scheme] = float(np.median(image))
         assert brightness["dark"] < 60 < 200 < brightness["light"]
         page.value("document.querySelector('.filters button[value=failed]').click()")
         assert page.value("document.querySelector('output').textContent") == "1 of 6 shown"

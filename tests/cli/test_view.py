@@ -1,4 +1,4 @@
-"""`demorec view` through the real viewer: pictures of recordings, runs and datasets; the browser."""
+"""`demorec view` through the real viewer: images of recordings, runs and datasets; the browser."""
 
 from __future__ import annotations
 
@@ -132,13 +132,13 @@ def test_episodes_are_listed_in_the_order_given(run_folder: Path, tmp_path: Path
 def _check_views(viewer: HeadlessViewer, cameras: tuple[str, ...] = ("front", "wrist")) -> None:
     """No view complains; the 3D view shows robot, table and frusta; the cameras show their moving red square."""
     assert viewer.reports() == []
-    world = pixels(viewer.view_picture("pick_place: the world"))
+    world = pixels(viewer.view_image("pick_place: the world"))
     assert num_colors(world) > 100
     white = (world.min(axis=2) > 150).mean()
     assert white > 0.005, "no robot"
     for camera in cameras:
-        picture = pixels(viewer.view_picture(f"{camera} camera")).astype(int)
-        red = (picture[..., 0] > 150) & (picture[..., 1] < 90) & (picture[..., 2] < 90)
+        image = pixels(viewer.view_image(f"{camera} camera")).astype(int)
+        red = (image[..., 0] > 150) & (image[..., 1] < 90) & (image[..., 2] < 90)
         assert red.mean() > 0.01, f"no video of {camera}"
 
 
@@ -153,9 +153,9 @@ def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
         state = viewer.client.get_state()
         assert len(state.recordings) == 2
         assert {recording.current_time for recording in state.recordings} == {1_000_000_000}
-        before = pixels(viewer.view_picture("front camera"))
+        before = pixels(viewer.view_image("front camera"))
         viewer.seek(0.2)
-        after = pixels(viewer.view_picture("front camera"))
+        after = pixels(viewer.view_image("front camera"))
     assert before.shape == after.shape
     assert np.abs(before.astype(int) - after).mean() > 1.0, "the video stands still"
 
@@ -167,15 +167,15 @@ def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "
     """H.264 is left out: Rerun 0.41 takes it for BT.709 whatever the stream says."""
     need_vulkan()
     colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 40]], dtype=np.uint8)
-    picture = np.repeat(np.repeat(colours[np.newaxis], 80, axis=1), 240, axis=0)
+    image = np.repeat(np.repeat(colours[np.newaxis], 80, axis=1), 240, axis=0)
     info, frames, outcome = make_episode(num_frames=30, cameras=("front",), width=320, height=240)
     with EpisodeWriter(tmp_path / "episode_000000.mcap", info, video=VideoConfig(codec=codec)) as writer:
         for frame in frames:
-            writer.write(replace(frame, images={"front": replace(frame.images["front"], color=picture)}))
+            writer.write(replace(frame, images={"front": replace(frame.images["front"], color=image)}))
         writer.finish(outcome)
     with HeadlessViewer(*save_each(find_episodes([tmp_path]), tmp_path)) as viewer:
         viewer.seek(0.5)
-        shown = pixels(viewer.view_picture("front camera"))
+        shown = pixels(viewer.view_image("front camera"))
     height, width = shown.shape[:2]
     np.testing.assert_allclose(shown[height // 2, width // 8 :: width // 4][:4], colours, atol=4)
 
@@ -201,9 +201,9 @@ def test_a_screenshot_of_an_episode(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
     episode = run_folder / "episodes" / "episode_000000.mcap"
     assert view(episode, "--screenshot", tmp_path / "x.png", "--size", 900, 600) == 0
-    picture = pixels((tmp_path / "x.png").read_bytes())
-    assert picture.shape == (600, 900, 3)
-    assert num_colors(picture) > 200
+    image = pixels((tmp_path / "x.png").read_bytes())
+    assert image.shape == (600, 900, 3)
+    assert num_colors(image) > 200
 
 
 @pytest.mark.slow
@@ -245,8 +245,8 @@ def test_the_browser_shows_an_episode(run_folder: Path, tmp_path: Path) -> None:
         colors, red = 0, 0.0
         while time.monotonic() < deadline and (colors < 200 or red < 0.002):
             time.sleep(2)
-            picture = pixels(page.picture()).astype(int)
-            colors = num_colors(picture.astype(np.uint8))
-            red = float(((picture[..., 0] > 150) & (picture[..., 1] < 90) & (picture[..., 2] < 90)).mean())
+            image = pixels(page.image()).astype(int)
+            colors = num_colors(image.astype(np.uint8))
+            red = float(((image[..., 0] > 150) & (image[..., 1] < 90) & (image[..., 2] < 90)).mean())
     assert colors >= 200, "the page is empty"
     assert red >= 0.002, "neither the cube nor the videos are there"

@@ -68,12 +68,12 @@ def test_what_is_kept_is_kept_bit_for_bit(dataset: Path, tmp_path: Path) -> None
         statistics_are_exact(out)
 
 
-@pytest.mark.parametrize("pictures", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_results_are_clean(small: Path, tmp_path: Path, pictures: bool) -> None:
+@pytest.mark.parametrize("images", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_results_are_clean(small: Path, tmp_path: Path, images: bool) -> None:
     assert edit("trim", small, "--head", 3, "--out", tmp_path / "trimmed", "--decode") == 0
     assert edit("shuffle", small, "--seed", 3, "--out", tmp_path / "shuffled") == 0
     for name in ("trimmed", "shuffled"):
-        results = checked(tmp_path / name, "dataset", pictures=pictures).results
+        results = checked(tmp_path / name, "dataset", images=images).results
         assert not [result for result in results if result.level in ("fail", "warn")]
 
 

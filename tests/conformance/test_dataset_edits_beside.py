@@ -52,7 +52,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def failing(root: Path) -> set[str]:
     """Checks of the dataset that fail; motion and images of these episodes are made up."""
-    results = checked(root, "dataset", pictures=False).results
+    results = checked(root, "dataset", images=False).results
     assert {result.check: result.level for result in results}["dataset_sidecar"] == "pass"
     return {result.check for result in results if result.level == "fail" and result.check.startswith("dataset")}
 

@@ -1,4 +1,4 @@
-"""Questions, traces and boxes against pictures of segmentation, projection and the scene, each computed anew."""
+"""Questions, traces and boxes against images of segmentation, projection and the scene, each computed anew."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Truth:
-    """The recording, and pictures of segmentation by the names of the bodies."""
+    """The recording, and images of segmentation by the names of the bodies."""
 
     def __init__(self, run: Path) -> None:
         (path,) = (run / "episodes").glob("*.mcap")
@@ -57,7 +57,7 @@ class Truth:
         return np.asarray(self.labels[camera][frame] == self.number[body])
 
     def pixel(self, camera: str, frame: int, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(2,) px: X_camera = R^T (X - t), then K; beyond all pictures for a point behind the camera."""
+        """(2,) px: X_camera = R^T (X - t), then K; beyond all images for a point behind the camera."""
         intrinsics = next(item for item in self.scene.cameras if item.name == camera).intrinsics
         pose = self.columns.world_from_camera[camera][frame]
         x, y, z = rotation_from_quat(pose[3:]).T @ (point - pose[:3])
@@ -155,7 +155,7 @@ def test_answers_are_true(dataset: Path, truth: Truth) -> None:
             assert is_on or abs(x - u) > 0.05 * 128
 
 
-def test_a_picture_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
+def test_a_image_alone_is_asked_the_same(run: Path, dataset: Path) -> None:
     """What is prepared of two rows, as the verification does it, is what the dataset has there."""
     (frames,) = language_of(dataset)
     (path,) = (run / "episodes").glob("*.mcap")

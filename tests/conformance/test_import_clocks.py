@@ -45,7 +45,7 @@ def isaac(seconds: float = 3.0) -> bags.Notes:
 
     steps = [round(k * bags.NS / 60) + bags.EPOCH_NS for k in range(round(60 * seconds))]
     notes = bags.joints(STATE, ("a", "b"), steps) + bags.joints(ACTION, ("a", "b"), steps, shift=0.1)
-    notes += bags.jpeg_pictures(FRONT, steps[::2], 0, "front")
+    notes += bags.jpeg_images(FRONT, steps[::2], 0, "front")
     stamps = simulated([note.header_ns for note in notes])
     return bags.in_order(
         [
@@ -59,7 +59,7 @@ def real(seconds: float = 2.0, *, skew_s: float = 0.0) -> bags.Notes:
     """A robot with a camera, and a gripper without headers; those of the others are `skew_s` behind the recorder."""
     notes = bags.joints(STATE, ("a", "b"), bags.times(100, seconds, seed=1))
     notes += bags.joints(ACTION, ("a", "b"), bags.times(100, seconds, seed=2), shift=0.1)
-    notes += bags.jpeg_pictures(FRONT, bags.times(30, seconds, seed=3), 0, "front")
+    notes += bags.jpeg_images(FRONT, bags.times(30, seconds, seed=3), 0, "front")
     notes = [replace(note, header_ns=note.header_ns - round(skew_s * bags.NS)) for note in notes]
     notes += [
         bags.Note(
@@ -172,7 +172,7 @@ def test_the_suggested_rate(rate: float, imports: Imports, tmp_path: Path) -> No
     moments = [bags.EPOCH_NS + 1000 * round(k * 1e6 / rate + (2e6 if k > rate else 0)) for k in range(round(3 * rate))]
     notes = bags.joints(STATE, ("a", "b"), range(moments[0] - 10_000_000, moments[-1], 10_000_000))
     notes += bags.joints(ACTION, ("a", "b"), range(moments[0] - 10_000_000, moments[-1], 10_000_000))
-    notes += bags.jpeg_pictures(FRONT, moments, 0, "front")
+    notes += bags.jpeg_images(FRONT, moments, 0, "front")
     imports(bags.in_order(notes), "suggested")
     assert tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]["fps"] == round(rate)
 

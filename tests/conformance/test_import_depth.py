@@ -88,7 +88,7 @@ def body(kind: str, time_ns: int) -> dict[str, Any]:
 def notes_with_depth(kind: str, moments: Sequence[int]) -> bags.Notes:
     """A follower, a leader, a colour camera, and distances at its times."""
     notes = [note for note in bags.so101(0.6) if "joint_states" in note.topic]
-    notes += bags.raw_pictures(COLOR, moments, 1, "wrist_optical")
+    notes += bags.raw_images(COLOR, moments, 1, "wrist_optical")
     name = "CompressedImage" if kind in ("png", "rvl") else "Image"
     for moment in moments:
         fields = body(kind, moment)
@@ -103,7 +103,7 @@ def notes_with_depth(kind: str, moments: Sequence[int]) -> bags.Notes:
 
 
 def imported(kind: str, folder: Path, *, is_ros1: bool = False) -> tuple[Path, list[int]]:
-    """A run, and the moments of its depth pictures."""
+    """A run, and the moments of its depth images."""
     moments = bags.times(30, 0.6)
     bag = bags.write_mcap(notes_with_depth(kind, moments), folder / "bag.mcap", is_ros1=is_ros1)
     mapping = bag_mappings.write_mapping(MAPPING, folder / "robot.toml")
@@ -117,8 +117,8 @@ def recording_of(run: Path) -> Path:
 
 
 def held(recording: Recording, moments: Sequence[int]) -> list[int]:
-    """The moments of the pictures that a recording has."""
-    stamps: list[int] = recording.columns().picture_stamps["wrist_depth"].tolist()
+    """The moments of the images that a recording has."""
+    stamps: list[int] = recording.columns().image_stamps["wrist_depth"].tolist()
     assert set(stamps) <= set(moments)
     assert len(stamps) > 10
     return stamps
@@ -185,12 +185,12 @@ def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> Non
     run, moments = imported(kind, tmp_path)
     export(run, tmp_path / "d.hdf5", "hdf5", depth=True)
     with Recording(recording_of(run)) as recording, h5py.File(tmp_path / "d.hdf5") as file:
-        numbers = recording.columns().pictures["wrist_depth"]
+        numbers = recording.columns().images["wrist_depth"]
         stamps = held(recording, moments)
         stored = file["data/demo_0/obs/wrist_depth"][..., 0]
-    for number, picture in zip(numbers.tolist(), stored, strict=True):
+    for number, image in zip(numbers.tolist(), stored, strict=True):
         expected = metres(stamps[number]) if kind == "32FC1" else millimetres(stamps[number]) / np.float32(1000)
-        np.testing.assert_array_equal(picture, expected)
+        np.testing.assert_array_equal(image, expected)
     report = export(run, tmp_path / "dataset", depth=True)
     assert report.depth_left_out == ()
     with open_dataset_episode(tmp_path / "dataset", 0) as episode:
@@ -203,7 +203,7 @@ def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> Non
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "quantised": ({"format": "32FC1; compressedDepth png"}, "does not keep what was measured"),
     "cut off": ({"data": np.zeros(15, np.uint8)}, "cut off"),
-    "no picture": ({"data": np.zeros(400, np.uint8)}, "0x0 pixels"),
+    "no image": ({"data": np.zeros(400, np.uint8)}, "0x0 pixels"),
 }
 
 

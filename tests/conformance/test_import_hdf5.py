@@ -16,8 +16,8 @@ from support.hdf5 import (
     HEIGHT,
     ROBOMIMIC_LENGTHS,
     WIDTH,
+    images,
     jpeg,
-    pictures,
     write_aloha,
     write_robomimic,
 )
@@ -25,7 +25,7 @@ from support.hdf5 import (
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-from demorec.sources.frames_writer import FramesImport, Picture
+from demorec.sources.frames_writer import FramesImport, Image
 from demorec.sources.hdf5_arrays import StoredCamera
 from demorec.sources.hdf5_import import episode_places, import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
@@ -90,7 +90,7 @@ def test_numbers_of_robomimic_are_those_of_the_file(robomimic: tuple[Path, Path]
 
 
 def nearest(shown: NDArray[np.uint8], candidates: NDArray[np.uint8]) -> int:
-    """Which of some pictures one is like."""
+    """Which of some images one is like."""
     return int(np.abs(candidates.astype(int) - shown).mean(axis=(1, 2, 3)).argmin())
 
 
@@ -126,11 +126,11 @@ def test_aloha_becomes_a_run(is_compressed: bool, tmp_path: Path) -> None:
                 np.testing.assert_array_equal(columns.features[name], values)
             assert columns.time_ns.tolist() == [20_000_000 * row for row in range(8)]
             for k, camera in enumerate(ALOHA_CAMERAS):
-                given = pictures(8, 10 * k)
+                given = images(8, 10 * k)
                 if is_compressed:
                     packets = [packet.data for packet in recording.packets(camera)]
-                    assert packets == [jpeg(picture, 60 + 5 * row) for row, picture in enumerate(given)]
-                assert [nearest(picture, given) for picture in recording.images(camera)] == list(range(8))
+                    assert packets == [jpeg(image, 60 + 5 * row) for row, image in enumerate(given)]
+                assert [nearest(image, given) for image in recording.images(camera)] == list(range(8))
 
 
 @pytest.mark.parametrize("is_compressed", [False, True])
@@ -140,7 +140,7 @@ def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) ->
     result, run = imported(file, changes={dataset: f'{dataset}\ncolors = "bgr"'})
     assert result.cameras["cam_high"].endswith("with red and blue exchanged, encoded once")
     with Recording(recordings(run)[0]) as recording:
-        shown = recording.picture("cam_high", 0)
+        shown = recording.numbered_image("cam_high", 0)
     red, blue = shown[: HEIGHT // 2, : WIDTH // 2 - 4, 0].mean(), shown[: HEIGHT // 2, : WIDTH // 2 - 4, 2].mean()
     assert blue - red > 200  # the corner is red in the file
 
@@ -167,10 +167,10 @@ def test_interrupting_leaves_nothing_half_written(
     words = ("import", "hdf5", source, "--mapping", source.with_suffix(".toml"), "--out", tmp_path / "run")
     given, calls = StoredCamera._ordered, iter(range(1000))
 
-    def interrupted(self: StoredCamera, picture: NDArray[np.uint8]) -> Picture:
+    def interrupted(self: StoredCamera, image: NDArray[np.uint8]) -> Image:
         if next(calls) == 19:  # in the second episode
             raise KeyboardInterrupt
-        return given(self, picture)
+        return given(self, image)
 
     with monkeypatch.context() as patched:
         patched.setattr(StoredCamera, "_ordered", interrupted)
@@ -186,12 +186,12 @@ def test_interrupting_leaves_nothing_half_written(
 def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
     """Rows as h5py's `vlen_dtype` makes them, in one stretch and in chunks."""
     file = write_aloha(tmp_path / "episode_0.hdf5")
-    given = [jpeg(picture, 60 + 4 * row) for row, picture in enumerate(pictures(8, 3))]
+    given = [jpeg(image, 60 + 4 * row) for row, image in enumerate(images(8, 3))]
     with h5py.File(file, "r+") as opened:
-        images = opened["observations/images"]
+        group = opened["observations/images"]
         for camera, chunks in zip(ALOHA_CAMERAS, (None, (3,)), strict=True):
-            del images[camera]
-            stored = images.create_dataset(camera, (8,), h5py.vlen_dtype(np.uint8), chunks=chunks)
+            del group[camera]
+            stored = group.create_dataset(camera, (8,), h5py.vlen_dtype(np.uint8), chunks=chunks)
             for row, data in enumerate(given):
                 stored[row] = np.frombuffer(data, np.uint8)
     result, run = imported(file)
@@ -230,7 +230,7 @@ def test_rows_that_share_their_bytes_are_bounded(
 @pytest.mark.parametrize("kind", ["uint8", "float32", "float64", "float16", "255"])
 @pytest.mark.parametrize("has_channels_first", [False, True])
 def test_pixels_of_other_forms_are_those_of_the_usual_one(kind: str, has_channels_first: bool, tmp_path: Path) -> None:
-    """The same pictures as uint8 of height, width, RGB make the same recording, but for the words about it."""
+    """The same images as uint8 of height, width, RGB make the same recording, but for the words about it."""
     found = []
     for folder in ("usual", "other"):
         file = write_aloha(tmp_path / folder / "episode_0.hdf5")
@@ -287,12 +287,12 @@ def test_a_camera_is_left_out_only_where_the_mapping_says_so(
     name = "next_obs" if camera == "next" else f"obs/{camera}"
     with h5py.File(file, "r+") as opened:
         for demo, length in zip(DEMOS, ROBOMIMIC_LENGTHS, strict=True):
-            data = np.frombuffer(jpeg(pictures(1, 0)[0], 50), np.uint8)
+            data = np.frombuffer(jpeg(images(1, 0)[0], 50), np.uint8)
             values = {
                 "jpeg": np.tile(data, (length, 1)),
-                "pixels": pictures(length, 0),
+                "pixels": images(length, 0),
                 "depth": np.ones((length, HEIGHT, WIDTH), np.float32),
-                "floats": (pictures(length, 0) / 255).transpose(0, 3, 1, 2),
+                "floats": (images(length, 0) / 255).transpose(0, 3, 1, 2),
             }
             if camera in values:
                 opened[f"data/{demo}/obs/{camera}"] = values[camera]
@@ -345,7 +345,7 @@ def _without_masked(file: h5py.File) -> None:
     file["mask/train"] = np.array(["demo_7"], dtype="S")
 
 
-def _pictures(images: NDArray[np.generic]) -> Callable[[h5py.File], None]:
+def _images(images: NDArray[np.generic]) -> Callable[[h5py.File], None]:
     def change(file: h5py.File) -> None:
         del file["data/demo_1/obs/agentview_image"]
         file["data/demo_1/obs/agentview_image"] = images
@@ -381,10 +381,10 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "another width": (
         _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 8)))), "The episodes differ"
     ),
-    "pictures of integers": (_pictures(np.zeros((5, 8, 8, 3), np.int32)), "images are uint8 or floats"),
-    "pictures of one colour": (_pictures(np.zeros((5, 8, 8, 1), np.uint8)), "images are uint8 or floats"),
-    "pictures from -1": (_pictures(np.linspace(-1, 1, 5 * 192).reshape(5, 8, 8, 3)), "has pixels from -1 to 1, floats"),
-    "pictures of nan": (_pictures(np.full((5, 8, 8, 3), np.nan)), "not finite in row 0"),
+    "images of integers": (_images(np.zeros((5, 8, 8, 3), np.int32)), "images are uint8 or floats"),
+    "images of one colour": (_images(np.zeros((5, 8, 8, 1), np.uint8)), "images are uint8 or floats"),
+    "images from -1": (_images(np.linspace(-1, 1, 5 * 192).reshape(5, 8, 8, 3)), "has pixels from -1 to 1, floats"),
+    "images of nan": (_images(np.full((5, 8, 8, 3), np.nan)), "not finite in row 0"),
     "soft link": (_soft_link, "data/demo_1/actions is a link"),
     "external link": (_external_link, "data/demo_1 is a link"),
     "masked external link": (_external_link, "data/demo_1 is a link"),

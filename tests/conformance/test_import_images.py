@@ -67,7 +67,7 @@ def bag(cameras: Mapping[str, Sequence[int]], *, shift_s: float = 0.0, joints_ra
     notes = bags.joints(STATE, NAMES, moments) + bags.joints(ACTION, NAMES, moments, shift=0.1)
     notes = [replace(note, header_ns=note.header_ns + round(shift_s * bags.NS)) for note in notes]
     for number, (topic, times) in enumerate(cameras.items()):
-        notes += bags.jpeg_pictures(topic, times, number, topic.split("/")[1])
+        notes += bags.jpeg_images(topic, times, number, topic.split("/")[1])
     return bags.in_order(notes)
 
 
@@ -80,7 +80,7 @@ def imported(
     told = capsys.readouterr().out
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         columns = recording.columns()
-        shown = {name: columns.picture_stamps[name][columns.pictures[name]].tolist() for name in columns.pictures}
+        shown = {name: columns.image_stamps[name][columns.images[name]].tolist() for name in columns.images}
     return told, shown
 
 
@@ -130,8 +130,8 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
 def test_distances_registered_to_another_camera_are_no_swap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Stereo cameras give them in the coordinate frame of the left one."""
     left, right, depth = "/zed/left/image_rect_color", "/zed/right/image_rect_color", "/zed/depth/depth_registered"
-    notes = bag({left: ticks(15, 40)}) + bags.jpeg_pictures(right, ticks(15, 40), 1, "right")
-    for note in bags.raw_pictures(depth, ticks(15, 40), 2, "left"):
+    notes = bag({left: ticks(15, 40)}) + bags.jpeg_images(right, ticks(15, 40), 1, "right")
+    for note in bags.raw_images(depth, ticks(15, 40), 2, "left"):
         width, height = note.body["width"], note.body["height"]
         data = np.linspace(0.3, 2.0, width * height, dtype=np.float32).view(np.uint8)
         notes.append(bags.with_body(note, encoding="32FC1", step=4 * width, data=data))

@@ -31,7 +31,7 @@ NAME = CAMERA.removeprefix("observation.images.")
 
 @pytest.fixture(scope="module", params=[pytest.param("video", marks=pytest.mark.slow), "image", "long_gops"])
 def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
-    """How pictures are kept, a dataset by LeRobot, and the run that was made of it."""
+    """How images are kept, a dataset by LeRobot, and the run that was made of it."""
     from lerobot.configs import RGBEncoderConfig
 
     kind = str(request.param)
@@ -56,13 +56,13 @@ def columns_of(dataset: Path, name: str) -> NDArray[np.generic]:
 
 
 def shown_by(dataset: Path) -> list[NDArray[np.uint8]]:
-    """All pictures of the camera in order, by av."""
-    pictures: list[NDArray[np.uint8]] = []
+    """All images of the camera in order, by av."""
+    images: list[NDArray[np.uint8]] = []
     for file in sorted((dataset / "videos" / CAMERA).rglob("*.mp4")):
         with av.open(str(file)) as container:
             shown = (frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
-            pictures += [np.asarray(picture, dtype=np.uint8) for picture in shown]
-    return pictures
+            images += [np.asarray(image, dtype=np.uint8) for image in shown]
+    return images
 
 
 def test_numbers_and_tasks_are_those_of_the_dataset(imported: tuple[str, Path, Path]) -> None:
@@ -82,7 +82,7 @@ def test_numbers_and_tasks_are_those_of_the_dataset(imported: tuple[str, Path, P
             begin = end
 
 
-def test_pictures_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None:
+def test_images_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None:
     kind, dataset, run = imported
     found = []
     for file in recordings(run):
@@ -99,7 +99,7 @@ def test_pictures_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> No
     assert len(found) == len(expected) == sum(LENGTHS)
     if kind == "video":
         assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
-    else:  # each is nearer to its own picture than to that of the frame before, by far
+    else:  # each is nearer to its own image than to that of the frame before, by far
         for index in range(1, len(found)):
             own, before = (np.abs(found[index].astype(int) - expected[k]).mean() for k in (index, index - 1))
             assert own < before / 2, index
@@ -141,7 +141,7 @@ def test_exported_again_it_has_equal_numbers(imported: tuple[str, Path, Path], t
 
 
 def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
-    """All depth pictures of a camera in order, by av."""
+    """All depth images of a camera in order, by av."""
     codes: list[NDArray[np.uint16]] = []
     for file in sorted((dataset / "videos" / key).rglob("*.mp4")):
         with av.open(str(file)) as container:

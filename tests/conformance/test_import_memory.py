@@ -1,4 +1,4 @@
-"""What an import keeps of a long bag: the numbers and times of its messages, and of pictures next to nothing."""
+"""What an import keeps of a long bag: the numbers and times of its messages, and of images next to nothing."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ topic = "/front/image"
 """
 PER_JOINT_MESSAGE = 6 * 8 + 8 + 8 + 4
 """Six numbers, two times, a checksum."""
-PER_PICTURE = 4 * 8
+PER_IMAGE = 4 * 8
 """Two times, its number, two checksums, its kind."""
 
 
 def write_bag(path: Path, seconds: float, *, rate: float) -> Path:
     notes = bags.joints("/state", bags.SO101_JOINTS, bags.times(rate, seconds, seed=1))
     notes += bags.joints("/command", bags.SO101_JOINTS, bags.times(rate, seconds, seed=2))
-    picture = bags.jpeg(np.zeros((16, 16, 3), np.uint8))
+    image = bags.jpeg(np.zeros((16, 16, 3), np.uint8))
     notes += [
         bags.Note(
             topic="/front/image",
             type="sensor_msgs/msg/CompressedImage",
             log_ns=moment,
             header_ns=moment,
-            body={"format": "jpeg", "data": np.frombuffer(picture, np.uint8)},
+            body={"format": "jpeg", "data": np.frombuffer(image, np.uint8)},
         )
         for moment in bags.times(100, seconds, seed=3)
     ]
@@ -65,7 +65,7 @@ def test_what_is_kept_of_messages(tmp_path: Path) -> None:
         tracemalloc.stop()
         assert len(streams.sources["observation.state", 0]) == 100 * seconds
     # Arrays grow by an eighth more than is needed.
-    assert kept[2] - kept[1] < 6 * 100 * (2 * PER_JOINT_MESSAGE + PER_PICTURE) * 1.2
+    assert kept[2] - kept[1] < 6 * 100 * (2 * PER_JOINT_MESSAGE + PER_IMAGE) * 1.2
 
 
 @pytest.mark.slow
@@ -79,4 +79,4 @@ def test_the_peak_of_an_import_is_little_more_than_what_is_kept(tmp_path: Path) 
         import_bags([bag], tmp_path / "robot.toml", tmp_path / f"run{seconds}")
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[2] - peaks[1] < 240 * (2 * 200 * PER_JOINT_MESSAGE + 100 * PER_PICTURE) * 2
+    assert peaks[2] - peaks[1] < 240 * (2 * 200 * PER_JOINT_MESSAGE + 100 * PER_IMAGE) * 2

@@ -104,28 +104,28 @@ def test_numbers_and_ages(imported: tuple[Layout, bags.Notes, Path]) -> None:
                     assert columns.features[feature.name][row].tobytes() == numbers[: len(feature.names)].tobytes()
 
 
-def test_pictures(imported: tuple[Layout, bags.Notes, Path]) -> None:
+def test_images(imported: tuple[Layout, bags.Notes, Path]) -> None:
     layout, notes, run = imported
     with _open(run) as recording:
         columns = recording.columns()
         for camera, topic in layout.cameras.items():
             of_topic = bags.of_topic(notes, topic)
             packets = list(recording.packets(camera))
-            stamps = columns.picture_stamps[camera]
+            stamps = columns.image_stamps[camera]
             by_stamp = {note.header_ns: note for note in of_topic}
             for row, time_ns in enumerate(columns.time_ns.tolist()):
                 expected = max(
                     (note for note in of_topic if note.header_ns <= time_ns), key=lambda note: note.header_ns
                 )
-                assert stamps[columns.pictures[camera][row]] == expected.header_ns
+                assert stamps[columns.images[camera][row]] == expected.header_ns
             kept = next(row for row in recording.info.cameras if row.name == camera).kept
             for packet, stamp in zip(packets, stamps.tolist(), strict=True):
                 if kept:
                     assert packet.data == bytes(by_stamp[stamp].body["data"])
             if not kept:
-                pictures = list(recording.images(camera))
-                assert len(pictures) == len(stamps)
-                for shown, stamp in zip(pictures, stamps.tolist(), strict=True):
+                images = list(recording.images(camera))
+                assert len(images) == len(stamps)
+                for shown, stamp in zip(images, stamps.tolist(), strict=True):
                     given = by_stamp[stamp].body["data"].astype(float)
                     assert np.abs(shown.astype(float) - given).mean() < 12
 
@@ -171,10 +171,10 @@ def test_an_episode_that_lacks_something_is_dropped_where_the_mapping_says_so(tm
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "mono8", "bgra8", "bayer_rggb8"])
-def test_raw_pictures_of_other_encodings(encoding: str, tmp_path: Path) -> None:
-    from demorec.sources.picture_messages import raw_picture
+def test_raw_images_of_other_encodings(encoding: str, tmp_path: Path) -> None:
+    from demorec.sources.image_messages import raw_image
 
-    image = bags.picture(bags.EPOCH_NS, 1)
+    image = bags.image(bags.EPOCH_NS, 1)
     smooth = np.broadcast_to(np.linspace(0, 255, bags.WIDTH).astype(np.uint8)[:, None], (bags.HEIGHT, bags.WIDTH, 3))
     given = {
         "bgr8": image[:, :, ::-1],
@@ -191,10 +191,10 @@ def test_raw_pictures_of_other_encodings(encoding: str, tmp_path: Path) -> None:
         "step": padded.shape[1],
         "data": padded.reshape(-1),
     }
-    assert np.abs(raw_picture(values).astype(int) - expected).max() <= (5 if "bayer" in encoding else 0)
+    assert np.abs(raw_image(values).astype(int) - expected).max() <= (5 if "bayer" in encoding else 0)
 
 
-def test_a_picture_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
+def test_a_image_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(buffer, format="PNG")
     good, bad = bytearray(buffer.getvalue()), bytearray(buffer.getvalue())
@@ -212,7 +212,7 @@ def test_a_picture_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
     with _open(tmp_path / "run") as recording:
         assert (
             bags.of_topic(notes, "/follower/cam_front/image_raw/compressed")[12].header_ns
-            not in recording.columns().picture_stamps["front"]
+            not in recording.columns().image_stamps["front"]
         )
 
 
@@ -247,12 +247,12 @@ def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) ->
 
     notes, folder = trossen_dataset
     dataset = LeRobotDataset("local/x", root=folder, video_backend="pyav")
-    pictures = bags.of_topic(notes, "/cameras/cam_high/image")
+    images = bags.of_topic(notes, "/cameras/cam_high/image")
     arms = [bags.of_topic(notes, f"{arm}/joints/state")[0].header_ns for arm in ("leader", "follower")]
-    pictures = [picture for picture in pictures if picture.header_ns >= max(arms)]
-    assert len(dataset) == len(pictures) < SECONDS * 30
+    images = [image for image in images if image.header_ns >= max(arms)]
+    assert len(dataset) == len(images) < SECONDS * 30
     for row in range(len(dataset)):
-        time_ns = pictures[row].header_ns
+        time_ns = images[row].header_ns
         item = dataset[row]
         for feature, arm in (("observation.state", "follower"), ("action", "leader")):
             told = [note for note in bags.of_topic(notes, f"{arm}/joints/state") if note.header_ns <= time_ns]
@@ -272,7 +272,7 @@ def test_kept_packets_are_in_the_dataset_byte_for_byte(trossen_dataset: tuple[ba
 
 
 def _slices(packet: bytes) -> list[bytes]:
-    """The coded pictures of an access unit, without parameter sets and the lengths of start codes."""
+    """The coded images of an access unit, without parameter sets and the lengths of start codes."""
     units = [unit.rstrip(b"\0") for unit in packet.split(b"\0\0\1")[1:]]
     return [unit for unit in units if unit[0] & 31 in (1, 5)]
 
@@ -292,7 +292,7 @@ def test_a_video_that_begins_between_keyframes(tmp_path: Path) -> None:
     assert "first 7 images" in finding.text
     with _open(tmp_path / "run") as recording:
         assert next(iter(recording.packets("high"))).is_keyframe
-        assert len(list(recording.images("high"))) == len(recording.columns().picture_stamps["high"])
+        assert len(list(recording.images("high"))) == len(recording.columns().image_stamps["high"])
 
 
 def test_a_video_without_keyframes_is_refused(tmp_path: Path) -> None:

@@ -45,8 +45,8 @@ def write_video(path: Path, length: int) -> None:
         stream.width = stream.height = 64
         stream.pix_fmt = "yuv420p"
         for number in range(length):
-            picture = np.full((64, 64, 3), 20 * number + 10, np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            image = np.full((64, 64, 3), 20 * number + 10, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
 
 

@@ -1,4 +1,4 @@
-"""Video that stays as it is though episodes begin between its keyframes: every picture is that of the bag's stream.
+"""Video that stays as it is though episodes begin between its keyframes: every image is that of the bag's stream.
 
 What the bag shows is decoded here by PyAV from the stream's beginning; the episodes are cut out of its middle.
 """
@@ -34,7 +34,7 @@ CUTS = ((0.7, 1.9), (2.2, 4.2))
 """Seconds; both between keyframes, which come every two thirds of a second."""
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
-Pictures = list[NDArray[np.uint8]]
+Images = list[NDArray[np.uint8]]
 
 
 def _pixels(frame: av.VideoFrame) -> NDArray[np.uint8]:
@@ -64,13 +64,13 @@ def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def expected(notes: bags.Notes, run: Path) -> list[Pictures]:
-    """Episode -> the picture of each frame, out of the whole stream."""
+def expected(notes: bags.Notes, run: Path) -> list[Images]:
+    """Episode -> the image of each frame, out of the whole stream."""
     of_topic = bags.of_topic(notes, TOPIC)
     stream = io.BytesIO(b"".join(bytes(note.body["data"]) for note in of_topic))
     with av.open(stream, "r", format="h264") as container:
         shown = [_pixels(frame) for frame in container.decode(video=0)]
-    by_stamp = {note.header_ns: picture for note, picture in zip(of_topic, shown, strict=True)}
+    by_stamp = {note.header_ns: image for note, image in zip(of_topic, shown, strict=True)}
     found = []
     for path in sorted((run / "episodes").glob("*.mcap")):
         with Recording(path) as recording:
@@ -78,55 +78,55 @@ def expected(notes: bags.Notes, run: Path) -> list[Pictures]:
     return found
 
 
-def shown_by(dataset: Path) -> list[Pictures]:
-    """Episode -> its pictures, each found by its time in the file, which PyAV decodes as a whole."""
+def shown_by(dataset: Path) -> list[Images]:
+    """Episode -> its images, each found by its time in the file, which PyAV decodes as a whole."""
     found = []
     for row in episode_rows(dataset):
         name = f"chunk-{row[f'videos/{KEY}/chunk_index']:03d}/file-{row[f'videos/{KEY}/file_index']:03d}.mp4"
         with av.open(str(dataset / "videos" / KEY / name)) as container:
-            pictures = {round((frame.time or 0) * 30): _pixels(frame) for frame in container.decode(video=0)}
+            images = {round((frame.time or 0) * 30): _pixels(frame) for frame in container.decode(video=0)}
         first, end = (round(row[f"videos/{KEY}/{edge}_timestamp"] * 30) for edge in ("from", "to"))
         assert end - first == row["length"]
-        found.append([pictures[number] for number in range(first, end)])
+        found.append([images[number] for number in range(first, end)])
     return found
 
 
-def assert_equal(found: list[Pictures], expected: list[Pictures]) -> None:
-    assert [len(pictures) for pictures in found] == [len(pictures) for pictures in expected]
+def assert_equal(found: list[Images], expected: list[Images]) -> None:
+    assert [len(images) for images in found] == [len(images) for images in expected]
     for one, other in zip(found, expected, strict=True):
         assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def test_whole_episodes_between_keyframes(expected: list[Pictures], dataset: Path) -> None:
+def test_whole_episodes_between_keyframes(expected: list[Images], dataset: Path) -> None:
     # No frame is left out to begin with a keyframe, and none is coded anew.
-    assert [len(pictures) for pictures in expected] == pytest.approx([30 * (end - begin) for begin, end in CUTS], abs=1)
+    assert [len(images) for images in expected] == pytest.approx([30 * (end - begin) for begin, end in CUTS], abs=1)
     assert_equal(shown_by(dataset), expected)
     (first, second) = (row[f"videos/{KEY}/from_timestamp"] * 30 for row in episode_rows(dataset))
     assert 0 < first < GOP
     assert 0 < second - first - len(expected[0]) < GOP
 
 
-def test_single_pictures(expected: list[Pictures], dataset: Path) -> None:
+def test_single_images(expected: list[Images], dataset: Path) -> None:
     found_in = LeRobotDataset(dataset)
-    for number, pictures in enumerate(expected):
-        frames = [0, 1, GOP, len(pictures) - 1]
+    for number, images in enumerate(expected):
+        frames = [0, 1, GOP, len(images) - 1]
         for frame, found in zip(frames, DatasetRecording(found_in, number).images_at("high", frames), strict=True):
-            assert np.array_equal(found, pictures[frame])
+            assert np.array_equal(found, images[frame])
 
 
 @pytest.mark.slow
-def test_lerobot_shows_them(expected: list[Pictures], dataset: Path) -> None:
+def test_lerobot_shows_them(expected: list[Images], dataset: Path) -> None:
     from lerobot.datasets import LeRobotDataset
 
     opened = LeRobotDataset("local/kept", root=dataset, video_backend="pyav", return_uint8=True)
-    pictures = [picture for episode in expected for picture in episode]
-    assert len(opened) == len(pictures)
-    for number in (0, 1, 17, len(expected[0]) - 1, len(expected[0]), len(expected[0]) + 5, len(pictures) - 1):
-        assert np.array_equal(opened[number][KEY].numpy().transpose(1, 2, 0), pictures[number])
+    images = [image for episode in expected for image in episode]
+    assert len(opened) == len(images)
+    for number in (0, 1, 17, len(expected[0]) - 1, len(expected[0]), len(expected[0]) + 5, len(images) - 1):
+        assert np.array_equal(opened[number][KEY].numpy().transpose(1, 2, 0), images[number])
 
 
 @pytest.mark.slow
-def test_lerobots_tools_keep_them(expected: list[Pictures], dataset: Path, run: Path, tmp_path: Path) -> None:
+def test_lerobots_tools_keep_them(expected: list[Images], dataset: Path, run: Path, tmp_path: Path) -> None:
     from lerobot.datasets import LeRobotDataset
     from lerobot.datasets.aggregate import aggregate_datasets
     from lerobot.datasets.dataset_tools import delete_episodes
@@ -136,7 +136,7 @@ def test_lerobots_tools_keep_them(expected: list[Pictures], dataset: Path, run: 
     aggregate_datasets(["local/1", "local/2"], "local/all", roots=roots, aggr_root=tmp_path / "merged")
     assert_equal(shown_by(tmp_path / "merged"), [*expected, *expected])
     opened = LeRobotDataset("local/1", root=dataset)
-    delete_episodes(opened, [0], output_dir=tmp_path / "left", repo_id="local/left")  # which codes pictures anew
+    delete_episodes(opened, [0], output_dir=tmp_path / "left", repo_id="local/left")  # which codes images anew
     ((*left,),) = shown_by(tmp_path / "left")
     assert len(left) == len(expected[1])
     differences = [np.abs(a.astype(float) - b).mean() for a, b in zip(left, expected[1], strict=True)]
@@ -144,7 +144,7 @@ def test_lerobots_tools_keep_them(expected: list[Pictures], dataset: Path, run: 
     assert max(differences) < 4 < np.median(moved)
 
 
-def test_appended_they_stay(expected: list[Pictures], run: Path, tmp_path: Path) -> None:
+def test_appended_they_stay(expected: list[Images], run: Path, tmp_path: Path) -> None:
     files = sorted((run / "episodes").glob("*.mcap"))
     export(files[1], tmp_path / "d")
     export(files[0], tmp_path / "d", append=True)
@@ -160,22 +160,22 @@ def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path
             length = given.columns().num_frames
             slices = [[packet.data[packet.data.rfind(b"\0\0\1") :] for packet in packets] for packets in (ours, theirs)]
             assert slices[0] == slices[1][: len(ours)]
-            assert len(ours) - length == found.columns().pictures["high"][0] > 0
+            assert len(ours) - length == found.columns().images["high"][0] > 0
             times = found.columns().time_ns
-            assert np.array_equal(found.columns().picture_stamps["high"][-length:], times)
+            assert np.array_equal(found.columns().image_stamps["high"][-length:], times)
     export(tmp_path / "run", tmp_path / "d")
     assert dataset_digest(tmp_path / "d") == dataset_digest(dataset)
 
 
-def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Pictures], dataset: Path) -> None:
+def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Images], dataset: Path) -> None:
     found = LeRobotDataset(dataset)
-    for number, (place, pictures) in enumerate(zip(found.places, expected, strict=True)):
+    for number, (place, images) in enumerate(zip(found.places, expected, strict=True)):
         packets = list(DatasetRecording(found, number).packets("high"))
         assert packets[0].is_keyframe
         assert [packet.frame_index for packet in packets] == list(range(len(packets)))
         with av.open(io.BytesIO(b"".join(packet.data for packet in packets)), "r", format="h264") as container:
             shown = [_pixels(frame) for frame in container.decode(video=0)]
-        assert_equal([shown[len(packets) - place.length :]], [pictures])
+        assert_equal([shown[len(packets) - place.length :]], [images])
         with open_dataset_episode(dataset, place.episode_index) as episode:
             times = np.array([time_ns for time_ns, _, _ in episode.videos["high"].packets()])
         assert len(times) == len(packets)
@@ -187,7 +187,7 @@ def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Pict
 def test_checks_take_them_and_nothing_else(dataset: Path, tmp_path: Path) -> None:
     for name in ("dataset_videos", "dataset_sidecar"):
         assert level_of(dataset, name, "dataset") == "pass"
-    # An episode that is off by a picture has a gap of the right kind in front, but not the pictures of its digest.
+    # An episode that is off by an image has a gap of the right kind in front, but not the images of its digest.
     for check, episode, shift in (("dataset_sidecar", 1, -1), ("dataset_sidecar", 1, 1), ("dataset_videos", 0, -GOP)):
         spoilt = tmp_path / f"{check}{shift}"
         shutil.copytree(dataset, spoilt)

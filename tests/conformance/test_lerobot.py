@@ -51,12 +51,12 @@ def open_dataset(root: Path, **arguments: Any) -> Any:
     return LeRobotDataset("local/test", root=root, **{"video_backend": "pyav", "return_uint8": True, **arguments})
 
 
-def recorded_pictures(run: Path, episode: int) -> dict[str, list[np.ndarray[Any, Any]]]:
+def recorded_images(run: Path, episode: int) -> dict[str, list[np.ndarray[Any, Any]]]:
     with Recording(run / "episodes" / f"episode_{episode:06d}.mcap") as recording:
         return {camera: list(recording.images(camera)) for camera in CAMERAS}
 
 
-def picture(item: dict[str, Any], camera: str) -> np.ndarray[Any, Any]:
+def image(item: dict[str, Any], camera: str) -> np.ndarray[Any, Any]:
     return np.asarray(item[f"observation.images.{camera}"].numpy().transpose(1, 2, 0))
 
 
@@ -71,7 +71,7 @@ def test_lerobot_reads_every_frame_as_it_was_recorded(run: Path, dataset: Path, 
     assert (found.num_episodes, found.num_frames, found.fps) == (len(LENGTHS), sum(LENGTHS), 30)
     row = 0
     for episode, length in enumerate(LENGTHS):
-        pictures = recorded_pictures(run, episode)
+        images = recorded_images(run, episode)
         _, frames, _ = make_episode(num_frames=length, episode_index=episode)
         for t in range(length):
             item = found[row]
@@ -85,7 +85,7 @@ def test_lerobot_reads_every_frame_as_it_was_recorded(run: Path, dataset: Path, 
             assert item["task"] == "pick up the red cube and place it on the green target"
             assert bool(item["next.done"]) is bool(item["next.success"]) is (t == length - 1)
             for camera in CAMERAS:
-                assert np.array_equal(picture(item, camera), pictures[camera][t]), (episode, t, camera)
+                assert np.array_equal(image(item, camera), images[camera][t]), (episode, t, camera)
             row += 1
 
 
@@ -96,14 +96,14 @@ def test_some_episodes_only(run: Path, dataset: Path) -> None:
     for row, (episode, t) in ((0, (1, 0)), (14, (1, 14)), (15, (4, 0)), (45, (4, 30))):
         item = found[row]
         assert (int(item["episode_index"]), int(item["frame_index"])) == (episode, t)
-        assert np.array_equal(picture(item, "wrist"), recorded_pictures(run, episode)["wrist"][t])
+        assert np.array_equal(image(item, "wrist"), recorded_images(run, episode)["wrist"][t])
 
 
 def test_windows_in_time_stop_at_the_ends_of_an_episode(run: Path, dataset: Path) -> None:
     steps = [-0.1, 0.0, 1 / 30, 0.2]
     found = open_dataset(dataset, delta_timestamps={"action": steps, "observation.images.front": steps})
     first, last = 20, 34  # of episode 1
-    pictures = recorded_pictures(run, 1)["front"]
+    images = recorded_images(run, 1)["front"]
     for row in (first, 27, last):
         item = found[row]
         wanted = [row - 3, row, row + 1, row + 6]
@@ -113,7 +113,7 @@ def test_windows_in_time_stop_at_the_ends_of_an_episode(run: Path, dataset: Path
             held = min(max(index, first), last)
             assert np.array_equal(item["action"][k].numpy(), found.hf_dataset[held]["action"].numpy())
             image = item["observation.images.front"][k].numpy().transpose(1, 2, 0)
-            assert np.array_equal(image, pictures[held - first])
+            assert np.array_equal(image, images[held - first])
 
 
 @pytest.mark.slow
@@ -137,13 +137,13 @@ def test_statistics_equal_those_of_the_decoded_data(dataset: Path) -> None:
         assert np.allclose(stats[name]["mean"], values.mean(axis=0), rtol=1e-9, atol=1e-12)
         assert np.allclose(stats[name]["std"], values.std(axis=0), rtol=1e-9, atol=1e-12)
         assert stats[name]["count"] == [sum(LENGTHS)]
-    pictures = [found[row] for row in range(sum(LENGTHS))]
+    images = [found[row] for row in range(sum(LENGTHS))]
     for camera in CAMERAS:
         key = f"observation.images.{camera}"
-        pixels = np.stack([picture(item, camera) for item in pictures]).reshape(-1, 3) / 255
+        pixels = np.stack([image(item, camera) for item in images]).reshape(-1, 3) / 255
         shaped = {what: np.asarray(value).reshape(-1) for what, value in stats[key].items()}
         assert stats[key]["mean"].shape == (3, 1, 1)
-        # Counted before coding, on every other picture.
+        # Counted before coding, on every other image.
         assert np.abs(shaped["mean"] - pixels.mean(axis=0)).max() < 0.01
         assert np.abs(shaped["std"] - pixels.std(axis=0)).max() < 0.02
         for what in ("q10", "q50", "q90"):
@@ -216,7 +216,7 @@ def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> Non
     aggregate_datasets(["a/a", "b/b"], "c/c", roots=[dataset, other], aggr_root=tmp_path / "both")
     found = assert_readable(tmp_path / "both", (*LENGTHS, *LENGTHS[:2]))
     for row, episode, t in ((sum(LENGTHS) + 3, 0, 3), (sum(LENGTHS) + 20 + 14, 1, 14), (33, 1, 13)):
-        assert np.array_equal(picture(found[row], "wrist"), recorded_pictures(run, episode)["wrist"][t])
+        assert np.array_equal(image(found[row], "wrist"), recorded_images(run, episode)["wrist"][t])
     merged = merge_datasets([open_dataset(other), open_dataset(dataset)], "d/d", tmp_path / "merged")
     assert merged.num_episodes == len(LENGTHS) + 2
     assert_readable(tmp_path / "merged", (*LENGTHS[:2], *LENGTHS))
@@ -296,7 +296,7 @@ def test_lerobot_goes_on_recording_and_then_demorec_appends(run: Path, tmp_path:
     assert (report.num_episodes, report.new_episodes) == (6, 2)
     assert report.digest == dataset_digest(root)
     found = assert_readable(root, (20, 15, 11, 11, 17, 9))
-    assert np.array_equal(picture(found[35 + 22 + 5], "front"), recorded_pictures(run, 2)["front"][5])
+    assert np.array_equal(image(found[35 + 22 + 5], "front"), recorded_images(run, 2)["front"][5])
     assert found[40]["task"] == "another task"
     values = np.array(data_table(root).column("action").to_pylist(), dtype=np.float64)
     assert np.allclose(found.meta.stats["action"]["q50"], np.quantile(values, 0.5, axis=0), rtol=1e-12)
@@ -318,18 +318,16 @@ def test_append_to_a_dataset_that_lerobot_wrote_from_the_start(run: Path, tmp_pa
     theirs = LeRobotDataset.create("local/test", 30, features, root=root, robot_type="panda", rgb_encoder=encoder)
     rng = np.random.default_rng(0)
     for t in range(13):
-        image = np.full((48, 64, 3), 10 * t, dtype=np.uint8)
+        grey = np.full((48, 64, 3), 10 * t, dtype=np.uint8)
         vector = rng.normal(size=8).astype(np.float32)
-        theirs.add_frame(
-            {"action": vector, "observation.state": vector, "observation.images.front": image, "task": "t"}
-        )
+        theirs.add_frame({"action": vector, "observation.state": vector, "observation.images.front": grey, "task": "t"})
     theirs.save_episode()
     theirs.finalize()
     report = export(run, root, episodes="1", append=True)
     assert report.num_frames == 28
     assert set(report.left_out) >= {"observation.images.wrist", "next.done"}
     found = assert_readable(root, (13, 15))
-    assert np.array_equal(picture(found[13 + 14], "front"), recorded_pictures(run, 1)["front"][14])
+    assert np.array_equal(image(found[13 + 14], "front"), recorded_images(run, 1)["front"][14])
 
 
 @pytest.mark.slow
@@ -354,11 +352,11 @@ def test_rerun_opens_the_folder(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inputs", ["pictures", "privileged"])
+@pytest.mark.parametrize("inputs", ["images", "privileged"])
 def test_a_policy_trains_on_it(run: Path, tmp_path: Path, inputs: str) -> None:
     root = tmp_path / "d"
     export(run, root, privileged=inputs == "privileged", action="joint_increment")
-    if inputs == "privileged":  # ACT takes what there is: without pictures it learns from the state alone
+    if inputs == "privileged":  # ACT takes what there is: without images it learns from the state alone
         root = tmp_path / "blind"
         blind = make_run(tmp_path / "run", LENGTHS, cameras=())
         export(blind, root, privileged=True, action="joint_increment")

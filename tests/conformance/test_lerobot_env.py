@@ -97,8 +97,8 @@ def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> No
     names = [name for name in info if name.startswith("observation.") or name == "action"]
     assert {name: list(found[name].shape) for name in names} == {name: info[name]["shape"] for name in names}
     cameras = DemorecEnvConfig(cameras=["front"], observation_width=64, observation_height=48)
-    pictures = env_to_policy_features(cameras)["observation.images.front"]
-    assert pictures.shape == (3, 48, 64)
+    images = env_to_policy_features(cameras)["observation.images.front"]
+    assert images.shape == (3, 48, 64)
     assert "environment_state" not in cameras.features
 
 

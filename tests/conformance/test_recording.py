@@ -133,10 +133,10 @@ def test_mcap_decodes_what_was_written(path: Path, episode: tuple[EpisodeInfo, l
     assert labels[0] == "background"
     assert labels[(2 + 1) * 256 + 5] == "panda/panda_link5"
     for frame, (_, content) in zip(frames, decoded["/camera/front/segmentation"], strict=True):
-        picture = cv2.imdecode(np.frombuffer(bytes(content.data), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-        assert picture is not None
-        assert picture.dtype == np.uint16
-        assert ((picture == 0) == (present(frame.images["front"].segmentation) == -1)).all()
+        image = cv2.imdecode(np.frombuffer(bytes(content.data), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        assert image.dtype == np.uint16
+        assert ((image == 0) == (present(frame.images["front"].segmentation) == -1)).all()
 
 
 def test_mcap_decodes_the_numbers_stamps_and_images_of_an_external_one(external: Path) -> None:
@@ -158,7 +158,7 @@ def test_mcap_decodes_the_numbers_stamps_and_images_of_an_external_one(external:
     rows = [content for _, content in decoded["/frames"]]
     assert rows[0].layout.dim[0].label == "observation.state,action,observation.force,top,wrist"
     assert rows[0].data[3:] == [0, -1]
-    for (stamp_ns, _), (time_ns, content) in zip(EXTERNAL.pictures["top"], decoded["/camera/top/h264"], strict=True):
+    for (stamp_ns, _), (time_ns, content) in zip(EXTERNAL.images["top"], decoded["/camera/top/h264"], strict=True):
         assert time_ns == stamp_ns == content.header.stamp.sec * 10**9 + content.header.stamp.nanosec
     assert decoded["/camera/top/camera_info"][0][1].k[0] == 60.0
     assert decoded["/robot_description"][0][1].data == URDF
@@ -221,8 +221,8 @@ def test_ffmpeg_decodes_the_bytes_of_the_topic(tmp_path: Path, codec: Codec) -> 
     assert len(packets) == NUM_FRAMES
     name = {"h264": "h264", "av1": "obu", "jpeg": "mjpeg"}[codec]
     with av.open(io.BytesIO(b"".join(packets)), "r", format=name) as container:
-        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert [frame_number(picture.astype(np.uint8)) for picture in pictures] == list(range(NUM_FRAMES))
+        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert [frame_number(image.astype(np.uint8)) for image in images] == list(range(NUM_FRAMES))
 
 
 def cdr_compressed_image(message: bytes) -> bytes:
@@ -231,7 +231,7 @@ def cdr_compressed_image(message: bytes) -> bytes:
         at = message.find(code, 30)
         if at > 0 and int.from_bytes(message[at - 4 : at], "little") == len(message) - at:
             return message[at:]
-    raise AssertionError("no picture in the message")
+    raise AssertionError("no image in the message")
 
 
 def protobuf_field(message: bytes, number: int) -> bytes:

@@ -31,18 +31,18 @@ def episode(index: int, *, success: bool | None, reason: str = "") -> Episode:
     """Twelve frames with colours, whole millimetres and metres, all of which every frame has an image of."""
     given = make_external(cameras=(TOP,), num_frames=12, episode_index=index, success=success)
     random = np.random.default_rng(index)
-    stamps = [stamp for stamp, _ in given.pictures["top"]]
+    stamps = [stamp for stamp, _ in given.images["top"]]
     near = [(stamp, random.integers(0, 9000, (24, 32)).astype(np.uint16)) for stamp in stamps]
     far = [(stamp, (values / 1000).astype(np.float32)) for stamp, values in near]
     shown = dict.fromkeys(("top", "near_depth", "far"))
     frames = [
-        replace(frame, pictures=dict.fromkeys(shown, number), subtask=SUBTASKS.get(number, ""))
+        replace(frame, images=dict.fromkeys(shown, number), subtask=SUBTASKS.get(number, ""))
         for number, frame in enumerate(given.frames)
     ]
-    pictures: dict[str, Any] = {**given.pictures, "near_depth": near, "far": far}
+    images: dict[str, Any] = {**given.images, "near_depth": near, "far": far}
     info = replace(given.info, cameras=(ON_THE_HAND, MILLIMETRES, METRES))
     outcome = replace(given.outcome, failure_reason=reason, drops={})
-    return Episode(info=info, frames=frames, pictures=pictures, outcome=outcome)
+    return Episode(info=info, frames=frames, images=images, outcome=outcome)
 
 
 @pytest.fixture(scope="module")

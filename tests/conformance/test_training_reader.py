@@ -187,8 +187,8 @@ def test_some_episodes_only(roots: dict[str, Path]) -> None:
 def test_transforms_draw_the_same_random_numbers(roots: dict[str, Path]) -> None:
     import torch
 
-    def noisy(picture: torch.Tensor) -> torch.Tensor:
-        return picture + torch.rand(picture.shape[-3:])
+    def noisy(image: torch.Tensor) -> torch.Tensor:
+        return image + torch.rand(image.shape[-3:])
 
     fast, slow = pair(roots["ours"], image_transforms=noisy)
     torch.manual_seed(3)
@@ -249,7 +249,7 @@ def test_what_cannot_be_read_is_refused_as_by_lerobot(roots: dict[str, Path]) ->
         for dataset in (fast, slow):
             with pytest.raises(IndexError):
                 dataset[index]
-    # A table of episodes that places the pictures 10 ms beside where they are.
+    # A table of episodes that places the images 10 ms beside where they are.
     for dataset in (fast, slow):
         key = "videos/observation.images.front/from_timestamp"
         dataset.meta.episodes = dataset.meta.episodes.map(lambda row, key=key: {key: row[key] + 0.01})

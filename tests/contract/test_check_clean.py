@@ -23,7 +23,7 @@ def test_every_task(task: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS.names())
-def test_every_task_with_pictures(task: str, tmp_path: Path) -> None:
+def test_every_task_with_images(task: str, tmp_path: Path) -> None:
     path = simulate(tmp_path / "e.mcap", task=task, seed=22, cameras=("front", "wrist"), width=128, height=128)
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
@@ -56,7 +56,7 @@ def test_an_arm_that_noise_shakes(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_pictures_of_every_kind(config: dict[str, Any], tmp_path: Path) -> None:
+def test_images_of_every_kind(config: dict[str, Any], tmp_path: Path) -> None:
     path = simulate(tmp_path / "e.mcap", seed=24, cameras=("front", "wrist"), **config)
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
@@ -83,7 +83,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         ((tmp_path / "nothing",), 2),
         ((), 2),
         ((path, "--replay", "1"), 0),
-        ((path, "--coverage-picture", tmp_path / "c.png"), 0),
+        ((path, "--coverage-image", tmp_path / "c.png"), 0),
     ]
     for args, code in cases:
         capsys.readouterr()

@@ -48,10 +48,10 @@ def filmed_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_good_ones_pass_without_a_warning(run: Path, dataset: Path, filmed_dataset: Path) -> None:
     for path, kind in ((run, "run"), (dataset, "dataset")):
-        report = checked(path, kind, pictures=False)
+        report = checked(path, kind, images=False)
         assert [r for r in report.results if r.level in ("warn", "fail")] == []
         assert report.count("pass") >= 3
-    assert level_of(filmed_dataset, "dataset_picture_statistics", "dataset") == "pass"
+    assert level_of(filmed_dataset, "dataset_image_statistics", "dataset") == "pass"
     assert level_of(filmed_dataset, "dataset_videos", "dataset") == "pass"
 
 
@@ -64,7 +64,7 @@ def test_what_a_killed_run_has_not_listed_yet(run: Path, tmp_path: Path, complet
     shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000007.mcap")
     told = json.loads((spoilt / "run.json").read_text())
     (spoilt / "run.json").write_text(json.dumps({**told, "complete": complete}))
-    results = checked(spoilt, "run", pictures=False).results
+    results = checked(spoilt, "run", images=False).results
     (found,) = [result for result in results if result.check == "run_files"]
     assert "episode_000007.mcap is not in run.json" in found.detail
     assert ("the command that began the run takes it in" in found.detail) != complete
@@ -201,12 +201,12 @@ def test_shifted_actions_of_every_kind(action: str, run: Path, tmp_path: Path) -
     assert level_of(tmp_path / "ds", "dataset_action_lag", "dataset") == "fail"
 
 
-def test_wrong_picture_statistics(filmed_dataset: Path, tmp_path: Path) -> None:
+def test_wrong_image_statistics(filmed_dataset: Path, tmp_path: Path) -> None:
     spoilt = copy(filmed_dataset, tmp_path / "ds")
     # Levels of 0..255 instead of 0..1.
     key = "observation.images.front"
     edit_json(spoilt / "meta/stats.json", lambda data: data[key].update(mean=[[[140.0]], [[139.0]], [[138.0]]]))
-    assert level_of(spoilt, "dataset_picture_statistics", "dataset") == "fail"
+    assert level_of(spoilt, "dataset_image_statistics", "dataset") == "fail"
 
 
 def test_a_cut_video(filmed_dataset: Path, tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_episodes_that_the_sidecar_does_not_know(dataset: Path, tmp_path: Path) 
     spoilt = copy(dataset, tmp_path / "ds")
     path = next((spoilt / "demorec" / "episodes").glob("*/*.parquet"))
     pq.write_table(pq.read_table(path).slice(1), path)
-    before, after = (checked(each, "dataset", pictures=False).results for each in (dataset, spoilt))
+    before, after = (checked(each, "dataset", images=False).results for each in (dataset, spoilt))
     differing = [(b.check, b.level, a.level) for b, a in zip(before, after, strict=True) if b.level != a.level]
     # What is not known to be ours is judged as anybody's.
     assert differing == [("pose_follows_joints", "skip", "pass"), ("dataset_sidecar", "pass", "fail")]

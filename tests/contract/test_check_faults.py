@@ -19,7 +19,7 @@ Fault = Callable[[Spoilt], None]
 
 @pytest.fixture(scope="session")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One pick-and-place without pictures."""
+    """One pick-and-place without images."""
     return simulate(tmp_path_factory.mktemp("good") / "good.mcap", seed=7)
 
 
@@ -144,36 +144,36 @@ def test_a_recovered_recording_is_a_warning(good: Path, tmp_path: Path) -> None:
     assert level_of(tmp_path / "cut.mcap", "complete") == "warn"
 
 
-# ------------------------------------------------------------------------------------------------- pictures
+# ------------------------------------------------------------------------------------------------- images
 
 
 def upside_down(s: Spoilt) -> None:
-    s.picture("front", lambda t, p: p[::-1])
+    s.image("front", lambda t, p: p[::-1])
 
 
 def mirrored(s: Spoilt) -> None:
-    s.picture("front", lambda t, p: p[:, ::-1])
+    s.image("front", lambda t, p: p[:, ::-1])
 
 
 def mirrored_wrist(s: Spoilt) -> None:
-    s.picture("wrist", lambda t, p: p[:, ::-1])
+    s.image("wrist", lambda t, p: p[:, ::-1])
 
 
 def blue_for_red(s: Spoilt) -> None:
     for camera in ("front", "wrist"):
-        s.picture(camera, lambda t, p: p[..., ::-1])
+        s.image(camera, lambda t, p: p[..., ::-1])
 
 
 def names_exchanged(s: Spoilt) -> None:
-    front = [images["front"].color for images in s.pictures]
-    wrist = [images["wrist"].color for images in s.pictures]
-    s.picture("front", lambda t, p: wrist[t])
-    s.picture("wrist", lambda t, p: front[t])
+    front = [images["front"].color for images in s.images]
+    wrist = [images["wrist"].color for images in s.images]
+    s.image("front", lambda t, p: wrist[t])
+    s.image("wrist", lambda t, p: front[t])
 
 
 def one_camera_twice(s: Spoilt) -> None:
-    front = [images["front"].color for images in s.pictures]
-    s.picture("wrist", lambda t, p: front[t])
+    front = [images["front"].color for images in s.images]
+    s.image("wrist", lambda t, p: front[t])
 
 
 def other_field_of_view(s: Spoilt) -> None:
@@ -181,44 +181,44 @@ def other_field_of_view(s: Spoilt) -> None:
     s.info = s.info.with_simulation(scene=replace(s.info.scene, cameras=cameras))
 
 
-def shifted_pictures(s: Spoilt) -> None:
-    s.picture("front", lambda t, p: np.roll(p, 10, axis=1))
+def shifted_images(s: Spoilt) -> None:
+    s.image("front", lambda t, p: np.roll(p, 10, axis=1))
 
 
 def frozen_camera(s: Spoilt) -> None:
-    first = s.pictures[40]["wrist"].color
-    s.picture("wrist", lambda t, p: first if 40 <= t < 60 else p)
+    first = s.images[40]["wrist"].color
+    s.image("wrist", lambda t, p: first if 40 <= t < 60 else p)
 
 
-def dropped_pictures(s: Spoilt) -> None:
-    before = [images["wrist"].color for images in s.pictures]
-    s.picture("wrist", lambda t, p: before[t - 1] if t in (14, 20, 26, 32, 38, 104, 110, 116, 122) else p)
+def dropped_images(s: Spoilt) -> None:
+    before = [images["wrist"].color for images in s.images]
+    s.image("wrist", lambda t, p: before[t - 1] if t in (14, 20, 26, 32, 38, 104, 110, 116, 122) else p)
 
 
-def black_pictures(s: Spoilt) -> None:
-    s.picture("front", lambda t, p: p * 0 if 30 <= t < 33 else p)
+def black_images(s: Spoilt) -> None:
+    s.image("front", lambda t, p: p * 0 if 30 <= t < 33 else p)
 
 
-def white_pictures(s: Spoilt) -> None:
-    s.picture("front", lambda t, p: p * 0 + 255 if t > 100 else p)
+def white_images(s: Spoilt) -> None:
+    s.image("front", lambda t, p: p * 0 + 255 if t > 100 else p)
 
 
-def burnt_pictures(s: Spoilt) -> None:
-    s.picture(
+def burnt_images(s: Spoilt) -> None:
+    s.image(
         "front",
         lambda t, p: np.where(np.arange(p.shape[1])[None, :, None] < p.shape[1] * 0.97, 255, p).astype(np.uint8),
     )
 
 
-def pictures_two_frames_late(s: Spoilt) -> None:
+def images_two_frames_late(s: Spoilt) -> None:
     for camera in ("front", "wrist"):
-        before = [images[camera].color for images in s.pictures]
-        s.picture(camera, lambda t, p, before=before: before[max(t - 2, 0)])  # type: ignore[misc]
+        before = [images[camera].color for images in s.images]
+        s.image(camera, lambda t, p, before=before: before[max(t - 2, 0)])  # type: ignore[misc]
 
 
-def pictures_one_frame_late(s: Spoilt) -> None:
-    before = [images["wrist"].color for images in s.pictures]
-    s.picture("wrist", lambda t, p: before[max(t - 1, 0)])
+def images_one_frame_late(s: Spoilt) -> None:
+    before = [images["wrist"].color for images in s.images]
+    s.image("wrist", lambda t, p: before[max(t - 1, 0)])
 
 
 def extrinsics_of_another_place(s: Spoilt) -> None:
@@ -235,39 +235,39 @@ def camera_axes_of_opengl(s: Spoilt) -> None:
     s.set(world_from_camera=poses)
 
 
-PICTURES: list[tuple[Fault, str]] = [
+IMAGES: list[tuple[Fault, str]] = [
     (upside_down, "projection"),
     (mirrored, "projection"),
-    # Not projection: what the hand goes for and holds is in the middle of the wrist's pictures.
-    (mirrored_wrist, "pictures_as_drawn"),
+    # Not projection: what the hand goes for and holds is in the middle of the wrist's images.
+    (mirrored_wrist, "images_as_drawn"),
     (blue_for_red, "projection"),
     (names_exchanged, "projection"),
-    (shifted_pictures, "projection"),
+    (shifted_images, "projection"),
     (one_camera_twice, "distinct_cameras"),
     (other_field_of_view, "image_placement"),
     (frozen_camera, "frozen"),
-    (dropped_pictures, "repeated_pictures"),
-    (black_pictures, "exposure"),
-    (white_pictures, "exposure"),
-    (burnt_pictures, "exposure"),
-    (pictures_two_frames_late, "picture_lag"),
-    (pictures_one_frame_late, "picture_lag"),
+    (dropped_images, "repeated_images"),
+    (black_images, "exposure"),
+    (white_images, "exposure"),
+    (burnt_images, "exposure"),
+    (images_two_frames_late, "image_lag"),
+    (images_one_frame_late, "image_lag"),
     (extrinsics_of_another_place, "extrinsics"),
     (camera_axes_of_opengl, "extrinsics"),
 ]
 
 
-def pictures_with_slow_ones() -> Iterator[Any]:
+def images_with_slow_ones() -> Iterator[Any]:
     """Each fault with its check; of a check's faults the first one is quick enough to stand for it in `make test`."""
     known = set[str]()
-    for fault, check in PICTURES:
+    for fault, check in IMAGES:
         marks = pytest.mark.slow if check in known else ()
         known.add(check)
         yield pytest.param(fault, check, id=f"{fault.__name__}-{check}", marks=marks)
 
 
-@pytest.mark.parametrize(("fault", "check"), pictures_with_slow_ones())
-def test_spoilt_pictures(fault: Fault, check: str, filmed: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("fault", "check"), images_with_slow_ones())
+def test_spoilt_images(fault: Fault, check: str, filmed: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(filmed)
     fault(spoilt)
     assert level_of(spoilt.write(tmp_path / "spoilt.mcap"), check) == "fail"
@@ -310,10 +310,10 @@ def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
     def edit(m: Message) -> list[Message]:
         if m[0] != topic or m[3] < 3_000_000_000:
             return [m]
-        # The bytes of the picture come last; what tells where they begin stays.
+        # The bytes of the image come last; what tells where they begin stays.
         return [(m[0], m[1], m[2][:-300] + rng.integers(0, 255, 300, dtype=np.uint8).tobytes(), m[3])]
 
-    assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "pictures_decode") == "fail"
+    assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "images_decode") == "fail"
 
 
 def test_histograms_of_the_other_camera(filmed: Path, tmp_path: Path) -> None:
@@ -337,6 +337,6 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
     }
     for name, change in faults.items():
         spoilt = Spoilt(fine)
-        spoilt.pictures = [{camera: change(image) for camera, image in images.items()} for images in spoilt.pictures]
+        spoilt.images = [{camera: change(image) for camera, image in images.items()} for images in spoilt.images]
         check = "segmentation_matches_scene" if "labels" in name else "depth_matches_scene"
         assert level_of(spoilt.write(tmp_path / f"{name}.mcap"), check) == "fail", name

@@ -34,7 +34,7 @@ Fault = Callable[[Changed], Changed]
 
 @pytest.fixture(scope="session")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One pick-and-place without pictures."""
+    """One pick-and-place without images."""
     return simulate(tmp_path_factory.mktemp("good") / "good.mcap", seed=7)
 
 

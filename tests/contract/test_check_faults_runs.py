@@ -17,7 +17,7 @@ from demorec.check.report import CheckOptions, check_subjects, find_subjects
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes without pictures."""
+    """Two episodes without images."""
     return simulate_run(tmp_path_factory.mktemp("runs") / "good", 2, seed=3)
 
 

@@ -94,16 +94,14 @@ FAULTS: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
 }
 
 
-def level(path: Path, check: str, *, pictures: bool = False) -> str:
-    found = {
-        result.check: result.level for result in checked(path, "dataset", pictures=pictures, only=(check,)).results
-    }
+def level(path: Path, check: str, *, images: bool = False) -> str:
+    found = {result.check: result.level for result in checked(path, "dataset", images=images, only=(check,)).results}
     return found[check]
 
 
 @pytest.mark.usefixtures("without_lerobot")
 def test_a_good_one_has_nothing_that_is_odd(strange: Path) -> None:
-    report = checked(strange, "dataset", pictures=True)
+    report = checked(strange, "dataset", images=True)
     assert [result for result in report.results if result.level in ("warn", "fail")] == []
     passed = {result.check for result in report.results if result.level == "pass"}
     assert {check for _, _, check in FAULTS.values()} | {"joint_speed", "frozen_images"} <= passed
@@ -256,7 +254,7 @@ def test_faults_in_a_dataset_that_lerobot_wrote(run: Path, tmp_path: Path) -> No
     edit_json(spoilt / "meta/info.json", slower)
     assert level(spoilt, "velocity_matches_position") == "fail"
     frozen = make_by_lerobot(run, tmp_path / "frozen", frozen=range(20, 80))
-    assert level(frozen, "frozen_images", pictures=True) == "fail"
+    assert level(frozen, "frozen_images", images=True) == "fail"
 
 
 LAWS = ("joint_limits", "joint_speed", "velocity_matches_position", "gripper_follows")
@@ -266,7 +264,7 @@ def test_every_law_runs_where_its_needs_are(strange: Path) -> None:
     """The same laws judge our recording and a dataset that says nothing of its robot but the names of its joints."""
     recording = next((strange.parent / "run" / "episodes").glob("*.mcap"))
     for path, kind in ((recording, "recording"), (strange, "dataset")):
-        report = checked(path, kind, pictures=False, only=LAWS)
+        report = checked(path, kind, images=False, only=LAWS)
         assert {result.check: result.level for result in report.results} == dict.fromkeys(LAWS, "pass"), kind
     assert level(strange, "pose_follows_joints") == "pass"
 
@@ -322,7 +320,7 @@ def test_a_description_that_the_user_names_makes_laws_applicable(
 
     def told(*flags: str) -> tuple[object, str]:
         with pytest.raises(SystemExit) as ended:
-            main(["check", str(other), "--no-pictures", "--only", "joint_limits", "pose_follows_joints", *flags])
+            main(["check", str(other), "--no-images", "--only", "joint_limits", "pose_follows_joints", *flags])
         return ended.value.code, capsys.readouterr().out
 
     other = copy(strange, tmp_path / "ds")
@@ -366,13 +364,13 @@ def test_exposure_that_drifts(strange: Path, tmp_path: Path) -> None:
 
     length = Dataset(spoilt).places[0].length
     rewrite_video(spoilt, FRONT, lambda images: [*brighter(images[:length]), *images[length:]])
-    assert level(strange, "steady_exposure", pictures=True) == "pass"
-    assert level(spoilt, "steady_exposure", pictures=True) == "warn"
+    assert level(strange, "steady_exposure", images=True) == "pass"
+    assert level(spoilt, "steady_exposure", images=True) == "warn"
 
 
 def test_images_of_an_episode_that_run_backwards(strange: Path, tmp_path: Path) -> None:
     spoilt = copy(strange, tmp_path / "spoilt")
     length = Dataset(spoilt).places[0].length
     rewrite_video(spoilt, FRONT, lambda images: [*images[:length][::-1], *images[length:]])
-    assert level(strange, "images_follow_state", pictures=True) == "pass"
-    assert level(spoilt, "images_follow_state", pictures=True) == "fail"
+    assert level(strange, "images_follow_state", images=True) == "pass"
+    assert level(spoilt, "images_follow_state", images=True) == "fail"

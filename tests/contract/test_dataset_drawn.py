@@ -1,4 +1,4 @@
-"""Videos of a dataset against its states, when there is no run beside it: late, exchanged and foreign pictures."""
+"""Videos of a dataset against its states, when there is no run beside it: late, exchanged and foreign images."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
-CHECKS = ("dataset_pictures_as_drawn", "dataset_picture_lag")
-Pictures = list[Any]
+CHECKS = ("dataset_images_as_drawn", "dataset_image_lag")
+Images = list[Any]
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +56,9 @@ def test_a_dataset_of_somebody_else_has_nothing_to_compare_with(dataset: Path) -
     assert levels(dataset) == ["skip", "skip"]
 
 
-def late(start: int, end: int) -> Callable[[Pictures], Pictures]:
-    """The pictures of one episode, one frame late."""
-    return lambda pictures: [*pictures[:start], pictures[start], *pictures[start : end - 1], *pictures[end:]]
+def late(start: int, end: int) -> Callable[[Images], Images]:
+    """The images of one episode, one frame late."""
+    return lambda images: [*images[:start], images[start], *images[start : end - 1], *images[end:]]
 
 
 @pytest.mark.parametrize("key", [FRONT, WRIST])
@@ -67,13 +67,13 @@ def test_one_episode_one_frame_late(key: str, number: int, dataset: Path) -> Non
     place = Dataset(dataset).places[number]
     start = place.videos[key][1]
     rewrite_video(dataset, key, late(start, start + place.length))
-    assert level_of(dataset, "dataset_picture_lag", "dataset") == "fail"
+    assert level_of(dataset, "dataset_image_lag", "dataset") == "fail"
 
 
 def test_one_episode_one_frame_early(dataset: Path) -> None:
     length = Dataset(dataset).places[0].length
     rewrite_video(dataset, FRONT, lambda p: [*p[1:length], p[length - 1], *p[length:]])
-    assert level_of(dataset, "dataset_picture_lag", "dataset") == "fail"
+    assert level_of(dataset, "dataset_image_lag", "dataset") == "fail"
 
 
 def test_cameras_exchanged(dataset: Path) -> None:
@@ -81,21 +81,21 @@ def test_cameras_exchanged(dataset: Path) -> None:
     front.rename(dataset / "videos" / "other")
     wrist.rename(front)
     (dataset / "videos" / "other").rename(wrist)
-    assert level_of(dataset, "dataset_pictures_as_drawn", "dataset") == "fail"
+    assert level_of(dataset, "dataset_images_as_drawn", "dataset") == "fail"
 
 
 @pytest.mark.parametrize("key", [FRONT, WRIST])
 def test_videos_of_two_episodes_exchanged(key: str, dataset: Path) -> None:
     first, second = (place.length for place in Dataset(dataset).places)
 
-    def exchanged(pictures: Pictures) -> Pictures:
-        one, other = pictures[:first], pictures[first:]
+    def exchanged(images: Images) -> Images:
+        one, other = images[:first], images[first:]
         return [*(other + other[-1:] * first)[:first], *(one + one[-1:] * second)[:second]]
 
     rewrite_video(dataset, key, exchanged)
     assert "fail" in levels(dataset)
 
 
-def test_mirrored_pictures_of_one_camera(dataset: Path) -> None:
-    rewrite_video(dataset, FRONT, lambda pictures: [picture[:, ::-1] for picture in pictures])
+def test_mirrored_images_of_one_camera(dataset: Path) -> None:
+    rewrite_video(dataset, FRONT, lambda images: [image[:, ::-1] for image in images])
     assert "fail" in levels(dataset)

@@ -121,7 +121,7 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "another rate of the video": (of_video(fps=30), "dataset_schema"),
     "other channels": (of_video(channels=1), "dataset_schema"),
     "another pixel format": (of_video(pix_fmt="yuv444p"), "dataset_schema"),
-    "another shape of the pictures": (of_feature(CAMERA, shape=[32, 32, 3]), "dataset_schema"),
+    "another shape of the images": (of_feature(CAMERA, shape=[32, 32, 3]), "dataset_schema"),
     "another fps": (of_info(lambda data: data.update(fps=20)), "dataset_schema"),
     "fps 0": (of_info(lambda data: data.update(fps=0)), "dataset_readable"),
     "a split too short": (of_info(lambda data: data.update(splits={"train": "0:2"})), "dataset_schema"),
@@ -144,7 +144,7 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "an episode's count": (value_of("stats/action/count", 0, [3], "meta/episodes"), "dataset_episode_statistics"),
     "an episode's colours": (
         value_of(f"stats/{CAMERA}/mean", 1, [[[0.1]], [[0.9]], [[0.1]]], "meta/episodes"),
-        "dataset_picture_statistics",
+        "dataset_image_statistics",
     ),
     "a NaN in the state": (value_of("observation.state", 20, float("nan")), "dataset_readable"),
     "an infinity in the action": (value_of("action", 20, float("inf")), "dataset_readable"),
@@ -175,29 +175,29 @@ def test_the_files_alone_give_it_away(name: str, dataset: Path) -> None:
 
 
 def at(frame: int, change: Callable[[Any], Any]) -> Callable[[list[Any]], list[Any]]:
-    return lambda pictures: [change(p) if number == frame else p for number, p in enumerate(pictures)]
+    return lambda images: [change(p) if number == frame else p for number, p in enumerate(images)]
 
 
-PICTURES: dict[str, Callable[[list[Any]], list[Any]]] = {
-    "a black picture": at(30, np.zeros_like),
-    "a green picture": at(31, lambda p: np.zeros_like(p) + np.array([0, 135, 0], dtype=np.uint8)),
+IMAGES: dict[str, Callable[[list[Any]], list[Any]]] = {
+    "a black image": at(30, np.zeros_like),
+    "a green image": at(31, lambda p: np.zeros_like(p) + np.array([0, 135, 0], dtype=np.uint8)),
     "noise": at(32, lambda p: np.random.default_rng(0).integers(0, 255, p.shape, dtype=np.uint8)),
     "upside down": at(33, lambda p: p[::-1]),
-    "a picture too few": lambda pictures: pictures[:-1],
+    "an image too few": lambda images: images[:-1],
 }
 
 
-@pytest.mark.parametrize("name", PICTURES)
-def test_a_single_picture(name: str, dataset: Path) -> None:
+@pytest.mark.parametrize("name", IMAGES)
+def test_a_single_image(name: str, dataset: Path) -> None:
     shutil.rmtree(dataset / "demorec")
-    rewrite_video(dataset, CAMERA, PICTURES[name])
+    rewrite_video(dataset, CAMERA, IMAGES[name])
     assert level_of(dataset, "stray_images", "dataset") == "fail"
 
 
-def test_pictures_coded_anew_are_no_fault(dataset: Path) -> None:
-    rewrite_video(dataset, CAMERA, lambda pictures: [*pictures[:-1], pictures[-2]])
+def test_images_coded_anew_are_no_fault(dataset: Path) -> None:
+    rewrite_video(dataset, CAMERA, lambda images: [*images[:-1], images[-2]])
     assert level_of(dataset, "stray_images", "dataset") == "pass"
-    assert level_of(dataset, "dataset_picture_statistics", "dataset") == "pass"
+    assert level_of(dataset, "dataset_image_statistics", "dataset") == "pass"
 
 
 def of_pose(camera: str, change: Callable[[Any], Any]) -> Fault:
@@ -273,7 +273,7 @@ DESCRIBED: dict[str, Fault] = {
     "an unknown robot": of_info(lambda data: data.update(robot_type="so100")),
     "names of nobody": of_info(lambda d: d["features"]["action"].update(names=[f"a{n}" for n in range(8)])),
     "twice the rate": of_info(lambda data: data.update(fps=20)),
-    "larger pictures": of_feature(CAMERA, shape=[128, 128, 3]),
+    "larger images": of_feature(CAMERA, shape=[128, 128, 3]),
 }
 
 
@@ -284,14 +284,14 @@ def test_the_sidecar_contradicts_it(name: str, dataset: Path) -> None:
 
 
 def test_the_good_ones_pass(run: Path) -> None:
-    report = checked(run / "dataset", "dataset", pictures=False)
+    report = checked(run / "dataset", "dataset", images=False)
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
-    for check in ("stray_images", "dataset_picture_statistics"):
+    for check in ("stray_images", "dataset_image_statistics"):
         assert level_of(run / "dataset", check, "dataset") == "pass"
     assert level_of(run, "run_dataset_content", "run") == "pass"
     shutil.copytree(run / "dataset", run.parent / "bare")
     shutil.rmtree(run.parent / "bare" / "demorec")
-    report = checked(run.parent / "bare", "dataset", pictures=False)
+    report = checked(run.parent / "bare", "dataset", images=False)
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
 
 

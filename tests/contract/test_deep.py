@@ -1,4 +1,4 @@
-"""`check --deep` names whatever differs from the recording made again: every field of every topic, every picture."""
+"""`check --deep` names whatever differs from the recording made again: every field of every topic, every image."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Without pictures, which makes it again in no time."""
+    """Without images, which makes it again in no time."""
     return simulate(tmp_path_factory.mktemp("deep") / "blind.mcap", seed=7, fps=FPS)
 
 
@@ -96,7 +96,7 @@ def single_values(message: Any, path: str = "") -> Iterator[tuple[str, Callable[
         elif isinstance(value, list) and value and not isinstance(value[-1], bool | int | float | str):
             yield from single_values(value[-1], f"{where}[{len(value) - 1}]")
         elif isinstance(value, bytes | bytearray | memoryview):
-            continue  # a coded picture
+            continue  # a coded image
         elif hasattr(value, "__len__") and not isinstance(value, str):
             if len(value):
                 yield f"{where}[{len(value) - 1}]", partial(value.__setitem__, len(value) - 1, other(value[-1]))
@@ -229,12 +229,12 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
                 container[place] = "x" if value is None or isinstance(value, dict | list) else other(value)
             metadata = {**again.metadata[record], key: spoilt if isinstance(spoilt, str) else json.dumps(spoilt)}
             recorded = replace(again, metadata={**again.metadata, record: metadata})
-            differences, pictures = content_differences(recorded, again, info, info.fps)
+            differences, images = content_differences(recorded, again, info, info.fps)
             if name.startswith("info.versions"):  # told by themselves
                 assert not differences
                 continue
             assert [(d.stream, d.field) for d in differences] == [(f"metadata {record}", name)]
-            assert not pictures
+            assert not images
             count += 1
     assert count > (300 if record == EPISODE else 20)
 
@@ -288,60 +288,60 @@ def test_other_versions_are_said_first(
     assert "pybullet is 3.2.5 there" in lines[2]
 
 
-# ----------------------------------------------------------------------------------------------------- the pictures
+# ----------------------------------------------------------------------------------------------------- the images
 
 
-def torn(picture: Any) -> Any:
-    half = len(picture) // 2
-    return np.concatenate([picture[:half], np.roll(picture[half:], 7, axis=1)])
+def torn(image: Any) -> Any:
+    half = len(image) // 2
+    return np.concatenate([image[:half], np.roll(image[half:], 7, axis=1)])
 
 
-def blurred(picture: Any) -> Any:
-    padded = np.pad(picture.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
-    rows, columns = picture.shape[:2]
+def blurred(image: Any) -> Any:
+    padded = np.pad(image.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    rows, columns = image.shape[:2]
     near = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
     return np.mean(near, axis=0).astype(np.uint8)
 
 
-def shifted(picture: Any) -> Any:
-    return np.roll(picture, 1, axis=1)
+def shifted(image: Any) -> Any:
+    return np.roll(image, 1, axis=1)
 
 
-def green(picture: Any) -> Any:
-    return np.stack([picture[..., 0] // 2, np.maximum(picture[..., 1], 200), picture[..., 2] // 2], axis=-1)
+def green(image: Any) -> Any:
+    return np.stack([image[..., 0] // 2, np.maximum(image[..., 1], 200), image[..., 2] // 2], axis=-1)
 
 
-def patched(picture: Any) -> Any:
-    changed = picture.copy()
+def patched(image: Any) -> Any:
+    changed = image.copy()
     changed[40:52, 40:52] = 255 - changed[40:52, 40:52]
     return changed
 
 
-def brighter(picture: Any) -> Any:
-    return np.clip(picture.astype(np.int16) + 6, 0, 255).astype(np.uint8)
+def brighter(image: Any) -> Any:
+    return np.clip(image.astype(np.int16) + 6, 0, 255).astype(np.uint8)
 
 
-def channels_swapped(picture: Any) -> Any:
-    return picture[..., ::-1]
+def channels_swapped(image: Any) -> Any:
+    return image[..., ::-1]
 
 
 @pytest.mark.slow
-def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
+def test_a_few_images_among_many(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     """All are coded a second time, as by a program that edits videos: only the spoilt ones show something else."""
     faults = {6: brighter, 11: torn, 16: blurred, 21: shifted, 26: green, 31: patched, 36: channels_swapped}
     swapped = {20: 24, 24: 20}
     spoilt = Spoilt(filmed)
-    before = [images["front"].color for images in spoilt.pictures]
-    spoilt.picture("wrist", lambda frame, picture: faults[frame](picture) if frame in faults else picture)
-    spoilt.picture("front", lambda frame, picture: before[swapped.get(frame, frame)])
-    depth = spoilt.pictures[9]["front"].depth
-    labels = spoilt.pictures[12]["wrist"].segmentation
+    before = [images["front"].color for images in spoilt.images]
+    spoilt.image("wrist", lambda frame, image: faults[frame](image) if frame in faults else image)
+    spoilt.image("front", lambda frame, image: before[swapped.get(frame, frame)])
+    depth = spoilt.images[9]["front"].depth
+    labels = spoilt.images[12]["wrist"].segmentation
     assert depth is not None
     assert labels is not None
     depth[30, 30] += 0.001
     labels[40, 40] = labels[40, 40] + 1
     report = deep_check(spoilt.write(tmp_path / "spoilt.mcap"), simulators)
-    shown = {d.stream: d.frames for d in report.differences if d.field == "picture"}
+    shown = {d.stream: d.frames for d in report.differences if d.field == "image"}
     assert shown == {
         "/camera/wrist/h264": tuple(faults),
         "/camera/wrist/video": tuple(faults),
@@ -352,28 +352,26 @@ def test_a_few_pictures_among_many(filmed: Path, tmp_path: Path, simulators: Sim
     }
     (of_depth,) = (d for d in report.differences if d.stream == "/camera/front/depth")
     assert "1 of 9216 pixels" in of_depth.recorded
-    assert all(d.is_coding or d.field == "picture" or d.stream.endswith("/histogram") for d in report.differences)
+    assert all(d.is_coding or d.field == "image" or d.stream.endswith("/histogram") for d in report.differences)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stream", [stream for stream in CODED if "image" not in stream])
-def test_a_coded_picture_of_another_frame(
-    stream: str, filmed: Path, tmp_path: Path, simulators: SimulatorCache
-) -> None:
-    """The stamp is right, the bytes are whole, the picture is that of five frames before."""
-    topic, pictures = f"/camera/front/{stream}", []
+def test_a_coded_image_of_another_frame(stream: str, filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
+    """The stamp is right, the bytes are whole, the image is that of five frames before."""
+    topic, images = f"/camera/front/{stream}", []
 
     def spoil(name: str, data: bytes) -> bytes:
         if name != topic:
             return data
-        pictures.append(data)
-        return data[:12] + pictures[10][12:] if len(pictures) == 25 else data
+        images.append(data)
+        return data[:12] + images[10][12:] if len(images) == 25 else data
 
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(rewritten(filmed, messages=spoil))
     report = deep_check(spoilt, simulators)
     assert report.level == "fail"
-    (difference,) = (d for d in report.differences if d.field == "picture")
+    (difference,) = (d for d in report.differences if d.field == "image")
     assert (difference.stream, difference.frames[0]) == (topic, 24)
 
 

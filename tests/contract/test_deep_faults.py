@@ -23,7 +23,7 @@ from demorec.core.geometry import Pose
 from demorec.episode.camera_error import error_values
 from demorec.episode.episode import Event, SuccessCheck
 from demorec.mcap import Recording, channels, messages
-from demorec.mcap.pictures import pixel_statistics, read_pixel_statistics
+from demorec.mcap.images import pixel_statistics, read_pixel_statistics
 from demorec.mcap.streams import frame_streams
 from demorec.replay.deep import deep_check
 from demorec.robots.panda import PANDA
@@ -38,14 +38,14 @@ SECOND = 1_000_000_000
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One short pick-and-place with small pictures of all kinds."""
+    """One short pick-and-place with small images of all kinds."""
     path = tmp_path_factory.mktemp("good") / "good.mcap"
     return simulate(path, seed=7, cameras=("front",), width=32, height=32, fps=10, depth=True, segmentation=True)
 
 
 @pytest.fixture(scope="module")
 def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same without pictures, at 30 frames a second."""
+    """The same without images, at 30 frames a second."""
     return simulate(tmp_path_factory.mktemp("blind") / "good.mcap", seed=7)
 
 
@@ -96,7 +96,7 @@ def calibration(offset: int, value: float) -> Edit:
 
 
 def message_before(topic: str) -> Edit:
-    """At two seconds the picture of the frame before once more, with the time of its own."""
+    """At two seconds the image of the frame before once more, with the time of its own."""
     kept: list[bytes] = []
 
     def edit(m: Message) -> list[Message]:
@@ -126,7 +126,7 @@ def stamped(topic: str, second: int, *, at: int | None = None) -> Edit:
 
 
 def counted_twice(m: Message) -> list[Message]:
-    """The histogram of twice as many pictures."""
+    """The histogram of twice as many images."""
     if m[0] != channels.camera_topic("front", "histogram"):
         return [m]
     told = read_pixel_statistics(m[2])
@@ -176,9 +176,9 @@ MESSAGES: list[tuple[str, Edit]] = [
     ("a robot of other colours", bytes_for("/robot_description", b"rgba=\"1", b"rgba=\"0")),
     ("a larger cube in its description",
      bytes_for("/object/red_cube/robot_description", b"<box", b"<bax")),
-    ("/video with the picture before", message_before(VIDEO)),
-    ("/video with one picture less", without(VIDEO, at=2 * SECOND)),
-    ("/h264 with the picture before", message_before(H264)),
+    ("/video with the image before", message_before(VIDEO)),
+    ("/video with one image less", without(VIDEO, at=2 * SECOND)),
+    ("/h264 with the image before", message_before(H264)),
     ("/video of another camera", bytes_for(VIDEO, b"camera_front", b"camera_wrist")),
     ("/video of another format", bytes_for(VIDEO, b"\5\0\0\0h264", b"\5\0\0\0h265")),
     ("/h264 of another format at one moment",
@@ -401,10 +401,10 @@ def test_a_summary_of_something_else(
 
 
 IMAGES: list[tuple[str, Edit, str]] = [
-    ("a depth picture that is cut off",
-     lambda m: [(m[0], m[1], m[2][:-40], m[3])] if (m[0], m[3]) == (DEPTH, 2 * SECOND) else [m], "pictures_decode"),
-    ("a picture of labels that is none", bytes_for(LABELED, b"IHDR", b"IHOR", at=2 * SECOND), "pictures_decode"),
-    ("a histogram of more pictures", counted_twice, "pixel_statistics"),
+    ("a depth image that is cut off",
+     lambda m: [(m[0], m[1], m[2][:-40], m[3])] if (m[0], m[3]) == (DEPTH, 2 * SECOND) else [m], "images_decode"),
+    ("an image of labels that is none", bytes_for(LABELED, b"IHDR", b"IHOR", at=2 * SECOND), "images_decode"),
+    ("a histogram of more images", counted_twice, "pixel_statistics"),
 ]  # fmt: skip
 
 

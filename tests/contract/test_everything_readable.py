@@ -30,7 +30,7 @@ from demorec.sources import opening
 pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 COMMANDS = {
     "info": "info PATH",
-    "check": "check PATH --no-pictures",
+    "check": "check PATH --no-images",
     "view": "view PATH --save NEW.rrd",
     "report": "report PATH --out NEW.html",
     "export": "export hdf5 PATH --out NEW.hdf5",

@@ -1,4 +1,4 @@
-"""The turn of a camera's calibration error, found in its pictures: against the one that was drawn from the seed."""
+"""The turn of a camera's calibration error, found in its images: against the one that was drawn from the seed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_the_found_turn_is_the_true_one(size: int, tmp_path: Path) -> None:
     with CheckedEpisode(path) as episode:
         config = from_plain(episode.info.config, GenerateConfig)
         made = prepare(EpisodePlan(config=config, episode_index=0, attempt=episode.info.attempt))
-        colors = {camera.name: episode.pictures(camera).cells for camera in episode.cameras}
+        colors = {camera.name: episode.images(camera).cells for camera in episode.cameras}
         kinds: dict[str, tuple[ImageKind, ...]] = dict.fromkeys(colors, ("color",))
         shift = draw_episode(older(episode.info), episode.columns, kinds, colors, draw_each=False).shift
         for camera in episode.cameras:
@@ -47,7 +47,7 @@ def test_the_found_turn_is_the_true_one(size: int, tmp_path: Path) -> None:
 def test_what_is_turned_farther_than_told_stays_so(tmp_path: Path) -> None:
     path = simulate(tmp_path / "e.mcap", variation="full", seed=31, cameras=("front",), width=64, height=64)
     with CheckedEpisode(path) as episode:
-        colors = {"front": np.roll(episode.pictures(episode.cameras[0]).cells, 1, axis=2)}  # one of 32 cells: 1.4 deg
+        colors = {"front": np.roll(episode.images(episode.cameras[0]).cells, 1, axis=2)}  # one of 32 cells: 1.4 deg
         info = older(episode.info)
         drawn = draw_episode(info, episode.columns, {"front": ("color",)}, colors, draw_each=False)
         assert drawn.shift == {}

@@ -143,7 +143,7 @@ def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, Columns], ki
     env.close()
 
 
-def test_pictures_are_those_of_the_rollout() -> None:
+def test_images_are_those_of_the_rollout() -> None:
     options: dict[str, Any] = {"cameras": ("front", "wrist"), "width": 64, "height": 48}
     prepared = episode(5, **options)
     env = make(split="all", **options)
@@ -222,13 +222,13 @@ def test_commands_keep_to_the_limits() -> None:
 def test_render_shows_the_world() -> None:
     env = make(render_mode="rgb_array", render_width=64, render_height=48)
     env.reset(seed=0)
-    picture = env.render()
-    assert picture is not None
-    assert picture.shape == (48, 64, 3)
-    assert picture.std() > 10
+    image = env.render()
+    assert image is not None
+    assert image.shape == (48, 64, 3)
+    assert image.std() > 10
     for _ in range(8):
         env.step(np.append(np.array(env.info.scene.robot.joint_position) + 0.4, 0.08))
-    assert not np.array_equal(picture, present(env.render()))
+    assert not np.array_equal(image, present(env.render()))
     env.close()
 
 

@@ -119,7 +119,7 @@ def test_a_quaternion_of_the_other_sign_is_no_jump(tmp_path: Path) -> None:
     assert _findings(bag, tmp_path, bag_mappings.FRANKA) == set()
 
 
-CHECK_OF = {"drops": "import_times", "stuck": "import_numbers", "frozen": "import_pictures"}
+CHECK_OF = {"drops": "import_times", "stuck": "import_numbers", "frozen": "import_images"}
 
 
 @pytest.mark.parametrize("kind", [*CHECK_OF, "nothing"])

@@ -153,10 +153,10 @@ FAULTS: dict[str, tuple[str, Callable[[Episode], None]]] = {
     "nothing said": ("dataset_language", everywhere("subtask", of(content=""))),
     "an answer that is no JSON": ("dataset_language", first_event(of(content="{oops", role="assistant"))),
     "an answer of no kind": ("dataset_language", answer("count", lambda told: told.pop("count"))),
-    "a box beyond the picture": (
+    "a box beyond the image": (
         "dataset_language", answer("detections", lambda told: told["detections"][0].update(bbox=[0, 0, 64, 5])),
     ),
-    "a trace beyond the picture": ("dataset_language", answer("points", of(points=[[5, -1]]))),
+    "a trace beyond the image": ("dataset_language", answer("points", of(points=[[5, -1]]))),
     "two answers at once": ("dataset_language", two_answers),
     "no subtask at first": ("dataset_language", drop_first_subtask),
     "two subtasks at once": ("dataset_language", everywhere("subtask", of(timestamp=0.0), 1)),

@@ -73,7 +73,7 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     (folder / "xarm6.urdf").rename(tmp_path / "xarm6.urdf")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
-    assert exit_code("check", recording, "--no-pictures") == 0
+    assert exit_code("check", recording, "--no-images") == 0
     assert exit_code("view", recording, "--save", tmp_path / "view.rrd") == 0
     capsys.readouterr()
     assert exit_code("replay", recording) == 2

@@ -35,7 +35,7 @@ kernels = [
     if hasattr(value, "stats")
 ]
 print(json.dumps({
-    "picture": hashlib.sha256(image.color.tobytes() + image.depth.tobytes()).hexdigest(),
+    "image": hashlib.sha256(image.color.tobytes() + image.depth.tobytes()).hexdigest(),
     "colours": len(set(map(bytes, image.color.reshape(-1, 3)))),
     "compiled": sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels),
     "decimated": decimations,
@@ -64,12 +64,12 @@ def test_processes_that_start_at_once_share_the_first_start(tmp_path: Path) -> N
     together = [result(process) for process in [start(tmp_path) for _ in range(PROCESSES)]]
     later = result(start(tmp_path))
     results = [found for found, _ in together]
-    assert len({found["picture"] for found in [*results, later[0]]}) == 1
+    assert len({found["image"] for found in [*results, later[0]]}) == 1
     assert results[0]["colours"] > 100
     # One compiles and says so; the others wait and load what it compiled.
     assert sorted(found["compiled"] > 0 for found in results) == [False] * (PROCESSES - 1) + [True]
     assert sum("Compiling the renderer" in errors for _, errors in together) == 1
-    # Each level of detail (one for the picture, one for the shadow map) is made by one of them.
+    # Each level of detail (one for the image, one for the shadow map) is made by one of them.
     levels = [level for found in results for level in found["decimated"]]
     assert len(levels) == len(set(levels)) == 2
     assert later[0]["compiled"] == 0

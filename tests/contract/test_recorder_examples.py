@@ -52,9 +52,9 @@ def test_a_robots_loop(runs: Path) -> None:
     for row, target in zip(columns.features["observation.state"], targets.tolist(), strict=True):
         assert row.tolist() == [position] * 6
         position += 0.5 * (target - position)
-    held = columns.pictures["top"]
+    held = columns.images["top"]
     assert [int(number) for number in held] == [-1 if step % 3 == 2 else step - step // 3 for step in range(60)]
-    assert (columns.picture_age_ns("top") >= 0).all()  # taken before the frame was written
+    assert (columns.image_age_ns("top") >= 0).all()  # taken before the frame was written
 
 
 def test_a_simulation_of_ones_own(runs: Path) -> None:

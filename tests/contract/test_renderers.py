@@ -92,7 +92,7 @@ def tilted(position: tuple[float, float, float]) -> Pose:
 
 
 @pytest.mark.parametrize(("width", "height"), [(96, 96), (161, 75)])
-def test_pictures_have_the_promised_shapes(stage: Stage, width: int, height: int) -> None:
+def test_images_have_the_promised_shapes(stage: Stage, width: int, height: int) -> None:
     scenes.add(stage.client, "box", (0.2, 0.2, 0.2))
     camera = scenes.camera(width, height)
     stage.renderer.setup(scenes.setup(stage.client, camera))
@@ -200,11 +200,11 @@ def test_known_points_are_drawn_where_they_project(stage: Stage, antialias: bool
         assert np.abs(middle - scenes.project(camera, place)).max() < stage.bounds.place
 
 
-def test_pictures_are_not_flipped(stage: Stage) -> None:
+def test_images_are_not_flipped(stage: Stage) -> None:
     camera = scenes.camera(
         160, 120, mount_from_camera=Pose(position=np.array([0.0, 0.0, 2.0]), quat_xyzw=np.array([1.0, 0.0, 0.0, 0.0]))
     )
-    # Looking straight down with y of the world upward in the picture: x right, y up.
+    # Looking straight down with y of the world upward in the image: x right, y up.
     assert np.allclose(camera.mount_from_camera.rotation, np.diag([1.0, -1.0, -1.0]))
     right = scenes.add(
         stage.client, "box", (0.2, 0.2, 0.2), Pose(position=np.array([0.5, 0, 0])), rgbaColor=[1, 0, 0, 1]

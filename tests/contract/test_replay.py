@@ -221,7 +221,7 @@ def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
     run = simulate_run(tmp_path / "run", 2, seed=3)
     export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, fps=10))
     assert exit_code("replay", tmp_path / "ds") == 0
-    assert exit_code("check", tmp_path / "ds", "--no-pictures", "--replay", "2") == 0
+    assert exit_code("check", tmp_path / "ds", "--no-images", "--replay", "2") == 0
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Recorded states, new pictures."""
+"""Recorded states, new images."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate(path, seed=13, cameras=("front", "wrist"), width=64, height=64)
 
 
-def test_own_cameras_and_looks_give_the_recorded_pictures_again(filmed: Path, tmp_path: Path) -> None:
+def test_own_cameras_and_looks_give_the_recorded_images_again(filmed: Path, tmp_path: Path) -> None:
     report = rerender(filmed, tmp_path / "again.mcap", RerenderOptions())
     assert report.compared == ("front", "wrist")
     assert not report.differing
@@ -51,7 +51,7 @@ def test_own_cameras_and_looks_give_the_recorded_pictures_again(filmed: Path, tm
 
 @pytest.mark.slow
 def test_calibration_errors_are_kept(tmp_path: Path) -> None:
-    # The recorded extrinsics are off on purpose; the pictures must come from where the cameras were.
+    # The recorded extrinsics are off on purpose; the images must come from where the cameras were.
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
     report = rerender(source, tmp_path / "again.mcap", RerenderOptions())
     assert report.compared == ("front",)
@@ -102,11 +102,11 @@ def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
     assert scenes[0][0] != scenes[1][0]
 
 
-def test_a_spoilt_picture_is_found(filmed: Path, tmp_path: Path) -> None:
+def test_a_spoilt_image_is_found(filmed: Path, tmp_path: Path) -> None:
     from support.check import Spoilt
 
     spoilt = Spoilt(filmed)
-    spoilt.picture("front", lambda t, p: p[::-1] if t == 20 else p)
+    spoilt.image("front", lambda t, p: p[::-1] if t == 20 else p)
     path = spoilt.write(tmp_path / "s.mcap")
     assert exit_code("render", path, "--out", tmp_path / "out") == 1
 

@@ -50,9 +50,9 @@ def test_a_sample_is_read(version: int) -> None:
         assert ("wrench" in columns.sensed) == (version >= 2)
         assert {"approach", "lift"} <= set(columns.phase) or len(set(columns.phase)) >= 5
         for camera in ("front", "wrist"):
-            pictures = list(recording.images(camera))
-            assert len(pictures) == num_frames
-            assert np.abs(pictures[0].astype(int) - pictures[-1]).mean() > 1.0
+            images = list(recording.images(camera))
+            assert len(images) == num_frames
+            assert np.abs(images[0].astype(int) - images[-1]).mean() > 1.0
             counts = recording.pixel_statistics(camera).counts
             assert counts.sum(axis=1).tolist() == [counts[0].sum()] * 3
             assert counts.sum() > 0

@@ -68,7 +68,7 @@ def test_the_state_is_joints_gripper_and_the_recorded_pose(run: Path, dataset: P
 
 def test_such_a_dataset_passes_every_check(dataset: Path, small: Path) -> None:
     for path in (dataset, small):
-        report = checked(path, "dataset", pictures=False)
+        report = checked(path, "dataset", images=False)
         assert [r for r in report.results if r.level in ("warn", "fail")] == []
     for check in ("dataset_action_lag", "forward_kinematics", "dataset_description", "joint_limits"):
         assert level_of(small, check, "dataset") == "pass"

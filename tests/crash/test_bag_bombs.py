@@ -190,7 +190,7 @@ def many_names(folder: Path) -> Path:
     )
 
 
-def pictures_of_nothing(folder: Path) -> Path:
+def images_of_nothing(folder: Path) -> Path:
     """60 PNG files of 4000x4000 pixels, all black."""
     png = io.BytesIO()
     Image.fromarray(np.zeros((4000, 4000), np.uint8)).save(png, format="PNG", compress_level=9)
@@ -222,7 +222,7 @@ BAGS = (
     two_fields_a_type, two_empty_fields_a_type, a_thousand_of_a_thousand,
     a_definition_that_computes, empty_elements_of_many_fields, lists_of_nothing, messages_that_claim_64_megabytes,
     columns_that_compute, a_column_called_rowid, definitions_that_compute, a_view_of_messages, aliases, merge_keys,
-    pictures_of_nothing, lists_in_every_message, many_messages,
+    images_of_nothing, lists_in_every_message, many_messages,
 )  # fmt: skip
 LONG = [
     pytest.param(make, marks=pytest.mark.slow)
@@ -241,7 +241,7 @@ def test_a_small_bag_never_becomes_large(
     bag = make(tmp_path)
     assert _size(bag) < 1_000_000
     text = MAPPING.replace('info_topic = "/info"\n', "")
-    if make is not pictures_of_nothing:
+    if make is not images_of_nothing:
         text = text[: text.index("[cameras")]
     if bag.suffix == ".db3" or bag.is_dir():
         text = bag_mappings.SO101
@@ -432,9 +432,9 @@ def test_fields_that_are_called_like_methods(tmp_path: Path, commands: LimitedCo
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])
-def test_a_keyframe_that_gives_no_picture(codec: str, tmp_path: Path, commands: LimitedCommands) -> None:
-    """Parameter sets, and the head of a picture without any of it."""
-    packet = bags.video([bags.picture(0, 0)], gop=1, codec={"h264": "libx264", "h265": "libx265"}[codec])[0]
+def test_a_keyframe_that_gives_no_image(codec: str, tmp_path: Path, commands: LimitedCommands) -> None:
+    """Parameter sets, and the head of an image without any of it."""
+    packet = bags.video([bags.image(0, 0)], gop=1, codec={"h264": "libx264", "h265": "libx265"}[codec])[0]
     units = packet.split(b"\x00\x00\x01")
     slices = {"h264": (5,), "h265": (19, 20)}[codec]
     kinds = [unit[0] & 31 if codec == "h264" else (unit[0] >> 1) & 63 for unit in units[1:]]

@@ -108,7 +108,7 @@ def test_the_limit_can_be_raised(good: Path, tmp_path: Path, monkeypatch: pytest
             Recording(path)
 
 
-def test_pictures_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
+def test_images_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
     """Black JPEG files beside a robot that stands still: the most that our own recordings unpack to."""
     from dataclasses import replace
 
@@ -238,7 +238,7 @@ def test_tables_that_claim_very_much(
     assert "The table" in commands.refused("check", tmp_path / "dataset", "--only", "dataset_readable")
 
 
-def test_a_video_that_claims_very_many_pictures(tmp_path: Path) -> None:
+def test_a_video_that_claims_very_many_images(tmp_path: Path) -> None:
     def box(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I4s", 8 + len(content), kind) + content
 

@@ -93,7 +93,7 @@ def test_a_full_disk(context: Any, run: Path, tmp_path: Path, mode: str, limit: 
     export(run, out, **options)  # and with room again it works
 
 
-def test_a_full_disk_where_processes_leave_pictures(context: Any, run: Path, tmp_path: Path) -> None:
+def test_a_full_disk_where_processes_leave_images(context: Any, run: Path, tmp_path: Path) -> None:
     before = files_of(tmp_path)
     assert exit_code(context, run, tmp_path / "d", {"workers": 2}, size_limit=500) == 3
     assert files_of(tmp_path) == before

@@ -101,7 +101,7 @@ def content(path: Path) -> tuple[Any, ...]:
             (camera, recording.pixel_statistics(camera).counts.tobytes(), recording.pixel_statistics(camera).num_images)
             for camera in recording.cameras
         )
-        pictures = tuple(picture.tobytes() for camera in recording.cameras for picture in recording.images(camera))
+        images = tuple(image.tobytes() for camera in recording.cameras for image in recording.images(camera))
         return (
             recording.digest(),
             recording.info,
@@ -110,7 +110,7 @@ def content(path: Path) -> tuple[Any, ...]:
             tuple(sorted(recording.segment_names().items())),
             tuple(recording.video_settings(camera) for camera in recording.cameras),
             statistics,
-            pictures,
+            images,
         )
 
 
@@ -178,10 +178,10 @@ class Fuzz:
             self.results["nothing to recover"] += 1
             return
         with Recording(kept) as recording:
-            pictures = tuple(picture.tobytes() for picture in recording.images("front"))
+            images = tuple(image.tobytes() for image in recording.images("front"))
             assert recording.info == expected[1]
-        assert 0 < len(pictures) <= expected[3]
-        assert pictures == expected[-1][: len(pictures)]
+        assert 0 < len(images) <= expected[3]
+        assert images == expected[-1][: len(images)]
         self.results["recovered"] += 1
 
 

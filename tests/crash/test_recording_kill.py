@@ -101,7 +101,7 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
                 assert recording.is_recovered
                 assert recording.columns().num_frames == kept
                 for camera in recording.cameras:
-                    numbers = [frame_number(picture) for picture in recording.images(camera)]
+                    numbers = [frame_number(image) for image in recording.images(camera)]
                     assert numbers == [index % 256 for index in range(kept)]
                 assert recording.pixel_statistics("front").num_images == (kept + 1) // 2
         # The frame that was being written when the signal came may be in the file without having been noted.

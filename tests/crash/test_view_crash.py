@@ -80,19 +80,17 @@ def test_what_a_kill_left_is_removed_by_the_next_call(recorded: Path, tmp_path: 
     assert [path.name for path in tmp_path.iterdir()] == ["x.rrd"]
 
 
-def test_a_full_disk_and_the_coverage_picture(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_and_the_coverage_image(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "c.png"
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(target)
     before = target.read_bytes()
-    arguments = ("check", recorded, "--only", "opens", "--coverage-picture", target, "--overwrite")
+    arguments = ("check", recorded, "--only", "opens", "--coverage-image", target, "--overwrite")
     assert demorec(*arguments, limit=2_000) == 2
-    assert "The picture cannot be written (File too large)" in capsys.readouterr().err
+    assert "The image cannot be written (File too large)" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"c.png": before}
 
 
-@pytest.mark.parametrize("arguments", [("view", "--save", "x.rrd"), ("check", "--coverage-picture", "x.png")])
+@pytest.mark.parametrize("arguments", [("view", "--save", "x.rrd"), ("check", "--coverage-image", "x.png")])
 def test_a_folder_that_cannot_be_written_to(
     recorded: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, str, str]
 ) -> None:

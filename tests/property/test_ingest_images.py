@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from demorec.sources.bag_findings import all_findings, row_findings
 from demorec.sources.episodes import Window
 from demorec.sources.fields import SourceReader, layout_of
+from demorec.sources.image_messages import ImageHead, ImageHeads
 from demorec.sources.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
-from demorec.sources.picture_messages import PictureHead, PictureHeads
 from demorec.sources.ros_types import Budgets
 from demorec.sources.rows import EpisodeRows, Timelines
 from demorec.sources.streams import BagStreams, Stream
@@ -43,9 +43,9 @@ def _moments(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding
 
 
 def _stream(label: str, times: list[int], *, is_camera: bool) -> Stream:
-    heads = PictureHeads()
+    heads = ImageHeads()
     for _ in times if is_camera else ():
-        heads.append(PictureHead("jpeg", "", 64, 48, True))
+        heads.append(ImageHead("jpeg", "", 64, 48, True))
     stream = Stream(label=label, topic=f"/{label}", budgets=Budgets())
     stream.logged, stream.stamped = array("q", [time + 1_000_000 for time in times]), array("q", times)
     stream.sums = array("I", range(len(times)))

@@ -57,7 +57,7 @@ def test_a_suggestion_is_toml_and_names_what_is_there(topic: str, joints: list[s
              body={"transforms": [{"child_frame_id": frame}]})
         for moment in moments
     ]  # fmt: skip
-    notes += bags.jpeg_pictures(f"{topic}/image", moments, 0, frame)
+    notes += bags.jpeg_images(f"{topic}/image", moments, 0, frame)
     notes += [
         Note(topic=f"{topic}{frame}", type="std_msgs/msg/String", log_ns=moments[0], header_ns=0, body={"data": frame})
     ]

@@ -26,13 +26,13 @@ from demorec.mcap.messages import JOINT_STATE
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.robots.assets import asset_path
 
-pictures = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
+images = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24)
 
 
 @settings(max_examples=60)
 @given(
     hnp.arrays(
-        np.uint16, pictures, elements=st.one_of(st.just(0), st.integers(1, 12), st.integers(0, 65535)), fill=st.just(0)
+        np.uint16, images, elements=st.one_of(st.just(0), st.integers(1, 12), st.integers(0, 65535)), fill=st.just(0)
     )
 )
 def test_depth_is_exact_to_the_millimetre(millimetres: np.ndarray[Any, Any]) -> None:
@@ -49,7 +49,7 @@ def test_depth_beyond_its_range_counts_as_nothing_hit() -> None:
 
 
 def test_depth_is_rvl_of_the_paper() -> None:
-    """A picture small enough to be coded by hand: runs 0 and 2, pixels 5 and 3 (differences 5 and -2, zigzag 10 and 3),
+    """An image small enough to be coded by hand: runs 0 and 2, pixels 5 and 3 (differences 5 and -2, zigzag 10 and 3),
     then runs 2 and 0. Groups of three bits, the continuation bit above them: 0, 2, 10 = 010 001 -> A 1, 3, 2, 0."""
     data = encode_depth(np.array([[0.005, 0.003, 0.0, 0.0]], dtype=np.float32))
     assert data[:12] == bytes(12)
@@ -59,7 +59,7 @@ def test_depth_is_rvl_of_the_paper() -> None:
 
 @settings(max_examples=60)
 @given(
-    hnp.arrays(np.int32, pictures, elements=st.integers(0, 254)),
+    hnp.arrays(np.int32, images, elements=st.integers(0, 254)),
     hnp.arrays(np.int32, (24, 24), elements=st.integers(-1, 254)),
 )
 def test_labels(bodies: np.ndarray[Any, Any], links: np.ndarray[Any, Any]) -> None:
@@ -193,13 +193,13 @@ def test_damaged_pngs_are_refused() -> None:
         decode_labels(good, (4, 4))
 
 
-def test_a_segmentation_picture_owes_nothing_to_the_one_before() -> None:
-    """FFmpeg adds up pictures that are not said to be keyframes."""
+def test_a_segmentation_image_owes_nothing_to_the_one_before() -> None:
+    """FFmpeg adds up images that are not said to be keyframes."""
     from PIL import Image
 
     decoder, table, cube = LabelDecoder((6, 8)), np.full((6, 8), 1, np.int32), np.full((6, 8), 2, np.int32)
-    shown = [decoder.decode(encode_labels(picture)) for picture in (table, cube, cube, table)]
-    for found, picture in zip(shown, (table, cube, cube, table), strict=True):
-        np.testing.assert_array_equal(found, picture)
+    shown = [decoder.decode(encode_labels(image)) for image in (table, cube, cube, table)]
+    for found, image in zip(shown, (table, cube, cube, table), strict=True):
+        np.testing.assert_array_equal(found, image)
     numbers = np.asarray(Image.open(io.BytesIO(encode_labels(cube))))
     np.testing.assert_array_equal(decoder.labels(encode_labels(cube)), numbers)

@@ -118,7 +118,7 @@ def _resized(number: int, note: Note) -> Note:
     return with_body(note, data=np.frombuffer(jpeg(np.zeros((24, 32, 3), np.uint8)), np.uint8))
 
 
-def _cut_picture(number: int, note: Note) -> Note:
+def _cut_image(number: int, note: Note) -> Note:
     return with_body(note, data=note.body["data"][:300]) if number % 20 == 7 else note
 
 
@@ -157,7 +157,7 @@ FAULTS: dict[str, Fault] = {
         kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0) if k % 10 == 3 else n)
     ),
     "single messages lost": Fault(kind="drops", hurt=_each(STATE, lambda k, n: None if k % 10 == 5 else n)),
-    "pictures lost": Fault(kind="drops", hurt=_each(FRONT, lambda k, n: None if k in (20, 21, 40) else n)),
+    "images lost": Fault(kind="drops", hurt=_each(FRONT, lambda k, n: None if k in (20, 21, 40) else n)),
     "a pause within the allowed age": Fault(kind="gap", hurt=_each(ACTION, lambda k, n: None if 40 <= k < 47 else n)),
     "a long pause": Fault(kind="gap", hurt=_each(FRONT, lambda k, n: None if 20 <= k < 35 else n), is_refused=True),
     "jitter": Fault(kind="jitter", hurt=_jittered),
@@ -187,7 +187,7 @@ FAULTS: dict[str, Fault] = {
     ),
     "messages that cannot be decoded": Fault(kind="malformed", hurt=_each(STATE, _garbage)),
     "a message that lacks a joint": Fault(kind="malformed", hurt=_each(STATE, _short)),
-    "pictures cut off": Fault(kind="malformed", hurt=_each(FRONT, _cut_picture)),
+    "images cut off": Fault(kind="malformed", hurt=_each(FRONT, _cut_image)),
     "swapped cameras": Fault(kind="swapped", hurt=_swapped_cameras),
     "one camera twice": Fault(kind="same_pictures", hurt=_same_pictures),
     "a frozen camera": Fault(kind="frozen", hurt=_frozen),
@@ -196,7 +196,7 @@ FAULTS: dict[str, Fault] = {
     "frames of another camera in between": Fault(
         kind="frame_id", hurt=_each(FRONT, lambda k, n: replace(n, frame_id="cam_side") if k == 30 else n)
     ),
-    "another kind of picture": Fault(
+    "another kind of image": Fault(
         kind="format",
         hurt=_each(FRONT, lambda k, n: with_body(n, format="png", data=_png()) if k == 30 else n),
         is_refused=True,

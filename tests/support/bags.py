@@ -4,7 +4,7 @@ A layout makes plain messages first, so that a test can hurt them before they ar
 without reading it. Topics, types, joint names and rates are those of:
 
 - franka: franka_ros2's broadcasters and GELLO's leader arm at up to 1 kHz, realsense2_camera, rosbag2 with MCAP;
-- so101: so101_ros2's follower and leader, usb_cam's JPEG pictures, rosbag2 with SQLite;
+- so101: so101_ros2's follower and leader, usb_cam's JPEG images, rosbag2 with SQLite;
 - agilex: Cobot Magic's two master and two puppet arms and three cameras, ROS 1 messages in MCAP;
 - trossen: Trossen SDK's protobuf joint states and Foxglove's CompressedVideo in MCAP.
 """
@@ -73,17 +73,17 @@ def motion(time_ns: int, count: int, *, shift: float = 0.0) -> NDArray[np.float6
     return np.asarray(0.5 * np.sin(2 * np.pi * 0.4 * t + np.arange(count) * 0.7 + shift) + noise)
 
 
-def picture(time_ns: int, camera: int) -> NDArray[np.uint8]:
+def image(time_ns: int, camera: int) -> NDArray[np.uint8]:
     """(HEIGHT, WIDTH, 3): of another colour for each camera, with a bar that moves."""
-    image = np.full((HEIGHT, WIDTH, 3), (40 + 60 * camera, 200 - 50 * camera, 90), np.uint8)
+    pixels = np.full((HEIGHT, WIDTH, 3), (40 + 60 * camera, 200 - 50 * camera, 90), np.uint8)
     x = int((time_ns - EPOCH_NS) / NS * 25) % (WIDTH - 8)
-    image[8:40, x : x + 8] = 250
-    image[0, 0] = [(time_ns // 1000) % 251, camera, 7]
-    return image
+    pixels[8:40, x : x + 8] = 250
+    pixels[0, 0] = [(time_ns // 1000) % 251, camera, 7]
+    return pixels
 
 
 def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """Of a picture."""
+    """Of an image."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=90)
     return buffer.getvalue()
@@ -105,7 +105,7 @@ def joints(
     ]
 
 
-def raw_pictures(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
+def raw_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
     """Messages of sensor_msgs/Image, rgb8."""
     return [
         Note(
@@ -113,14 +113,14 @@ def raw_pictures(topic: str, moments: Sequence[int], camera: int, frame_id: str)
             type="sensor_msgs/msg/Image",
             log_ns=moment + 20_000_000,
             header_ns=moment,
-            body={"encoding": "rgb8", "width": WIDTH, "height": HEIGHT, "data": picture(moment, camera)},
+            body={"encoding": "rgb8", "width": WIDTH, "height": HEIGHT, "data": image(moment, camera)},
             frame_id=frame_id,
         )
         for moment in moments
     ]
 
 
-def jpeg_pictures(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
+def jpeg_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
     """Messages of sensor_msgs/CompressedImage, JPEG."""
     return [
         Note(
@@ -128,7 +128,7 @@ def jpeg_pictures(topic: str, moments: Sequence[int], camera: int, frame_id: str
             type="sensor_msgs/msg/CompressedImage",
             log_ns=moment + 15_000_000,
             header_ns=moment,
-            body={"format": "jpeg", "data": np.frombuffer(jpeg(picture(moment, camera)), np.uint8)},
+            body={"format": "jpeg", "data": np.frombuffer(jpeg(image(moment, camera)), np.uint8)},
             frame_id=frame_id,
         )
         for moment in moments
@@ -159,7 +159,7 @@ def franka(seconds: float = 2.0) -> Notes:
     ]
     for camera, name in enumerate(("wrist_camera", "scene_camera")):
         moments = times(30, seconds, seed=4 + camera)
-        notes += raw_pictures(color.format(name), moments, camera, f"{name}_color_optical_frame")
+        notes += raw_images(color.format(name), moments, camera, f"{name}_color_optical_frame")
         notes += [
             Note(
                 topic=f"/camera/{name}/color/camera_info",
@@ -193,7 +193,7 @@ def so101(seconds: float = 2.0) -> Notes:
             ("/static_camera/cam_side/image_raw/compressed", "cam_side"),
         )
     ):
-        notes += jpeg_pictures(topic, times(30, seconds, seed=3 + camera), camera, frame)
+        notes += jpeg_images(topic, times(30, seconds, seed=3 + camera), camera, frame)
     return notes
 
 
@@ -207,14 +207,12 @@ def agilex(seconds: float = 2.0) -> Notes:
         )
     for camera, letter in enumerate("flr"):
         topic = f"/camera_{letter}/color/image_raw"
-        notes += raw_pictures(
-            topic, times(30, seconds, seed=5 + camera), camera, f"camera_{letter}_color_optical_frame"
-        )
+        notes += raw_images(topic, times(30, seconds, seed=5 + camera), camera, f"camera_{letter}_color_optical_frame")
     return notes
 
 
 def trossen(seconds: float = 2.0, *, gop: int = 10) -> Notes:
-    """Trossen's arms and cameras, the pictures coded as H.264."""
+    """Trossen's arms and cameras, the images coded as H.264."""
     notes: Notes = []
     for number, arm in enumerate(("leader", "follower")):
         for moment in times(200, seconds, seed=1 + number):
@@ -230,7 +228,7 @@ def trossen(seconds: float = 2.0, *, gop: int = 10) -> Notes:
             )
     for camera, name in enumerate(("cam_high", "cam_wrist")):
         moments = times(30, seconds, seed=3 + camera)
-        packets = video([picture(moment, camera) for moment in moments], gop=gop)
+        packets = video([image(moment, camera) for moment in moments], gop=gop)
         notes += [
             Note(
                 topic=f"/cameras/{name}/image",
@@ -245,8 +243,8 @@ def trossen(seconds: float = 2.0, *, gop: int = 10) -> Notes:
     return notes
 
 
-def video(pictures: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx264") -> list[bytes]:
-    """One packet a picture, parameter sets before each keyframe."""
+def video(images: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx264") -> list[bytes]:
+    """One packet an image, parameter sets before each keyframe."""
     context = av.CodecContext.create(codec, "w")
     assert isinstance(context, av.VideoCodecContext)
     context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
@@ -256,7 +254,7 @@ def video(pictures: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx
     if codec == "libx265":
         context.options = {"tune": "zerolatency", "x265-params": "bframes=0:repeat-headers=1:log-level=none"}
     packets = []
-    for image in pictures:
+    for image in images:
         packets += context.encode(av.VideoFrame.from_ndarray(image, format="rgb24"))
     packets += context.encode(None)
     return [bytes(packet) for packet in packets]

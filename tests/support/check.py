@@ -31,7 +31,7 @@ from demorec.robots.motors import Motors
 from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
 from support.mcap import metadata_of
 
-Pictures = list[dict[str, CameraImages]]
+Images = list[dict[str, CameraImages]]
 
 
 def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
@@ -75,11 +75,11 @@ def checked(
     kind: str = "recording",
     *,
     only: Sequence[str] = (),
-    pictures: bool = True,
+    images: bool = True,
     motors: Motors | None = None,
 ) -> SubjectReport:
     """The report of some checks, or of all."""
-    options = CheckOptions(only=tuple(only), pictures=pictures, motors=motors)
+    options = CheckOptions(only=tuple(only), images=images, motors=motors)
     return check_subject(Subject(path=path, kind=kind), options)  # type: ignore[arg-type]
 
 
@@ -94,7 +94,7 @@ class Spoilt:
 
     Attributes:
         info, columns, outcome: Of the recording; replace them or write into the arrays.
-        pictures: Camera name -> images of every frame, decoded; empty without cameras.
+        images: Camera name -> images of every frame, decoded; empty without cameras.
         frames: Numbers of the frames to be written, in order.
         events: Frame -> what happened then, instead of what is recorded.
     """
@@ -104,7 +104,7 @@ class Spoilt:
             self.info: EpisodeInfo = recording.info
             self.columns: Columns = recording.columns()
             self.outcome: Outcome | None = recording.outcome
-            self.pictures: Pictures = [dict(images) for images in decoded_images(recording, self.columns)]
+            self.images: Images = [dict(images) for images in decoded_images(recording, self.columns)]
             self._frames = list(frames_of(recording, self.columns))
             self.joint_samples = [frame.joint_samples for frame in self._frames]
         self._source = path
@@ -127,16 +127,16 @@ class Spoilt:
         """Replace the poses of an object."""
         self.set(object_poses={**self.columns.object_poses, name: np.asarray(rows)})
 
-    def picture(self, camera: str, change: Callable[[int, np.ndarray[Any, Any]], Any]) -> None:
-        """Replace a camera's colour pictures by what `change(frame, picture)` returns."""
+    def image(self, camera: str, change: Callable[[int, np.ndarray[Any, Any]], Any]) -> None:
+        """Replace a camera's colour images by what `change(frame, image)` returns."""
         changed = 0
         new = []
-        for frame, images in enumerate(self.pictures):
+        for frame, images in enumerate(self.images):
             color = np.ascontiguousarray(change(frame, images[camera].color))
             changed += int(not np.array_equal(color, images[camera].color))
             new.append({**images, camera: replace(images[camera], color=color)})
-        assert changed > 0, "no picture was changed"
-        self.pictures = new
+        assert changed > 0, "no image was changed"
+        self.images = new
 
     def write(self, path: Path) -> Path:
         """Record it."""
@@ -158,7 +158,7 @@ class Spoilt:
 
         images = {
             name: replace(image, world_from_camera=pose_of(self.columns.world_from_camera[name][index]))
-            for name, image in self.pictures[index].items()
+            for name, image in self.images[index].items()
         }
         return replace(
             frame, frame_index=number, time_ns=frame_time_ns(number, self.info.fps), images=images,

@@ -131,19 +131,19 @@ def count_calls(run: Path, out: Path, options: dict[str, Any]) -> int:
 
 
 def rewrite_video(dataset: Path, key: str, change: Callable[[list[Any]], list[Any]]) -> None:
-    """The pictures of a camera's only file, changed and coded anew at 10 a second."""
+    """The images of a camera's only file, changed and coded anew at 10 a second."""
     import av
 
     path = next(dataset.glob(f"videos/{key}/*/*.mp4"))
     with av.open(str(path)) as container:
-        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    before = np.stack(pictures)
-    changed = change(pictures)
+        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    before = np.stack(images)
+    changed = change(images)
     assert len(changed) != len(before) or not np.array_equal(np.stack(changed), before)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=10, options={"crf": "18", "g": "2", "bf": "0"})
         stream.height, stream.width = before.shape[1:3]
         stream.pix_fmt = "yuv420p"
-        for picture in changed:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+        for image in changed:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
         container.mux(stream.encode(None))

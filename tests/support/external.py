@@ -1,4 +1,4 @@
-"""Made-up external episodes: a two-jointed arm with a gripper, of which two cameras send pictures at their own pace.
+"""Made-up external episodes: a two-jointed arm with a gripper, of which two cameras send images at their own pace.
 
 Nothing here needs a simulator. The time is uneven and the streams have stamps of their own.
 """
@@ -46,12 +46,12 @@ class Episode:
 
     Attributes:
         info, frames, outcome: As the writer takes them.
-        pictures: Camera -> (stamp, pixels) in order.
+        images: Camera -> (stamp, pixels) in order.
     """
 
     info: EpisodeInfo
     frames: list[SampledFrame]
-    pictures: dict[str, list[tuple[int, NDArray[np.uint8]]]]
+    images: dict[str, list[tuple[int, NDArray[np.uint8]]]]
     outcome: Outcome
 
 
@@ -63,7 +63,7 @@ def make_external(
     episode_index: int = 0,
     success: bool | None = True,
 ) -> Episode:
-    """An episode: frames 20 to 45 ms apart; the camera `wrist` sends every second frame a picture, held by two."""
+    """An episode: frames 20 to 45 ms apart; the camera `wrist` sends every second frame an image, held by two."""
     random = np.random.default_rng(episode_index)
     info = EpisodeInfo(
         episode_index=episode_index,
@@ -76,17 +76,17 @@ def make_external(
         versions={"demorec": "0"},
     )
     times = START_NS + np.cumsum(random.integers(20_000_000, 45_000_000, num_frames))
-    pictures: dict[str, list[tuple[int, NDArray[np.uint8]]]] = {camera.name: [] for camera in cameras}
+    images: dict[str, list[tuple[int, NDArray[np.uint8]]]] = {camera.name: [] for camera in cameras}
     frames = []
     phases = random.uniform(-np.pi, np.pi, (2, 3))  # of joints that swing, no faster than motors are
     for index, time_ns in enumerate(times.tolist()):
         held = {}
         for camera in cameras:
             if camera.name == "top" or index % 2 == 1:
-                pixels = _picture(camera, index)
-                pictures[camera.name].append((time_ns - 7_000_000, pixels))
-            if pictures[camera.name]:  # the wrist has none at the first frame
-                held[camera.name] = len(pictures[camera.name]) - 1
+                pixels = _image(camera, index)
+                images[camera.name].append((time_ns - 7_000_000, pixels))
+            if images[camera.name]:  # the wrist has none at the first frame
+                held[camera.name] = len(images[camera.name]) - 1
         frames.append(
             SampledFrame(
                 time_ns=time_ns,
@@ -97,14 +97,14 @@ def make_external(
                     ACTION.name: Sample(stamp_ns=time_ns, vector=np.sin(0.05 * index + phases[1])),
                     FORCE.name: Sample(stamp_ns=time_ns - 12_345_678, vector=random.normal(size=3)),
                 },
-                pictures=held,
+                images=held,
             )
         )
     outcome = Outcome(success=success, num_frames=num_frames, drops={"wrist": 2})
-    return Episode(info=info, frames=frames, pictures=pictures, outcome=outcome)
+    return Episode(info=info, frames=frames, images=images, outcome=outcome)
 
 
-def _picture(camera: Camera, index: int) -> NDArray[np.uint8]:
+def _image(camera: Camera, index: int) -> NDArray[np.uint8]:
     """A ramp whose brightness tells the frame."""
     pixels = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     pixels[..., 0] = np.linspace(0, 200, camera.width).astype(np.uint8)
@@ -113,14 +113,14 @@ def _picture(camera: Camera, index: int) -> NDArray[np.uint8]:
     return pixels
 
 
-def write_pictures_and_frames(writer: EpisodeWriter, episode: Episode) -> None:
+def write_images_and_frames(writer: EpisodeWriter, episode: Episode) -> None:
     """Everything but the end."""
-    given = dict.fromkeys(episode.pictures, 0)
+    given = dict.fromkeys(episode.images, 0)
     for frame in episode.frames:
-        for name, number in frame.pictures.items():
+        for name, number in frame.images.items():
             while given[name] <= number:
-                stamp_ns, pixels = episode.pictures[name][given[name]]
-                assert writer.picture(name, stamp_ns, pixels) == given[name]
+                stamp_ns, pixels = episode.images[name][given[name]]
+                assert writer.image(name, stamp_ns, pixels) == given[name]
                 given[name] += 1
         writer.write(frame)
 
@@ -129,6 +129,6 @@ def write_external(path: Path, episode: Episode | None = None, *, video: VideoCo
     """A recording of an external episode."""
     episode = episode or make_external()
     with EpisodeWriter(path, episode.info, video=video) as writer:
-        write_pictures_and_frames(writer, episode)
+        write_images_and_frames(writer, episode)
         writer.finish(episode.outcome)
     return path

@@ -1,4 +1,4 @@
-"""Faults of recordings that need no file: good numbers or pictures with one thing wrong, and what a check says."""
+"""Faults of recordings that need no file: good numbers or images with one thing wrong, and what a check says."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Result
 from demorec.check.cells import CellGrid, ImageKind
-from demorec.check.drawn import PictureComparison
+from demorec.check.drawn import ImageComparison
 from demorec.check.episode import CheckedEpisode
-from demorec.check.summary import PictureSummary
+from demorec.check.summary import ImageSummary
 from demorec.core.tables import CHECKS
 from demorec.episode.episode import Columns, Outcome
 from demorec.episode.info import EpisodeInfo
@@ -27,58 +27,58 @@ Rows = NDArray[Any]
 
 @dataclass
 class Good:
-    """A good recording, kept open, with its decoded pictures.
+    """A good recording, kept open, with its decoded images.
 
     Attributes:
         episode: As the checks see it; drawn once.
-        pictures: (camera, kind) -> (T, H, W[, 3]).
+        images: (camera, kind) -> (T, H, W[, 3]).
     """
 
     episode: CheckedEpisode
-    pictures: Mapping[tuple[str, ImageKind], Rows] = field(default_factory=dict)
+    images: Mapping[tuple[str, ImageKind], Rows] = field(default_factory=dict)
 
     @classmethod
     def open(cls, path: Path) -> Good:
         """Read and decode everything."""
         episode = CheckedEpisode(path)
-        recording, pictures = episode.recording, {}
+        recording, images = episode.recording, {}
         for camera in episode.cameras:
             for kind in episode.kinds(camera.name):
                 read: Callable[[str], Any] = {
                     "color": recording.images, "depth": recording.depth, "labels": recording.segmentation,
                 }[kind]  # fmt: skip
-                pictures[camera.name, kind] = np.stack(list(read(camera.name)))
-        return cls(episode, pictures)
+                images[camera.name, kind] = np.stack(list(read(camera.name)))
+        return cls(episode, images)
 
     @property
     def _cameras(self) -> dict[str, SceneCamera]:
         return {camera.name: camera for camera in self.episode.cameras}
 
-    def with_pictures(self, changed: Mapping[tuple[str, ImageKind], Rows]) -> CheckedEpisode:
-        """The episode with other pictures; what is drawn of it stays."""
+    def with_images(self, changed: Mapping[tuple[str, ImageKind], Rows]) -> CheckedEpisode:
+        """The episode with other images; what is drawn of it stays."""
         spoilt = CheckedEpisode(self.episode.path)
         spoilt.__dict__["recording"] = _WithImages(self.episode.recording, changed)
         spoilt.__dict__["columns"] = self.episode.columns
         spoilt.__dict__["_drawn"] = self.episode._drawn
         spoilt.__dict__["sampled"] = self.episode.sampled
         spoilt.__dict__["_drawn_full_size"] = self.episode._drawn_full_size
-        for key in self.pictures.keys() - changed.keys():
-            spoilt._pictures[key] = self.episode.pictures(self._cameras[key[0]], key[1])
+        for key in self.images.keys() - changed.keys():
+            spoilt._images[key] = self.episode.images(self._cameras[key[0]], key[1])
             compared = self.episode.compared(self._cameras[key[0]], key[1])
-            assert isinstance(compared, PictureComparison)
+            assert isinstance(compared, ImageComparison)
             spoilt._comparisons[key] = compared
-        for (name, kind), pictures in changed.items():
-            grid = CellGrid(pictures.shape[2], pictures.shape[1])
-            cells = np.stack([grid.read(kind, picture).cells for picture in pictures])
-            nothing = np.zeros(len(pictures))
-            spoilt._pictures[name, kind] = PictureSummary(
+        for (name, kind), images in changed.items():
+            grid = CellGrid(images.shape[2], images.shape[1])
+            cells = np.stack([grid.read(kind, image).cells for image in images])
+            nothing = np.zeros(len(images))
+            spoilt._images[name, kind] = ImageSummary(
                 error="",
-                mean=np.zeros((len(pictures), 3)),
+                mean=np.zeros((len(images), 3)),
                 dark=nothing,
                 bright=nothing,
                 cells=cells,
                 detail=nothing.astype(np.float32),
-                kept={} if kind == "color" else {frame: pictures[frame] for frame in self.episode.sampled[name]},
+                kept={} if kind == "color" else {frame: images[frame] for frame in self.episode.sampled[name]},
             )
         return spoilt
 

@@ -71,7 +71,7 @@ class FuzzedBags:
         self._db3 = next(rosbag2.glob("*.db3")).read_bytes()
         self._metadata = (rosbag2 / "metadata.yaml").read_text()
         moment = bags.EPOCH_NS
-        still = bags.picture(moment, 0)
+        still = bags.image(moment, 0)
         self._jpeg, self._still = bags.jpeg(still), still
         png = io.BytesIO()
         Image.fromarray(still).save(png, format="PNG")
@@ -94,7 +94,7 @@ class FuzzedBags:
         chance = random.Random(number)
         kinds: tuple[Callable[[random.Random, Path], tuple[Path, str]], ...] = (
             self._bytes, self._database_bytes, self._database, self._yaml, self._toml, self._json, self._json,
-            self._definition, self._protobuf, self._picture, self._picture,
+            self._definition, self._protobuf, self._image, self._image,
         )  # fmt: skip
         make = kinds[number % len(kinds)]
         bag, mapping = make(chance, self.folder)
@@ -306,7 +306,7 @@ class FuzzedBags:
             writer.finish()
         return path
 
-    def _picture(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
+    def _image(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
         name, data = chance.choice(sorted(self._coded.items()))
         told = chance.choice(
             (name, name, name, "jpeg", "h264", "h265", "av1", "zstd: 64", "", "\x00", "16UC1; compressedDepth")
@@ -325,5 +325,5 @@ class FuzzedBags:
                 body = {"encoding": encoding, "width": width, "height": height, "step": step, "data": pixels}
             kind = "sensor_msgs/msg/Image" if is_raw else "sensor_msgs/msg/CompressedImage"
             notes.append(bags.Note(topic="/image", type=kind, log_ns=moment, header_ns=moment, body=body))
-        path = bags.write_mcap(bags.in_order(notes), folder / "picture.mcap")
+        path = bags.write_mcap(bags.in_order(notes), folder / "image.mcap")
         return path, MAPPING.replace('info_topic = "/info"\n', "")

@@ -16,7 +16,7 @@ ROBOMIMIC_LENGTHS = (7, 5, 6)
 ALOHA_CAMERAS = ("cam_high", "cam_left_wrist")
 
 
-def pictures(count: int, seed: int) -> NDArray[np.uint8]:
+def images(count: int, seed: int) -> NDArray[np.uint8]:
     """(T, H, W, 3): a ramp whose brightness tells the row, and a red corner, by which exchanged colours are seen."""
     shown = np.zeros((count, HEIGHT, WIDTH, 3), np.uint8)
     shown[..., 1] = np.linspace(0, 200, WIDTH).astype(np.uint8)
@@ -54,18 +54,18 @@ def write_robomimic(path: Path, *, control_freq: float | None = 20.0, compressio
                     ("robot0_gripper_qvel", 2), ("robot0_eef_pos", 3), ("robot0_eef_quat", 4), ("object", 10),
                 ):  # fmt: skip
                     observed[key] = rng.normal(size=(count, width))
-                images = pictures(count, seed=len(name))
-                observed.create_dataset("agentview_image", data=images, compression=compression)
-                observed.create_dataset("robot0_eye_in_hand_image", data=images[:, :, ::-1], compression=compression)
+                shown = images(count, seed=len(name))
+                observed.create_dataset("agentview_image", data=shown, compression=compression)
+                observed.create_dataset("robot0_eye_in_hand_image", data=shown[:, :, ::-1], compression=compression)
         file["mask/train"] = np.array(["demo_0", "demo_10"], dtype="S")
         file["mask/valid"] = np.array(["demo_1"], dtype="S")
     return path
 
 
-def jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:
-    """A picture as a JPEG file."""
+def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """An image as a JPEG file."""
     stored = io.BytesIO()
-    Image.fromarray(picture).save(stored, "JPEG", quality=quality)
+    Image.fromarray(image).save(stored, "JPEG", quality=quality)
     return stored.getvalue()
 
 
@@ -76,16 +76,16 @@ def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed
     with h5py.File(path, "w", rdcc_nbytes=2 << 20) as file:
         file.attrs["sim"] = False
         observations = file.create_group("observations")
-        images = observations.create_group("images")
+        group = observations.create_group("images")
         if is_compressed:
             file.attrs["compress"] = True
             coded = {
-                camera: [jpeg(picture, 60 + 5 * number) for number, picture in enumerate(pictures(count, 10 * k))]
+                camera: [jpeg(image, 60 + 5 * number) for number, image in enumerate(images(count, 10 * k))]
                 for k, camera in enumerate(ALOHA_CAMERAS)
             }
             width = max(len(data) for row in coded.values() for data in row)
             for camera, row in coded.items():
-                stored = images.create_dataset(camera, (count, width), "uint8", chunks=(1, width))
+                stored = group.create_dataset(camera, (count, width), "uint8", chunks=(1, width))
                 for number, data in enumerate(row):
                     stored[number] = np.frombuffer(data.ljust(width, b"\0"), np.uint8)
             # As ALOHA's recorders write it: float32, cameras in the order of their own list, which is not the file's.
@@ -94,7 +94,7 @@ def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed
         else:
             for k, camera in enumerate(ALOHA_CAMERAS):
                 shape = (count, HEIGHT, WIDTH, 3)
-                images.create_dataset(camera, shape, "uint8", chunks=(1, *shape[1:]))[...] = pictures(count, 10 * k)
+                group.create_dataset(camera, shape, "uint8", chunks=(1, *shape[1:]))[...] = images(count, 10 * k)
         for group, name, width in ((observations, "qpos", 14), (observations, "qvel", 14), (file, "action", 14)):
             group.create_dataset(name, (count, width), "f4")[...] = rng.normal(size=(count, width))
         if is_compressed:

@@ -108,7 +108,7 @@ class Layout:
     write: Callable[[Notes, Path], Path] = field(default=lambda notes, path: bags.write_rosbag2(notes, path / "bag"))
 
     def notes(self) -> Notes:
-        """Its messages, in the order of recording. Pictures begin last, so that a row can be at each of them."""
+        """Its messages, in the order of recording. Images begin last, so that a row can be at each of them."""
         bags.register(DEFINITIONS)
         made = []
         for topic in self.topics:
@@ -147,7 +147,7 @@ def camera(topic: str, shade: int = 0) -> Topic:
     return Topic(
         name=topic, type="sensor_msgs/msg/CompressedImage", rate=30,
         body=lambda time, number: {
-            "format": "jpeg", "data": np.frombuffer(bags.jpeg(bags.picture(time, shade)), np.uint8),
+            "format": "jpeg", "data": np.frombuffer(bags.jpeg(bags.image(time, shade)), np.uint8),
         },
     )  # fmt: skip
 
@@ -157,7 +157,7 @@ def raw_camera(topic: str, shade: int = 0) -> Topic:
         name=topic, type="sensor_msgs/msg/Image", rate=30,
         body=lambda time, number: {
             "encoding": "rgb8", "width": bags.WIDTH, "height": bags.HEIGHT, "step": 3 * bags.WIDTH,
-            "data": bags.picture(time, shade),
+            "data": bags.image(time, shade),
         },
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Values that may be None (a depth picture, a wrench), where a test knows that they are there."""
+"""Values that may be None (a depth image, a wrench), where a test knows that they are there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Made-up episodes: a Panda whose joints move and whose cameras see pictures that differ by frame and by camera.
+"""Made-up episodes: a Panda whose joints move and whose cameras see images that differ by frame and by camera.
 
 Nothing here needs the simulator. `make_episode` is a pure function of its arguments.
 """
@@ -124,10 +124,10 @@ def make_episode(
     return info, frames, outcome
 
 
-def frame_number(picture: NDArray[np.uint8]) -> int:
-    """The frame's number modulo 256, from the bar code at the bottom of its picture, coded or not."""
-    side = -(-picture.shape[1] // 8)
-    blocks = [picture[-6:-2, bit * side + 1 : (bit + 1) * side - 1].mean() for bit in range(8)]
+def frame_number(image: NDArray[np.uint8]) -> int:
+    """The frame's number modulo 256, from the bar code at the bottom of its image, coded or not."""
+    side = -(-image.shape[1] // 8)
+    blocks = [image[-6:-2, bit * side + 1 : (bit + 1) * side - 1].mean() for bit in range(8)]
     return sum(1 << bit for bit, value in enumerate(blocks) if value > 125)
 
 

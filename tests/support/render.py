@@ -144,7 +144,7 @@ def cast_capsule(radius: float, length: float, origin: Any, direction: Any) -> N
 
 
 def project(cam: SceneCamera, point: Any) -> NDArray[np.float64]:
-    """(2,) place in the picture, pixels, of a point in the world."""
+    """(2,) place in the image, pixels, of a point in the world."""
     seen = cam.mount_from_camera.inverse().apply(np.asarray(point, dtype=np.float64))
     image = cam.intrinsics @ seen
     return np.asarray(image[:2] / image[2])

@@ -1,4 +1,4 @@
-"""Running episodes in tests, without pictures unless asked for."""
+"""Running episodes in tests, without images unless asked for."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def episode(index: int = 0, *, attempt: int = 0, **config: Any) -> Episode:
 
 
 def first_frame(prepared: Episode) -> Frame:
-    """What is seen before anything has moved; its pictures need no episode around them."""
+    """What is seen before anything has moved; its images need no episode around them."""
     with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
         return next(Session.of_episode(world, prepared, renderer).run(ScriptAgent(prepared)))
 

@@ -28,7 +28,7 @@ SMALL_ACT: dict[str, Any] = {
 }
 """Settings of a policy whose training takes no time."""
 SIZE = 64
-"""Of the pictures: the least that LeRobot's AV1 encoder takes."""
+"""Of the images: the least that LeRobot's AV1 encoder takes."""
 
 
 def write_by_lerobot(
@@ -39,7 +39,7 @@ def write_by_lerobot(
     Args:
         root: A folder that does not exist yet.
         lengths: Frames of each episode.
-        stored_as: "video" or "image": how pictures are kept.
+        stored_as: "video" or "image": how images are kept.
         depth: Whether there is a depth camera, too.
         arguments: Of `LeRobotDataset.create`.
     """
@@ -78,7 +78,7 @@ def _write(root: Path, lengths: Sequence[int], *, stored_as: str, depth: bool, *
                 "observation.counts": rng.integers(-9, 1 << 40, 3),
                 "observation.touch": np.array([t % 3 == 0]),
                 "note": f"frame {t} of {episode}",
-                CAMERA: _picture(episode, t),
+                CAMERA: _image(episode, t),
                 "action": rng.normal(size=4).astype(np.float32),
                 "task": ("push it", "pull it")[episode % 2],
             }
@@ -90,12 +90,12 @@ def _write(root: Path, lengths: Sequence[int], *, stored_as: str, depth: bool, *
     return root
 
 
-def _picture(episode: int, t: int) -> NDArray[np.uint8]:
+def _image(episode: int, t: int) -> NDArray[np.uint8]:
     """A block that moves over a slope: every frame differs from the others."""
     rows, columns = np.mgrid[0:SIZE, 0:SIZE]
-    picture = np.stack([rows * 2 + 40, columns * 3, np.full_like(rows, 30 * episode % 256)], axis=-1).astype(np.uint8)
-    picture[3 * t % 48 : 3 * t % 48 + 16, 5 * t % 48 : 5 * t % 48 + 16] = (250, 20 + 4 * t, 200)
-    return picture
+    image = np.stack([rows * 2 + 40, columns * 3, np.full_like(rows, 30 * episode % 256)], axis=-1).astype(np.uint8)
+    image[3 * t % 48 : 3 * t % 48 + 16, 5 * t % 48 : 5 * t % 48 + 16] = (250, 20 + 4 * t, 200)
+    return image
 
 
 def assert_same_item(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Driving the real viewers: what they need, why a test is skipped without it, and how a picture is judged."""
+"""Driving the real viewers: what they need, why a test is skipped without it, and how an image is judged."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def pixels(png: bytes) -> NDArray[np.uint8]:
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
 
-def num_colors(picture: NDArray[np.uint8]) -> int:
-    return len(np.unique(picture.reshape(-1, 3) // 8, axis=0))
+def num_colors(image: NDArray[np.uint8]) -> int:
+    return len(np.unique(image.reshape(-1, 3) // 8, axis=0))
 
 
 @contextlib.contextmanager
@@ -111,5 +111,5 @@ class Chromium:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def picture(self) -> bytes:
+    def image(self) -> bytes:
         return base64.b64decode(self.call("Page.captureScreenshot")["data"])

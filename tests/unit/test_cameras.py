@@ -65,7 +65,7 @@ def test_top_sees_every_place_where_objects_go_with_the_base_below(world: World)
 
 
 @pytest.mark.parametrize("size", [(56, 40), (224, 224), (640, 480), (640, 360)])
-def test_workspace_sees_every_place_where_objects_go_in_pictures_of_any_shape(
+def test_workspace_sees_every_place_where_objects_go_in_images_of_any_shape(
     world: World, size: tuple[int, int]
 ) -> None:
     camera = CAMERAS.load("workspace").camera("workspace", world.robot, width=size[0], height=size[1])
@@ -88,7 +88,7 @@ def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
     half, middle = gripper.max_width / 2, gripper.object_offset(gripper.max_width)
     for point in ([0, middle, 0], [0, middle + 0.7 * half, 0], [0, middle - 0.7 * half, 0], [0, middle, 0.1]):
         assert inside(camera, pixel(camera, pose, tuple(tcp.apply(np.array(point))))), point
-    # The hand's own x axis runs down in the picture: what lies ahead of the fingers comes in from below. SO-101's mount
+    # The hand's own x axis runs down in the image: what lies ahead of the fingers comes in from below. SO-101's mount
     # looks from there.
     ahead, behind = (pixel(camera, pose, tuple(tcp.apply(np.array([x, 0, 0.05]))))[1] for x in (0.02, -0.02))
     assert turned * (ahead - behind) > 0

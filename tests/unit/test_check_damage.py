@@ -58,7 +58,7 @@ def test_what_is_wrong_in_a_dataset_is_said_without_pythons_words(
     recording = write_episode(tmp_path / "e.mcap", num_frames=10, cameras=())
     export([recording], tmp_path / "d")
     (tmp_path / "d" / "meta" / "stats.json").unlink()
-    code, text = check(tmp_path / "d", capsys, "--no-pictures")
+    code, text = check(tmp_path / "d", capsys, "--no-images")
     assert code == 1
     (line,) = (line for line in text.splitlines() if "dataset_statistics" in line)
     assert line.strip() == (

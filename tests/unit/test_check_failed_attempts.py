@@ -34,7 +34,7 @@ def run(tmp_path: Path) -> Path:
 
 def report_of(path: Path, file: Path) -> SubjectReport:
     """What the check of `path` says about a file."""
-    (report,) = (r for r in check_subjects(find_subjects([path]), CheckOptions(pictures=False)) if r.path == file)
+    (report,) = (r for r in check_subjects(find_subjects([path]), CheckOptions(images=False)) if r.path == file)
     return report
 
 
@@ -122,7 +122,7 @@ def test_where_no_chosen_check_applies_nothing_has_passed(capsys: pytest.Capture
 def test_what_passed_is_one_line_and_what_did_not_is_listed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", [0, 1, 2], cameras=())
     damaged = run / "episodes" / "episode_000001.mcap"
-    only = ("--only", "opens", "checksums", "--no-pictures")
+    only = ("--only", "opens", "checksums", "--no-images")
     code, out = check(capsys, run / "episodes", *only)
     assert code == 0
     assert out.splitlines()[0] == "pass  3 recordings: 6 checks passed"  # two of each

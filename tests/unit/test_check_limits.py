@@ -25,6 +25,6 @@ def test_the_opening_of_a_scaled_gripper_is_scaled_once(width: float, beyond: fl
             writer.write(replace(frame, observation=home))
         writer.finish(outcome)
     export(tmp_path / "a.mcap", tmp_path / "ds")
-    (found,) = checked(tmp_path / "ds", "dataset", only=("joint_limits",), pictures=False).results
+    (found,) = checked(tmp_path / "ds", "dataset", only=("joint_limits",), images=False).results
     assert found.value is not None
     assert (found.value if "gripper" in found.detail else 0.0) == pytest.approx(beyond, abs=1e-6)

@@ -43,11 +43,11 @@ def test_modules_of_the_users_own_are_allowed_in_them() -> None:
         assert shlex.split(line)[2:] == ["/data", "--allow", "mytask", "--allow", "lab.arms"]
 
 
-@pytest.mark.parametrize("without", ["a dataset", "pictures", "torch"])
+@pytest.mark.parametrize("without", ["a dataset", "images", "torch"])
 def test_no_training_is_offered_that_would_not_start(monkeypatch: pytest.MonkeyPatch, without: str) -> None:
     if without == "torch":
         monkeypatch.setattr(generate_report, "find_spec", lambda name: None)
-    result = result_of(Path("/data"), cameras=() if without == "pictures" else ("front",))
+    result = result_of(Path("/data"), cameras=() if without == "images" else ("front",))
     lines = next_commands(result, None if without == "a dataset" else EXPORT)
     assert len(lines) == 2
     assert "lerobot-train" not in " ".join(lines)

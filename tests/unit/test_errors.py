@@ -12,7 +12,7 @@ import av
 import pytest
 from support.present import present
 
-from demorec.core.errors import RecordingError, in_words, resource_error
+from demorec.core.errors import RecordingError, describe_error, resource_error
 
 
 @pytest.mark.parametrize(
@@ -88,5 +88,5 @@ def _raised(code: str) -> Exception:
 )
 def test_errors_of_python_are_told_in_words(code: str, words: str) -> None:
     error = _raised(code)
-    assert in_words(error) == words
-    assert in_words(RecordingError("The recording is damaged: a.mcap")) == "The recording is damaged: a.mcap"
+    assert describe_error(error) == words
+    assert describe_error(RecordingError("The recording is damaged: a.mcap")) == "The recording is damaged: a.mcap"

@@ -81,8 +81,8 @@ def test_a_dataset_holds_what_was_recorded(run: Path, tmp_path: Path) -> None:
         found = video_frames(tmp_path / "d", camera)
         for path in recordings(run):
             with Recording(path) as recording:
-                for picture in recording.images(camera):
-                    assert np.array_equal(next(found), picture)
+                for image in recording.images(camera):
+                    assert np.array_equal(next(found), image)
         assert next(found, None) is None
 
 
@@ -144,13 +144,13 @@ def test_fewer_frames_a_second(run: Path, tmp_path: Path, fps: int, stride: int,
         assert np.allclose(state[row][:7], first.observation.joint_position[:7], atol=1e-6)
         assert np.allclose(action[row][:7], last.action.joint_target, atol=1e-6)
     assert sum(data_table(out).column("next.done").to_pylist()) == 4
-    pictures = list(video_frames(out, "front"))
+    images = list(video_frames(out, "front"))
     expected = []
     for path in recordings(run):
         with Recording(path) as recording:
             expected += list(recording.images("front"))[::stride]
-    assert len(pictures) == len(expected)
-    difference = max(np.abs(a.astype(int) - b).mean() for a, b in zip(pictures, expected, strict=True))
+    assert len(images) == len(expected)
+    difference = max(np.abs(a.astype(int) - b).mean() for a, b in zip(images, expected, strict=True))
     assert difference < 5 if transcoded else difference == 0
 
 
@@ -223,7 +223,7 @@ def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> Non
         for what in ("min", "max", "mean", "std"):
             assert np.allclose(a[name][what], b[name][what], rtol=1e-9), (name, what)
         assert a[name]["count"] == b[name]["count"]
-        if not name.startswith("observation.images"):  # of pictures LeRobot's own rule is used, an average
+        if not name.startswith("observation.images"):  # of images LeRobot's own rule is used, an average
             assert all(a[name][q] == b[name][q] for q in ("q01", "q10", "q50", "q90", "q99"))
     assert attempt_counts(grown) == attempt_counts(whole) == (4, 5)
     rows = episode_rows(grown)

@@ -29,7 +29,7 @@ def run_of(folder: Path, *episodes: Episode) -> Path:
 
 
 def complete(**arguments: Any) -> Episode:
-    """An episode in which every frame has its picture."""
+    """An episode in which every frame has its image."""
     return make_external(cameras=(TOP,), **arguments)
 
 
@@ -78,24 +78,24 @@ def test_packets_go_into_the_dataset_as_they_are(tmp_path: Path) -> None:
     assert all(np.array_equal(a, b) for a, b in zip(shown, recorded, strict=True))
 
 
-def test_a_missing_picture_is_an_error_unless_the_last_may_be_held(tmp_path: Path) -> None:
+def test_a_missing_image_is_an_error_unless_the_last_may_be_held(tmp_path: Path) -> None:
     episode = complete(num_frames=30)
-    gap = [replace(frame, pictures={}) if index in (7, 8) else frame for index, frame in enumerate(episode.frames)]
+    gap = [replace(frame, images={}) if index in (7, 8) else frame for index, frame in enumerate(episode.frames)]
     run = run_of(tmp_path / "run", replace(episode, frames=gap))
-    age = episode.frames[8].time_ns - episode.pictures["top"][6][0]
+    age = episode.frames[8].time_ns - episode.images["top"][6][0]
     with pytest.raises(ExportError, match="Frame 7 has no image of the camera top, as 2 of 30 frames"):
         export(run, tmp_path / "d")
     with pytest.raises(ExportError, match="Frame 8"):
-        export(run, tmp_path / "d", hold_pictures=(age - 10**6) / 1e9)
-    report = export(run, tmp_path / "d", hold_pictures=(age + 10**6) / 1e9)
+        export(run, tmp_path / "d", hold_images=(age - 10**6) / 1e9)
+    report = export(run, tmp_path / "d", hold_images=(age + 10**6) / 1e9)
     assert report.transcoded == ("top, frames show images again, or leave some out",)
     with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
         shown = [float(frame.to_ndarray(format="rgb24")[30, 30, 1]) for frame in file.decode(video=0)]
     assert np.abs(np.array(shown) - [5 * (6 if index in (7, 8) else index) for index in range(30)]).max() < 12
     assert json.loads((tmp_path / "d" / "demorec" / "export.json").read_text())["hold_pictures"] > 0
-    first = replace(episode, frames=[replace(episode.frames[0], pictures={}), *episode.frames[1:]])
+    first = replace(episode, frames=[replace(episode.frames[0], images={}), *episode.frames[1:]])
     with pytest.raises(ExportError, match="none came before it: leave the camera"):
-        export(run_of(tmp_path / "first", first), tmp_path / "e", hold_pictures=9)
+        export(run_of(tmp_path / "first", first), tmp_path / "e", hold_images=9)
 
 
 def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
     """Failed episodes without an image, of other cameras and features, and of another rate."""
     failed: dict[str, Any] = {"episode_index": 1, "num_frames": 5, "success": False}
     without = complete(**failed)
-    without = replace(without, frames=[replace(frame, pictures={}) for frame in without.frames], pictures={"top": []})
+    without = replace(without, frames=[replace(frame, images={}) for frame in without.frames], images={"top": []})
     blind = make_external(cameras=(), **failed | {"episode_index": 2})
     slow = complete(**failed | {"episode_index": 3})
     slow = replace(slow, info=replace(slow.info, fps=20))
@@ -174,14 +174,14 @@ def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     (tmp_path / "run" / "episodes").mkdir(parents=True)
     with EpisodeWriter(tmp_path / "run" / "episodes" / "episode_000000.mcap", episode.info) as writer:
         for frame_, packet in zip(episode.frames, packets, strict=True):
-            writer.picture("top", frame_.time_ns, packet)
+            writer.image("top", frame_.time_ns, packet)
             writer.write(frame_)
         writer.finish(episode.outcome)
     report = export(tmp_path / "run", tmp_path / "d")
     assert report.transcoded == ()
     with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
         assert file.streams.video[0].codec_context.name == "hevc"
-        shown = [int(picture.to_ndarray(format="rgb24").mean()) for picture in file.decode(video=0)]
+        shown = [int(image.to_ndarray(format="rgb24").mean()) for image in file.decode(video=0)]
     assert np.abs(np.array(shown) - 9 * np.arange(12)).max() < 6
 
 

@@ -61,17 +61,17 @@ def test_numbers_are_those_of_the_recording(run: Path, tmp_path: Path) -> None:
             assert observed["object"].shape[1] == len(json.loads(demo["obs/object"].attrs["names"]))
 
 
-def test_pictures_are_the_decoded_ones(run: Path, tmp_path: Path) -> None:
+def test_images_are_the_decoded_ones(run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d.hdf5", "hdf5", depth=True)
     with h5py.File(tmp_path / "d.hdf5") as file:
         for index in range(3):
             demo = file[f"data/demo_{index}/obs"]
             with recording(run, index) as source:
                 for camera in ("front", "wrist"):
-                    pictures, distances = demo[f"{camera}_image"], demo[f"{camera}_depth"]
-                    np.testing.assert_array_equal(pictures[()], np.stack(list(source.images(camera))))
+                    images, distances = demo[f"{camera}_image"], demo[f"{camera}_depth"]
+                    np.testing.assert_array_equal(images[()], np.stack(list(source.images(camera))))
                     np.testing.assert_array_equal(distances[..., 0], np.stack(list(source.depth(camera))))
-                    assert (pictures.chunks, pictures.compression) == ((1, 48, 64, 3), "gzip")
+                    assert (images.chunks, images.compression) == ((1, 48, 64, 3), "gzip")
                     assert (distances.chunks, distances.dtype) == ((1, 48, 64, 1), np.float32)
 
 
@@ -103,13 +103,13 @@ def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
 
     import demorec.gym_env  # noqa: F401  (registers the environments)
 
-    # Environments have pictures of one size, the recordings of this run have two.
+    # Environments have images of one size, the recordings of this run have two.
     features = ("observation.velocity", "observation.images.wrist")
     export(run, tmp_path / "d.hdf5", "hdf5", features=features, action="ee")
     with h5py.File(tmp_path / "d.hdf5") as file:
         described = json.loads(file["data"].attrs["env_args"])
-        pictures = [name for name in file["data/demo_0/obs"] if name.endswith("_image")]
-        shapes = {name.removesuffix("_image"): file[f"data/demo_0/obs/{name}"].shape[1:] for name in pictures}
+        images = [name for name in file["data/demo_0/obs"] if name.endswith("_image")]
+        shapes = {name.removesuffix("_image"): file[f"data/demo_0/obs/{name}"].shape[1:] for name in images}
     assert described["type"] == 2  # robomimic's EnvType.GYM_TYPE
     env = gymnasium.make(described["env_name"], **described["env_kwargs"])
     assert env.action_space.shape == (8,)

@@ -1,4 +1,4 @@
-"""Mp4 files of remuxed pictures, read back with FFmpeg: timing, pictures, index in front."""
+"""Mp4 files of remuxed images, read back with FFmpeg: timing, images, index in front."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from demorec.mcap.video import decode, is_keyframe, make_encoder
 WIDTH, HEIGHT = 64, 48
 
 
-def pictures(count: int, seed: int = 0) -> list[np.ndarray[Any, Any]]:
+def images(count: int, seed: int = 0) -> list[np.ndarray[Any, Any]]:
     rng = np.random.default_rng(seed)
     base = rng.integers(0, 255, (HEIGHT // 8, WIDTH // 8, 3)).astype(np.uint8).repeat(8, axis=0).repeat(8, axis=1)
     return [np.roll(base, 3 * index, axis=1) for index in range(count)]
@@ -32,7 +32,7 @@ def encoded(
     codec: str, count: int, *, fps: int = 30, seed: int = 0, crf: int | None = None
 ) -> tuple[VideoSettings, list[bytes]]:
     encoder = make_encoder(video=VideoConfig(codec=codec, crf=crf), width=WIDTH, height=HEIGHT, fps=fps)  # type: ignore[arg-type]
-    packets = [packet for picture in pictures(count, seed) for packet in encoder.encode(picture)] + encoder.finish()
+    packets = [packet for image in images(count, seed) for packet in encoder.encode(image)] + encoder.finish()
     return encoder.settings, packets
 
 
@@ -55,9 +55,9 @@ def video_of(codec: str, packets: list[bytes]) -> EncodedVideo:
 
 
 @pytest.mark.parametrize(("codec", "fps"), [("h264", 30), ("h264", 7), ("h264", 240), ("av1", 30), ("av1", 15)])
-def test_every_picture_and_time_comes_back(tmp_path: Path, codec: str, fps: int) -> None:
-    first, first_pictures = coded(codec, 9, fps=fps)
-    second, second_pictures = coded(codec, 4, fps=fps, seed=1)
+def test_every_image_and_time_comes_back(tmp_path: Path, codec: str, fps: int) -> None:
+    first, first_images = coded(codec, 9, fps=fps)
+    second, second_images = coded(codec, 4, fps=fps, seed=1)
     writer = Mp4Writer(tmp_path / "a.mp4", first, fps=fps)
     writer.add(first)
     writer.add(second)
@@ -72,7 +72,7 @@ def test_every_picture_and_time_comes_back(tmp_path: Path, codec: str, fps: int)
         assert present(stream.duration) * present(stream.time_base) == Fraction(13, fps)
         frames = list(container.decode(stream))
     assert [present(frame.pts) * present(frame.time_base) for frame in frames] == [Fraction(n, fps) for n in range(13)]
-    for frame, expected in zip(frames, first_pictures + second_pictures, strict=True):
+    for frame, expected in zip(frames, first_images + second_images, strict=True):
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected)
 
 
@@ -93,7 +93,7 @@ def test_the_index_is_in_front_and_seeking_finds_keyframes(tmp_path: Path) -> No
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected[number])
 
 
-def test_pictures_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path) -> None:
+def test_images_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path) -> None:
     videos = [coded("h264", count, seed=count)[0] for count in (5, 9, 3, 7)]
     aside = tmp_path / "aside"
     aside.mkdir()
@@ -106,7 +106,7 @@ def test_pictures_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path
         assert list(aside.iterdir()) == []
 
 
-def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_images_that_are_none_are_refused(tmp_path: Path) -> None:
     _, units = encoded("av1", 3)
     for nothing in (b"", b"\x12\x00"):  # the second is a temporal delimiter alone
         with pytest.raises(ExportError, match="no image"):
@@ -153,7 +153,7 @@ def hevc_units(count: int) -> list[bytes]:
     context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     context.time_base, context.framerate = Fraction(1, 30), Fraction(30)
     context.options = {"x265-params": "bframes=0:repeat-headers=1:log-level=none"}
-    frames = [av.VideoFrame.from_ndarray(picture, format="rgb24") for picture in pictures(count)]
+    frames = [av.VideoFrame.from_ndarray(image, format="rgb24") for image in images(count)]
     packets = [packet for frame in frames for packet in context.encode(frame.reformat(format="yuv420p"))]
     return [bytes(packet) for packet in packets + context.encode(None)]
 

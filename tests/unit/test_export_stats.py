@@ -1,4 +1,4 @@
-"""Statistics against NumPy: of episodes, of pictures, and of data files in bounded memory."""
+"""Statistics against NumPy: of episodes, of images, and of data files in bounded memory."""
 
 from __future__ import annotations
 
@@ -80,13 +80,13 @@ def test_statistics_of_files_equal_those_of_numpy(tmp_path: Path, count: int) ->
         check(found[name], column)
 
 
-def test_statistics_of_pictures_equal_those_of_numpy() -> None:
+def test_statistics_of_images_equal_those_of_numpy() -> None:
     rng = np.random.default_rng(1)
-    pictures = rng.integers(0, 256, (5, 20, 30, 3)).astype(np.uint8)
-    pictures[..., 1] //= 9
-    counts = np.stack([np.bincount(pictures[..., c].ravel(), minlength=256) for c in range(3)])
+    images = rng.integers(0, 256, (5, 20, 30, 3)).astype(np.uint8)
+    images[..., 1] //= 9
+    counts = np.stack([np.bincount(images[..., c].ravel(), minlength=256) for c in range(3)])
     found = PixelHistogram(counts=counts, level_values=colour_levels(), num_images=5).statistics()
-    expected = pictures.reshape(-1, 3) / 255
+    expected = images.reshape(-1, 3) / 255
     for name, q in QUANTILES.items():
         assert np.allclose(found.values[name], np.quantile(expected, q, axis=0), atol=1e-15)
     assert np.allclose(found.values["mean"], expected.mean(axis=0), rtol=1e-12)

@@ -28,12 +28,12 @@ def steady(**changes: Any) -> Episode:
     for index, frame in enumerate(episode.frames):
         time_ns = 10**18 + index * 33_333_333
         samples = {name: Sample(stamp_ns=time_ns, vector=one.vector) for name, one in frame.samples.items()}
-        frames.append(SampledFrame(time_ns=time_ns, samples=samples, pictures={"top": index, "side": index}))
-        pixels = episode.pictures["top"][index][1]
+        frames.append(SampledFrame(time_ns=time_ns, samples=samples, images={"top": index, "side": index}))
+        pixels = episode.images["top"][index][1]
         top.append((time_ns, pixels))
         side.append((time_ns, pixels[::-1].copy()))
     return replace(
-        episode, frames=frames, pictures={"top": top, "side": side}, outcome=replace(episode.outcome, drops={})
+        episode, frames=frames, images={"top": top, "side": side}, outcome=replace(episode.outcome, drops={})
     )
 
 
@@ -43,15 +43,15 @@ def shifted(frame: SampledFrame, *, by: int) -> SampledFrame:
 
 
 def moved(offset: Callable[[int], int]) -> Callable[[Episode], Episode]:
-    """Frames and their pictures later by so much."""
+    """Frames and their images later by so much."""
 
     def change(episode: Episode) -> Episode:
-        pictures = {
+        images = {
             name: [(stamp + offset(index), pixels) for index, (stamp, pixels) in enumerate(ones)]
-            for name, ones in episode.pictures.items()
+            for name, ones in episode.images.items()
         }
         frames = [shifted(frame, by=offset(index)) for index, frame in enumerate(episode.frames)]
-        return replace(episode, frames=frames, pictures=pictures)
+        return replace(episode, frames=frames, images=images)
 
     return change
 
@@ -88,13 +88,13 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
     "half the rate": (moved(lambda i: i * 40_000_000), "rate", "fail"),
     "a late sensor": (older("observation.force", 2 * 10**8), "sample_age", "warn"),
     "a clock offset": (older("action", 3 * 10**9), "sample_age", "fail"),
-    "late pictures": (
-        lambda e: replace(e, pictures={**e.pictures, "top": [(s - 3 * 10**8, p) for s, p in e.pictures["top"]]}),
+    "late images": (
+        lambda e: replace(e, images={**e.images, "top": [(s - 3 * 10**8, p) for s, p in e.images["top"]]}),
         "image_age",
         "warn",
     ),
-    "a missing picture": (
-        each(lambda i, f: replace(f, pictures={"top": f.pictures["top"]}) if i == 9 else f),
+    "a missing image": (
+        each(lambda i, f: replace(f, images={"top": f.images["top"]}) if i == 9 else f),
         "missing_images",
         "warn",
     ),
@@ -112,23 +112,23 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
     "a joint too fast": (state(lambda i, v: [v[0] + 0.9 * (i % 2), *v[1:]]), "joint_speed", "fail"),
     "drops": (lambda e: replace(e, outcome=replace(e.outcome, drops={"frames": 3})), "drops", "warn"),
     "a covered camera": (
-        lambda e: replace(e, pictures={**e.pictures, "side": [(s, p * 0) for s, p in e.pictures["side"]]}),
+        lambda e: replace(e, images={**e.images, "side": [(s, p * 0) for s, p in e.images["side"]]}),
         "images_show_something",
         "fail",
     ),
     "cameras that change places": (
         lambda e: replace(
             e,
-            pictures={
-                "top": [*e.pictures["top"][:15], *e.pictures["side"][15:]],
-                "side": [*e.pictures["side"][:15], *e.pictures["top"][15:]],
+            images={
+                "top": [*e.images["top"][:15], *e.images["side"][15:]],
+                "side": [*e.images["side"][:15], *e.images["top"][15:]],
             },
         ),
         "exchanged_cameras",
         "fail",
     ),
     "one camera twice": (
-        lambda e: replace(e, pictures={**e.pictures, "side": e.pictures["top"]}),
+        lambda e: replace(e, images={**e.images, "side": e.images["top"]}),
         "distinct_cameras",
         "fail",
     ),

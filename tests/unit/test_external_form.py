@@ -19,12 +19,12 @@ from support.external import (
     WRIST,
     make_external,
     write_external,
-    write_pictures_and_frames,
+    write_images_and_frames,
 )
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
-from demorec.episode.episode import NO_PICTURE, Sample, SampledFrame
+from demorec.episode.episode import NO_IMAGE, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.mcap import EpisodeWriter, Recording, recover
 
@@ -49,13 +49,13 @@ def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
         assert values.tobytes() == b"".join(frame.samples[feature.name].vector.tobytes() for frame in episode.frames)
         assert columns.stamps[feature.name].tolist() == [f.samples[feature.name].stamp_ns for f in episode.frames]
     for camera in cameras:
-        expected = [frame.pictures.get(camera.name, NO_PICTURE) for frame in episode.frames]
-        assert columns.pictures[camera.name].tolist() == expected
-        assert columns.picture_stamps[camera.name].tolist() == [stamp for stamp, _ in episode.pictures[camera.name]]
+        expected = [frame.images.get(camera.name, NO_IMAGE) for frame in episode.frames]
+        assert columns.images[camera.name].tolist() == expected
+        assert columns.image_stamps[camera.name].tolist() == [stamp for stamp, _ in episode.images[camera.name]]
     if num_frames > 1 and cameras:
-        assert columns.pictures["wrist"][:3].tolist() == [NO_PICTURE, 0, 0]
+        assert columns.images["wrist"][:3].tolist() == [NO_IMAGE, 0, 0]
         assert columns.age_ns("observation.state").tolist() == [1_000_000] * num_frames
-        assert columns.picture_age_ns("top").tolist() == [7_000_000] * num_frames
+        assert columns.image_age_ns("top").tolist() == [7_000_000] * num_frames
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
@@ -65,13 +65,13 @@ def test_pixels_are_coded_once_and_found_by_their_frame(tmp_path: Path, codec: L
     with Recording(path) as recording:
         images = list(recording.images("top"))
         assert len(images) == 45
-        for picture, (_, pixels) in zip(images, episode.pictures["top"], strict=True):
-            assert np.abs(picture.astype(int) - pixels).mean() < 8
+        for image, (_, pixels) in zip(images, episode.images["top"], strict=True):
+            assert np.abs(image.astype(int) - pixels).mean() < 8
         assert recording.image("wrist", 0) is None
         third, last = recording.image("wrist", 2), recording.image("wrist", -1)
         assert third is not None
         assert last is not None
-        assert abs(int(third[4, 4, 1]) - 5 * 1) < 8  # the picture of frame 1
+        assert abs(int(third[4, 4, 1]) - 5 * 1) < 8  # the image of frame 1
         assert abs(int(last[4, 4, 1]) - 5 * 43) < 8
         assert recording.pixel_statistics("top").num_images == 23  # every other one
 
@@ -98,17 +98,17 @@ def test_packets_that_came_coded_stay_byte_for_byte(tmp_path: Path, codec: Liter
     episode = make_external(num_frames=25, cameras=(camera,))
     with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
         for frame, packet in zip(episode.frames, packets, strict=True):
-            writer.picture("top", frame.time_ns, packet)
+            writer.image("top", frame.time_ns, packet)
             writer.write(frame)
         writer.finish(episode.outcome)
     with Recording(tmp_path / "a.mcap") as recording:
         assert [packet.data for packet in recording.packets("top")] == packets
-        assert bytes(recording.coded_pictures(["top"])["top"].joined()) == b"".join(packets)
+        assert bytes(recording.coded_images(["top"])["top"].joined()) == b"".join(packets)
         assert [packet.frame_index for packet in recording.packets("top") if packet.is_keyframe] == [0, 10, 20]
-        pictures = list(recording.images("top"))
+        images = list(recording.images("top"))
         assert recording.video_settings("top").codec == codec
         assert recording.pixel_statistics("top").num_images == 13
-    assert all(abs(int(picture.mean()) - 4 * index) < 6 for index, picture in enumerate(pictures))
+    assert all(abs(int(image.mean()) - 4 * index) < 6 for index, image in enumerate(images))
 
 
 def _frame(**changes: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
@@ -120,8 +120,8 @@ def _sample(feature: str, vector: object, stamp_ns: object = 5) -> Callable[[Epi
     return lambda writer, frame: writer.write(replace(frame, samples={**frame.samples, feature: sample}))
 
 
-def _picture(*arguments: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
-    return lambda writer, frame: writer.picture(*arguments)
+def _image(*arguments: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
+    return lambda writer, frame: writer.image(*arguments)
 
 
 PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
@@ -140,13 +140,13 @@ BAD: dict[str, tuple[Callable[[EpisodeWriter, SampledFrame], object], str]] = {
     "negative time": (_frame(time_ns=-1), "allowed are 0 to"),
     "float time": (_frame(time_ns=1.5), "must be a whole number of nanoseconds"),
     "feature goes back": (_sample("action", np.zeros(3), 7), "The feature 'action' of frame 1 has the stamp 7 ns"),
-    "no such picture": (_frame(pictures={"top": 9}), "has no image 9 for frame 1, it has 1 so far"),
-    "no such camera": (_frame(pictures={"front": 0}), "camera 'front' has no image 0"),
-    "unknown camera": (_picture("tip", 5, PIXELS), "Unknown camera 'tip'.*'top'"),
-    "size": (_picture("top", 2 * 10**18, PIXELS[:-1]), r"uint8 of shape \(47, 64, 3\), it must be uint8 of shape"),
-    "float picture": (_picture("top", 2 * 10**18, PIXELS / 255), "is float64 of shape"),
-    "bytes for pixels": (_picture("top", 2 * 10**18, b"x"), "is bytes, it must be uint8"),
-    "picture goes back": (_picture("top", 5, PIXELS), "image of the camera 'top' has the stamp 5 ns, the one before"),
+    "no such image": (_frame(images={"top": 9}), "has no image 9 for frame 1, it has 1 so far"),
+    "no such camera": (_frame(images={"front": 0}), "camera 'front' has no image 0"),
+    "unknown camera": (_image("tip", 5, PIXELS), "Unknown camera 'tip'.*'top'"),
+    "size": (_image("top", 2 * 10**18, PIXELS[:-1]), r"uint8 of shape \(47, 64, 3\), it must be uint8 of shape"),
+    "float image": (_image("top", 2 * 10**18, PIXELS / 255), "is float64 of shape"),
+    "bytes for pixels": (_image("top", 2 * 10**18, b"x"), "is bytes, it must be uint8"),
+    "image goes back": (_image("top", 5, PIXELS), "image of the camera 'top' has the stamp 5 ns, the one before"),
 }
 
 
@@ -155,10 +155,10 @@ def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what
     act, words = BAD[what]
     episode = make_external(num_frames=2, cameras=(TOP,))
     with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        writer.picture("top", *episode.pictures["top"][0])
+        writer.image("top", *episode.images["top"][0])
         writer.write(episode.frames[0])
         with pytest.raises(RecordingError, match=words) as error:
-            act(writer, replace(episode.frames[1], pictures={}))
+            act(writer, replace(episode.frames[1], images={}))
     assert "\n" not in str(error.value)
 
 
@@ -191,7 +191,7 @@ def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str,
 def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) -> None:
     episode = make_external(num_frames=100)
     with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        write_pictures_and_frames(writer, episode)
+        write_images_and_frames(writer, episode)
         data = (tmp_path / "a.mcap.part").read_bytes()
     (tmp_path / "b.mcap.part").write_bytes(data)
     with pytest.raises(DemorecError, match="cut off"):
@@ -204,7 +204,7 @@ def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) ->
         assert recording.outcome is None
         columns = recording.columns()
         assert columns.time_ns.tolist() == [frame.time_ns for frame in episode.frames[: result.num_frames]]
-        assert int(columns.pictures["top"].max()) == result.num_frames - 1
+        assert int(columns.images["top"].max()) == result.num_frames - 1
         assert len(list(recording.images("top"))) >= result.num_frames
 
 
@@ -226,10 +226,10 @@ def test_what_a_killed_import_left_is_made_again(tmp_path: Path) -> None:
     episode = make_external(num_frames=3)
     imported = replace(episode, info=replace(episode.info, origin=origin))
     with EpisodeWriter(tmp_path / "a.mcap", imported.info) as writer:
-        write_pictures_and_frames(writer, imported)
+        write_images_and_frames(writer, imported)
     write_external(tmp_path / "a.mcap", imported)
     (tmp_path / "a.mcap").unlink()
     with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        write_pictures_and_frames(writer, episode)
+        write_images_and_frames(writer, episode)
     with pytest.raises(ConfigError, match="unfinished recording"):  # of the Recorder: nobody can make it again
         write_external(tmp_path / "a.mcap", episode)

@@ -98,7 +98,7 @@ def test_an_episode_depends_on_its_plan_alone() -> None:
     assert len(set(alone)) == 2
 
 
-def test_pictures_do_not_disturb_the_physics() -> None:
+def test_images_do_not_disturb_the_physics() -> None:
     _, without = run(episode(4, max_episode_seconds=1.0))
     frames, outcome = run(episode(4, max_episode_seconds=1.0, cameras=("front",), width=32, height=32, renderer="tiny"))
     assert outcome.final_state_digest == without.final_state_digest

@@ -69,7 +69,7 @@ def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], 
 
 
 @pytest.mark.parametrize("camera", ["front", "wrist"])
-def test_coded_pictures_are_passed_on_unchanged(saved: dict[str, list[Any]], recording: Path, camera: str) -> None:
+def test_coded_images_are_passed_on_unchanged(saved: dict[str, list[Any]], recording: Path, camera: str) -> None:
     with Recording(recording) as source:
         packets = list(source.packets(camera))
     rows = _column(saved[f"/world/cameras/{camera}"], "VideoStream:sample")

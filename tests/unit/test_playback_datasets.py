@@ -77,8 +77,8 @@ def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path)
     export(run, tmp_path / "d", depth=True)
     with open_dataset_episode(tmp_path / "d", 1) as episode:  # the second in its file
         assert episode.info.simulation is not None
-        times, pictures = zip(*episode.depth["front"](), strict=True)
-        shown = np.array(pictures)
+        times, images = zip(*episode.depth["front"](), strict=True)
+        shown = np.array(images)
         assert list(times) == episode.time_ns.tolist()
         packets = list(episode.videos["front"].packets())
     with Recording(run / "episodes" / "episode_000001.mcap") as recording:

@@ -119,7 +119,7 @@ def test_the_viewer_draws_every_drawable_character(tmp_path: Path) -> None:
     recording.disconnect()
     with HeadlessViewer(tmp_path / "x.rrd") as viewer:
         viewer.seek(0.0)
-        viewer.save_picture(tmp_path / "x.png")
+        viewer.save_image(tmp_path / "x.png")
         assert len(viewer.client.get_state().views) >= 3  # text, log and states
     assert (tmp_path / "x.png").stat().st_size > 10_000
 
@@ -132,7 +132,7 @@ def test_a_character_without_a_glyph_is_named(tmp_path: Path) -> None:
     recording.log("text", rr.TextDocument("一"), static=True)
     recording.disconnect()
     with pytest.raises(RecordingError, match=r"cannot draw '一' \(U\+4E00\)"), HeadlessViewer(tmp_path / "x.rrd") as v:
-        v.save_picture(tmp_path / "x.png")
+        v.save_image(tmp_path / "x.png")
 
 
 @pytest.mark.slow

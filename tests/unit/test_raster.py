@@ -1,4 +1,4 @@
-"""The rasteriser: cached pictures, shadows, textures, light, levels of detail, changes that it must notice."""
+"""The rasteriser: cached images, shadows, textures, light, levels of detail, changes that it must notice."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def client() -> Any:
     connection.disconnect()
 
 
-def picture(client: Any, camera: Any, **changes: Any) -> Any:
+def image(client: Any, camera: Any, **changes: Any) -> Any:
     with RasterRenderer() as raster:
         raster.setup(scenes.setup(client, camera, **changes))
         return scenes.draw(raster, client)[camera.name]
@@ -102,7 +102,7 @@ def test_what_stood_still_and_was_moved_is_noticed(client: Any) -> None:
     client.resetBasePositionAndOrientation(body, [0.2, 0.0, 0.0], [0, 0, 0, 1])
     after = scenes.draw(raster, client)["front"]
     assert not np.array_equal(present(before.segmentation), present(after.segmentation))
-    assert same(after, picture(client, scenes.camera(64, 64)))
+    assert same(after, image(client, scenes.camera(64, 64)))
 
 
 def test_procedural_textures_are_drawn(client: Any) -> None:
@@ -110,8 +110,8 @@ def test_procedural_textures_are_drawn(client: Any) -> None:
 
     texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=2.0)
     body = scenes.add(client, "box", (0.4, 0.4, 0.4), rgbaColor=[1, 1, 1, 1])
-    plain = picture(client, scenes.camera(128, 128))
-    checked = picture(client, scenes.camera(128, 128), textures={body: texture})
+    plain = image(client, scenes.camera(128, 128))
+    checked = image(client, scenes.camera(128, 128), textures={body: texture})
     top = plain.segmentation == body
     assert plain.color[top].max() - plain.color[top].min() < 140
     assert checked.color[top].min() < 10
@@ -128,8 +128,8 @@ def test_distant_textures_turn_to_their_mean(client: Any) -> None:
     camera = scenes.camera(192, 192, mount_from_camera=look_at((2.7, -1.35, 2.25), (0.0, 0.0, 0.0)))
     origin, direction = scenes.rays(camera, Pose())
     for smooth in (True, False):
-        seen = picture(client, camera, textures={body: texture}, antialias=smooth)
-        flat = picture(client, camera, antialias=smooth)
+        seen = image(client, camera, textures={body: texture}, antialias=smooth)
+        flat = image(client, camera, antialias=smooth)
         on_top = np.abs(seen.depth - (0.01 - origin[2]) / direction[..., 2]) < 1e-3
         inner = on_top & scenes.away_from_borders(on_top.astype(np.int32), 3)
         assert inner.sum() > 500
@@ -145,8 +145,8 @@ def test_a_shadow_lies_where_the_light_puts_it(client: Any) -> None:
     scenes.add(client, "sphere", (radius,), Pose(position=np.array([0.0, 0.0, height])))
     light = Light(direction=(0.5, -0.4, 1.0))
     camera = scenes.camera(320, 240)
-    images = picture(client, camera, light=light)
-    unshadowed = picture(client, camera, light=Light(direction=light.direction, shadow=0.0))
+    images = image(client, camera, light=light)
+    unshadowed = image(client, camera, light=Light(direction=light.direction, shadow=0.0))
     origin, direction = scenes.rays(camera, Pose())
     place = origin + (-origin[2] / direction[..., 2])[..., None] * direction
     towards = np.array(light.direction) / math.sqrt(0.25 + 0.16 + 1)
@@ -196,7 +196,7 @@ def test_a_camera_inside_a_mesh_clips_more_than_there_is_room_for(client: Any) -
 def test_planes_reach_the_horizon(client: Any) -> None:
     body = scenes.add(client, "plane", ())
     camera = scenes.camera(96, 96, far=50.0)
-    images = picture(client, camera)
+    images = image(client, camera)
     origin, direction = scenes.rays(camera, Pose())
     depth = -origin[2] / direction[..., 2]
     expected = (depth > 0) & (depth < 50)

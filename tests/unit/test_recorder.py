@@ -19,7 +19,7 @@ from support.external import URDF
 from demorec import Recorder
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.episode.episode import NO_PICTURE
+from demorec.episode.episode import NO_IMAGE
 from demorec.episode.info import Camera, Feature
 from demorec.mcap import Recording
 from demorec.mcap.recorder.encoder import Encoder
@@ -60,11 +60,11 @@ def test_what_was_given_is_recorded_to_the_bit(tmp_path: Path) -> None:
         assert (found.info.robot_name, found.info.instruction, found.info.fps) == ("so101", "stack", 30)
         assert found.outcome is not None
         assert (found.outcome.success, found.outcome.num_frames, found.outcome.drops) == (True, 40, {})
-        for index, picture in enumerate(found.images("top")):
-            assert abs(int(picture.mean()) - 5 * index) < 4
+        for index, image in enumerate(found.images("top")):
+            assert abs(int(image.mean()) - 5 * index) < 4
 
 
-def test_stamps_of_the_caller_and_missing_or_repeated_pictures(tmp_path: Path) -> None:
+def test_stamps_of_the_caller_and_missing_or_repeated_images(tmp_path: Path) -> None:
     with recorder(tmp_path / "run", cameras=TOP) as run, run.episode() as episode:
         episode.write([0.0], [0.0], {"top": None}, time_ns=100, stamps={"observation.state": 90})
         episode.write([1.0], [0.0], {"top": (PIXELS, 150)}, time_ns=200)
@@ -74,8 +74,8 @@ def test_stamps_of_the_caller_and_missing_or_repeated_pictures(tmp_path: Path) -
         columns = found.columns()
         assert columns.time_ns.tolist() == [100, 200, 300, 400]
         assert columns.stamps["observation.state"].tolist() == [90, 200, 300, 400]
-        assert columns.pictures["top"].tolist() == [NO_PICTURE, 0, 0, 1]
-        assert columns.picture_stamps["top"].tolist() == [150, 350]
+        assert columns.images["top"].tolist() == [NO_IMAGE, 0, 0, 1]
+        assert columns.image_stamps["top"].tolist() == [150, 350]
         assert found.outcome is not None
         assert found.outcome.success is None
 
@@ -380,5 +380,5 @@ def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: si
     with recording_of(tmp_path / "run") as found:
         columns = found.columns()
         assert columns.features["observation.state"][:, 0].tolist() == list(range(first.num_frames))
-        assert columns.pictures["top"].tolist() == list(range(first.num_frames))
+        assert columns.images["top"].tolist() == list(range(first.num_frames))
         assert found.is_recovered == (number == signal.SIGKILL)

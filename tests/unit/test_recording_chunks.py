@@ -14,7 +14,7 @@ from support.recording import write_episode
 from demorec.mcap.chunks import blocks_of
 from demorec.mcap.container import Container
 from demorec.mcap.limits import Limits
-from demorec.mcap.messages import PictureMessages, coded_pictures
+from demorec.mcap.messages import ImageMessages, coded_images
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +60,15 @@ def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> Non
         blocks_of([content], {"/one": 1}, LIMITS)
 
 
-def test_pictures_of_several_formats_and_cut_off_ones() -> None:
-    made = [PictureMessages("a", "h264").compressed_image(0, b"one")]
-    made += [PictureMessages("a longer frame", "jpeg").compressed_image(7, b"three")]
+def test_images_of_several_formats_and_cut_off_ones() -> None:
+    made = [ImageMessages("a", "h264").compressed_image(0, b"one")]
+    made += [ImageMessages("a longer frame", "jpeg").compressed_image(7, b"three")]
     for messages in (made, made[:1] * 2):
         block = blocks_of([b"".join(message(1, 0, data) for data in messages)], {"/x": 1}, LIMITS)["/x"]
-        assert list(coded_pictures(block, "h264").messages()) == (
+        assert list(coded_images(block, "h264").messages()) == (
             [b"one", b"three"] if messages is made else [b"one"] * 2
         )
         for cut in (1, len(messages[-1]) - 3):
             short = replace(block, lengths=block.lengths - np.array([0, cut]))
             with pytest.raises((ValueError, struct.error)):
-                coded_pictures(short, "h264")
+                coded_images(short, "h264")

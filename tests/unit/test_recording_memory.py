@@ -94,18 +94,18 @@ def test_numbers_of_a_long_external_episode_take_little_more_memory_than_they_ar
     assert peaks[2] - peaks[1] < 4 * (num_bytes[2] - num_bytes[1])
 
 
-def test_numbers_of_a_external_episode_are_read_without_its_pictures(tmp_path: Path) -> None:
+def test_numbers_of_a_external_episode_are_read_without_its_images(tmp_path: Path) -> None:
     given = make_external(cameras=(replace(TOP, kept="jpeg"),), num_frames=120)
     noise = np.random.default_rng(0)
     num_bytes = 0
     with EpisodeWriter(tmp_path / "a.mcap", given.info) as writer:
         for number, frame in enumerate(given.frames):
             num_bytes += 200_000
-            assert writer.picture("top", frame.time_ns, noise.bytes(200_000)) == number
+            assert writer.image("top", frame.time_ns, noise.bytes(200_000)) == number
             writer.write(frame)
         writer.finish(given.outcome)
     with Recording(tmp_path / "a.mcap") as recording:
-        # A chunk has the pictures of a second, and is there compressed and unpacked.
+        # A chunk has the images of a second, and is there compressed and unpacked.
         assert peak_bytes(recording.columns) < num_bytes * 0.7
-        stamps = recording.columns().picture_stamps["top"].tolist()
+        stamps = recording.columns().image_stamps["top"].tolist()
     assert stamps == [frame.time_ns for frame in given.frames]

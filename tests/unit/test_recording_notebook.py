@@ -1,4 +1,4 @@
-"""A recording in a notebook: a sequence of frames with pictures, a table, a page, and the examples of the documents."""
+"""A recording in a notebook: a sequence of frames with images, a table, a page, and the examples of the documents."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def same_frame(found: Frame, true: Frame) -> None:
         assert np.allclose(images.world_from_camera.position, true.images[camera].world_from_camera.position)
 
 
-def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -> None:
+def test_frames_come_with_numbers_and_images(path: Path, truth: list[Frame]) -> None:
     with Recording(path) as recording:
         assert len(recording) == NUM_FRAMES
         count = 0
@@ -62,7 +62,7 @@ def test_frames_come_with_numbers_and_pictures(path: Path, truth: list[Frame]) -
 
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
-def test_a_picked_picture_is_that_of_the_whole_stream(tmp_path: Path, codec: Codec) -> None:
+def test_a_picked_image_is_that_of_the_whole_stream(tmp_path: Path, codec: Codec) -> None:
     file = write_episode(tmp_path / "a.mcap", num_frames=12, video=VideoConfig(codec=codec, gop=5))
     with Recording(file) as recording:
         whole = list(recording.images("wrist"))
@@ -94,19 +94,19 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
 
 
 class Page(HTMLParser):
-    """Collects the text of a page and its pictures; knows which elements were opened and closed."""
+    """Collects the text of a page and its images; knows which elements were opened and closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.texts: list[str] = []
-        self.pictures: list[bytes] = []
+        self.images: list[bytes] = []
         self.tags: set[str] = set()
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.add(tag)
         if tag == "img":
-            self.pictures.append(base64.b64decode(present(dict(attrs)["src"]).partition("base64,")[2]))
+            self.images.append(base64.b64decode(present(dict(attrs)["src"]).partition("base64,")[2]))
 
     def handle_data(self, data: str) -> None:
         self.texts.append(data)
@@ -121,8 +121,8 @@ def test_the_page_of_a_notebook(path: Path) -> None:
         assert what in text
     assert "47 frames (1.6 s at 30 Hz)" in line
     assert "\n" not in line
-    pictures = [np.asarray(Image.open(io.BytesIO(data))) for data in page.pictures]
-    assert [frame_number(picture) for picture in pictures] == 2 * [0, 12, 23, 34, 46]
+    images = [np.asarray(Image.open(io.BytesIO(data))) for data in page.images]
+    assert [frame_number(image) for image in images] == 2 * [0, 12, 23, 34, 46]
 
 
 def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Path) -> None:
@@ -161,7 +161,7 @@ def test_a_simulated_recording_says_which_image_each_frame_holds(path: Path) -> 
     with open_recording(path, simulated=True) as recording:
         columns, info = recording.columns(), recording.info
         for camera in info.cameras:
-            assert columns.pictures[camera.name].tolist() == list(range(NUM_FRAMES))
-            assert not columns.picture_age_ns(camera.name).any()
+            assert columns.images[camera.name].tolist() == list(range(NUM_FRAMES))
+            assert not columns.image_age_ns(camera.name).any()
         assert [camera.name for camera in info.cameras] == list(recording.cameras)
         assert np.array_equal(np.reshape(present(info.cameras[0].intrinsics), (3, 3)), info.scene.cameras[0].intrinsics)

@@ -72,7 +72,7 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
 
 
 @pytest.mark.parametrize("video", CODECS, ids=lambda video: f"{video.codec}-{video.gop}")
-def test_pictures(tmp_path: Path, video: VideoConfig) -> None:
+def test_images(tmp_path: Path, video: VideoConfig) -> None:
     info, frames, outcome = make_episode(num_frames=64)
     path = record(tmp_path / "a.mcap", frames, info, outcome, video)
     with Recording(path) as recording:
@@ -82,15 +82,15 @@ def test_pictures(tmp_path: Path, video: VideoConfig) -> None:
             assert [packet.time_ns for packet in packets] == [frame.time_ns for frame in frames]
             gop = 1 if video.codec == "jpeg" else video.gop
             assert [packet.is_keyframe for packet in packets] == [index % gop == 0 for index in range(64)]
-            pictures = list(recording.images(camera))
-            assert len(pictures) == 64
-            for frame, picture in zip(frames, pictures, strict=True):
+            images = list(recording.images(camera))
+            assert len(images) == 64
+            for frame, image in zip(frames, images, strict=True):
                 original = frame.images[camera].color
-                assert picture.shape == original.shape
-                assert picture.dtype == np.uint8
-                assert frame_number(picture) == frame.frame_index
+                assert image.shape == original.shape
+                assert image.dtype == np.uint8
+                assert frame_number(image) == frame.frame_index
                 other = frame.images["wrist" if camera == "front" else "front"].color
-                errors = [np.abs(picture.astype(int) - expected).mean() for expected in (original, other)]
+                errors = [np.abs(image.astype(int) - expected).mean() for expected in (original, other)]
                 assert errors[0] < 8
                 assert errors[0] < errors[1]
             settings = recording.video_settings(camera)
@@ -132,14 +132,14 @@ def test_without_depth_it_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("width", "height", "step"), [(64, 48, 1), (640, 480, 4)])
-def test_statistics_are_of_every_other_picture(tmp_path: Path, width: int, height: int, step: int) -> None:
-    """Every fourth row of it, each quarter in turn; large pictures thinned as LeRobot thins them."""
+def test_statistics_are_of_every_other_image(tmp_path: Path, width: int, height: int, step: int) -> None:
+    """Every fourth row of it, each quarter in turn; large images thinned as LeRobot thins them."""
     info, frames, outcome = make_episode(num_frames=7, width=width, height=height)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
     with Recording(path) as recording:
         found = recording.pixel_statistics("wrist")
     thinned = [frame.images["wrist"].color[::step, ::step] for frame in frames[::2]]
-    chosen = np.concatenate([picture[number % 4 :: 4].reshape(-1, 3) for number, picture in enumerate(thinned)])
+    chosen = np.concatenate([image[number % 4 :: 4].reshape(-1, 3) for number, image in enumerate(thinned)])
     assert found.num_images == 4
     assert np.array_equal(found.counts, [np.bincount(chosen[:, channel], minlength=256) for channel in range(3)])
 
@@ -165,9 +165,9 @@ def test_the_digest_is_of_the_content(tmp_path: Path) -> None:
     effort[2] = np.nextafter(effort[2], 99.0)
     changed = replace(frames[3], observation=replace(observation, joint_effort=effort))
     assert digest("d.mcap", frames=[*frames[:3], changed, *frames[4:]]) != original
-    picture = frames[3].images["front"].color.copy()
-    picture[:8, :8] = 255
-    images = {**frames[3].images, "front": replace(frames[3].images["front"], color=picture)}
+    image = frames[3].images["front"].color.copy()
+    image[:8, :8] = 255
+    images = {**frames[3].images, "front": replace(frames[3].images["front"], color=image)}
     assert digest("e.mcap", frames=[*frames[:3], replace(frames[3], images=images), *frames[4:]]) != original
     event = replace(frames[3], events=(Event(name="grasp", message="again"),))
     assert digest("f.mcap", frames=[*frames[:3], event, *frames[4:]]) != original
@@ -183,7 +183,7 @@ def test_no_frames_at_all(tmp_path: Path) -> None:
         assert len(recording.digest()) == 64
 
 
-def test_numbers_are_read_without_touching_the_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_are_read_without_touching_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_episode(tmp_path / "a.mcap", num_frames=90, width=160, height=120, video=VideoConfig(codec="jpeg"))
     read: list[int] = []
     original = Container._read_at
@@ -198,8 +198,8 @@ def test_numbers_are_read_without_touching_the_pictures(tmp_path: Path, monkeypa
         recording.columns()
         numbers = sum(read) - opened
         list(recording.packets("front"))
-        pictures = sum(read) - opened - numbers
+        images = sum(read) - opened - numbers
     size = path.stat().st_size
     assert opened < 0.1 * size
     assert numbers < 0.25 * size
-    assert pictures > 0.6 * size
+    assert images > 0.6 * size

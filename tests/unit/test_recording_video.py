@@ -91,8 +91,8 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
     encoder = make_encoder(video=VideoConfig(), width=224, height=224, fps=30)
     times, rows, columns = np.mgrid[0:12, 0:224, 0:224].astype(np.float64)
     waves = 128 + 100 * np.sin(rows / 9 + times / 3) * np.cos(columns / 13 - times / 5)
-    pictures = np.stack([waves, np.roll(waves, 40, axis=2), 255 - waves], axis=-1).astype(np.uint8)
-    packets = [bytes(p) for picture in pictures for p in encoder.encode(picture)]
+    images = np.stack([waves, np.roll(waves, 40, axis=2), 255 - waves], axis=-1).astype(np.uint8)
+    packets = [bytes(p) for image in images for p in encoder.encode(image)]
     packets += [bytes(p) for p in encoder.finish()]
 
     def plain(parameters: str) -> list[bytes]:
@@ -111,26 +111,26 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
             "x264-params": parameters,
         }
         found = []
-        for index, picture in enumerate(pictures):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        for index, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             frame.pts, frame.time_base = index, context.time_base
             found += [bytes(p) for p in context.encode(frame)]
         return found + [bytes(p) for p in context.encode(None)]
 
     assert plain("cpu-independent=1:asm=0") == packets
-    assert plain("asm=0") != plain(""), "these pictures would not tell"
-    assert len(packets) == len(pictures)
+    assert plain("asm=0") != plain(""), "these images would not tell"
+    assert len(packets) == len(images)
 
 
 @pytest.mark.parametrize(("codec", "decoder"), [("h264", "h264"), ("av1", "libdav1d")])
 def test_a_stream_says_how_its_colours_are_meant(codec: Codec, decoder: str) -> None:
-    """And it is true: the luma and chroma in it give the picture back by the matrix and range that it names."""
+    """And it is true: the luma and chroma in it give the image back by the matrix and range that it names."""
     import av
 
     colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 40]], dtype=np.uint8)
-    picture = np.repeat(np.repeat(colours[np.newaxis], 32, axis=1), 64, axis=0)
+    image = np.repeat(np.repeat(colours[np.newaxis], 32, axis=1), 64, axis=0)
     encoder = make_encoder(video=VideoConfig(codec=codec, crf=5), width=128, height=64, fps=30)
-    packets = [*encoder.encode(picture), *encoder.finish()]
+    packets = [*encoder.encode(image), *encoder.finish()]
     context = av.CodecContext.create(decoder, "r")
     assert isinstance(context, av.VideoCodecContext)
     frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))] + context.decode(None)

@@ -94,7 +94,7 @@ def test_frames_come_in_order(tmp_path: Path) -> None:
             writer.write(replace(frames[1], time_ns=7))
 
 
-def test_pictures_are_complete(tmp_path: Path) -> None:
+def test_images_are_complete(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=2, depth=True)
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         writer.write(frames[0])

@@ -1,4 +1,4 @@
-"""`demorec report`: read by an HTML parser that is not ours, its pictures by Pillow."""
+"""`demorec report`: read by an HTML parser that is not ours, its images by Pillow."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def report_on(path: Path, *, camera: str = "", checks: bool = False) -> Page:
 
 
 def gathered(path: Path, *, camera: str = "", checks: bool = False, workers: int = 1) -> Report:
-    options = CheckOptions(pictures=False) if checks else None
+    options = CheckOptions(images=False) if checks else None
     return gather(path, camera=camera, checks=options, workers=workers)
 
 
@@ -130,7 +130,7 @@ def test_nothing_is_loaded_from_elsewhere(run: Path) -> None:
 
 
 def test_a_filmstrip_shows_the_frames_that_it_names(run: Path) -> None:
-    """Each picture carries its frame's number as a bar code."""
+    """Each image carries its frame's number as a bar code."""
     found = report_on(run)
     assert len(list(found.all("img"))) == 4
     for image, words in zip(found.all("img"), found.articles, strict=True):
@@ -323,7 +323,7 @@ def test_refusals(run: Path, dataset: Path, tmp_path: Path, capsys: pytest.Captu
         ((run, "--out", tmp_path / "x.pdf"), "--out names an .html file"),
         ((run, "--out", tmp_path / "no" / "x.html"), "there is no folder"),
         ((run, "--out", tmp_path / "x.html", "--workers", "0"), "--workers is 0"),
-        ((run, "--out", tmp_path / "x.html", "--no-checks", "--pictures"), "leave one of them out"),
+        ((run, "--out", tmp_path / "x.html", "--no-checks", "--images"), "leave one of them out"),
         ((run, "--against", dataset, "--out", tmp_path / "x.html"), "Expected a LeRobot dataset, found"),
         ((dataset, "--against", run, "--out", tmp_path / "x.html"), "Expected a LeRobot dataset, found"),
     ):

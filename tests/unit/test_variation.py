@@ -133,7 +133,7 @@ def test_calibration_error_is_between_truth_and_record() -> None:
         assert error != Pose()
         shift = [prepared.info.behaviour[f"calibration_{name}_{axis}"] for axis in "xyz"]
         assert np.allclose(error.position, shift, atol=1e-9)
-        # The picture is drawn from where the camera truly is.
+        # The image is drawn from where the camera truly is.
         assert np.array_equal(frame.images[name].color, reference.images[name].color)
 
 
@@ -199,7 +199,7 @@ def test_textures_are_functions_of_their_fields(
         assert np.array_equal(pixels[:16, :16], pixels[16:32, 16:32])
 
 
-def test_a_texture_reaches_the_picture() -> None:
+def test_a_texture_reaches_the_image() -> None:
     prepared = episode(7, cameras=("front",), width=64, height=64, renderer="tiny")
     texture = Texture(pattern="checker", colors=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), scale=8)
     bodies = tuple(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.check.scoring.score import EpisodeScore
-from demorec.core.errors import ConfigError, in_words
+from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import MAX_JSON_BYTES, read_json_limited
 from demorec.core.replacing import ReplaceableKind, check_replaceable, written_whole
 
@@ -56,7 +56,9 @@ def read_scores(path: Path, num_frames: Mapping[int, int]) -> dict[int, float]:
         rows = read_json_limited(path, MAX_JSON_BYTES)["episodes"]
         found = {int(row["episode_index"]): (int(row["num_frames"]), float(row["score"])) for row in rows}
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ConfigError(f"This is no file of demorec dataset score --out ({in_words(error)}): {path}") from error
+        raise ConfigError(
+            f"This is no file of demorec dataset score --out ({describe_error(error)}): {path}"
+        ) from error
     if {index: frames for index, (frames, _) in found.items()} != dict(num_frames):
         raise ConfigError(f"The scores are those of a dataset with other episodes; score this one anew: {path}")
     return {index: score for index, (_, score) in found.items()}

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import Cut, Plan, Source
@@ -211,7 +211,7 @@ def _reworded(info: str, task: str, root: Path) -> str:
         described = parse_json(info)
         described["instruction"] = task
     except (ValueError, TypeError) as error:
-        raise ExportError(f"The sidecar's episode_info cannot be used ({in_words(error)}): {root}") from error
+        raise ExportError(f"The sidecar's episode_info cannot be used ({describe_error(error)}): {root}") from error
     return to_json(described)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.editing.packets import PacketCutter
 from demorec.datasets.editing.plan import Source
 from demorec.datasets.lerobot.language import column_digests
@@ -178,7 +178,9 @@ def _values(array: Any, feature: DatasetFeature, root: Path) -> NDArray[Any]:
             return np.array(digests, dtype=np.str_).reshape(-1, 1)
         return column_values(array)
     except (ValueError, TypeError, KeyError, pa.ArrowException) as error:
-        raise ExportError(f"A column holds something else than info.json says ({in_words(error)}): {root}") from error
+        raise ExportError(
+            f"A column holds something else than info.json says ({describe_error(error)}): {root}"
+        ) from error
 
 
 def _digest(values: NDArray[Any]) -> bytes:
@@ -244,10 +246,10 @@ def _alike(
     for number in rest_a:
         one = a[number]
         common = Counter(other for value in one.sketch.tolist() for other in holders.get(value, ()))
-        same_images = Counter(other for key in _image_keys(one) for other in holders.get(key, ()))
-        for other in {*common, *same_images}:
+        same_pictures = Counter(other for key in _image_keys(one) for other in holders.get(key, ()))
+        for other in {*common, *same_pictures}:
             most = max(len(one.sketch), len(b[other].sketch), 1)
-            alike = common[other] / most + _IMAGES_ALIKE * same_images[other] / max(len(one.images), 1)
+            alike = common[other] / most + _IMAGES_ALIKE * same_pictures[other] / max(len(one.images), 1)
             if alike >= _LEAST_ALIKE:
                 yield (-alike, abs(number - other)), number, other
 

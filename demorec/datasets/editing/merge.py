@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import ConfigError, in_words
+from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.registry import check_choice, nearest_match
 from demorec.datasets.editing.operations import joined
@@ -69,7 +69,7 @@ def _read(path: Path, roots: Sequence[Path]) -> dict[Path, dict[str, Any]]:
         if set(data) - {"dataset"}:
             raise ValueError(f"it has {sorted(set(data) - {'dataset'})[0]!r} beside the datasets")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ConfigError(f"The mapping cannot be used ({in_words(error)}): {path}") from error
+        raise ConfigError(f"The mapping cannot be used ({describe_error(error)}): {path}") from error
     if strange := [entry for entry in entries if entry not in [root.resolve() for root in roots]]:
         raise ConfigError(f"The mapping is about a dataset that is not merged, {strange[0]}: {path}")
     return entries
@@ -96,7 +96,7 @@ def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None, path: Path
         try:
             features[name], takes[name] = _converted(plan.info.features, name, item, model)
         except (ValueError, TypeError, KeyError) as error:
-            raise ConfigError(f"The mapping of {name} cannot be used ({in_words(error)}): {path}") from error
+            raise ConfigError(f"The mapping of {name} cannot be used ({describe_error(error)}): {path}") from error
     fixed = {name: features.pop(name) for name in AUTOMATIC_FEATURES}
     mapped = plan.with_features({**features, **fixed}, [takes])
     return replace(mapped, info=replace(mapped.info, robot_type=entry.get("robot_type", mapped.info.robot_type)))

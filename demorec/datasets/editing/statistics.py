@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.editing.compare import Difference
 from demorec.datasets.editing.content import TASK, Shared
 from demorec.datasets.editing.plan import Source
@@ -126,7 +126,7 @@ def _stats(source: Source) -> dict[str, Any]:
         if not isinstance(found, dict):
             raise ValueError("it is no object")
     except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The statistics cannot be read ({describe_error(error)}): {path}") from error
     return found
 
 

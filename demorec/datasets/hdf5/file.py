@@ -12,7 +12,7 @@ from typing import Self
 
 import h5py
 
-from demorec.core.errors import in_words
+from demorec.core.errors import describe_error
 from demorec.core.files import HDF5_MAGIC, open_regular
 from demorec.core.replacing import ReplaceableKind
 from demorec.datasets.hdf5 import trial
@@ -85,7 +85,7 @@ def _strangers(path: Path) -> list[str]:
             found += [f"attribute {key}" for key in file.attrs]
             file.visititems_links(look)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise OSError(errno.EIO, in_words(error)) from error
+        raise OSError(errno.EIO, describe_error(error)) from error
     return found
 
 

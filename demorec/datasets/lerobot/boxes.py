@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
@@ -79,7 +79,7 @@ def _box_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ExportError(f"The boxes cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The boxes cannot be read ({describe_error(error)}): {path}") from error
 
 
 class StoredBoxes:

@@ -18,7 +18,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.stats import PixelHistogram
@@ -127,7 +127,7 @@ def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
         context.open()
     except (av.FFmpegError, ValueError) as error:
         raise ExportError(
-            f"Depth video cannot be encoded, this build of PyAV has no 12-bit HEVC ({in_words(error)})."
+            f"Depth video cannot be encoded, this build of PyAV has no 12-bit HEVC ({describe_error(error)})."
         ) from error
     return context
 

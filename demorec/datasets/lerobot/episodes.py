@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from demorec.core.errors import ConfigError, ExportError, in_words
+from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.boxes import BOXES_DIR
 from demorec.datasets.lerobot.depth import DepthScale
 from demorec.datasets.lerobot.files import column_numbers, open_table, table_batches
@@ -138,7 +138,7 @@ class LeRobotDataset:
                     if ((numbers > _EXACT) | (numbers < -_EXACT)).any():
                         return False
             except (ValueError, TypeError, pa.ArrowException) as error:
-                raise ExportError(f"The column {name} cannot be read ({in_words(error)}): {path}") from error
+                raise ExportError(f"The column {name} cannot be read ({describe_error(error)}): {path}") from error
         return True
 
     @cached_property

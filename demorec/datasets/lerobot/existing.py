@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import ConfigError, ExportError, in_words
+from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, facts_of
 from demorec.datasets.lerobot.files import open_table, read_json, read_table
 from demorec.datasets.lerobot.layout import (
@@ -77,7 +77,7 @@ def open_existing(root: Path) -> Existing:
         if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
             raise ValueError(f"{CONFIGS_PATH} holds no configurations")
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise ExportError(f"The dataset cannot be read ({in_words(error)}): {root}") from error
+        raise ExportError(f"The dataset cannot be read ({describe_error(error)}): {root}") from error
     if (episodes, frames, rows) != (info.total_episodes, info.total_frames, info.total_frames):
         raise ExportError(
             f"The dataset is not whole: {INFO_PATH} counts {info.total_episodes} episodes of {info.total_frames} "

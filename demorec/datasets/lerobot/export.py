@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, in_words
+from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, describe_error
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
 from demorec.datasets.episode import ExportEpisode
@@ -223,7 +223,7 @@ class _Export:
 
     def _about_this_export(self) -> dict[str, Any]:
         options = self._options
-        held = {} if self._is_simulated else {"hold_pictures": options.hold_pictures}
+        held = {} if self._is_simulated else {"hold_pictures": options.hold_images}
         return {
             **held,
             "demorec": version("demorec"),
@@ -275,7 +275,7 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
         hub.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
     except Exception as error:  # the hub's client raises errors of several HTTP libraries
         raise ExportError(
-            f"The dataset was not uploaded to {repo_id} ({in_words(error)}); it is kept: {folder}"
+            f"The dataset was not uploaded to {repo_id} ({describe_error(error)}); it is kept: {folder}"
         ) from error
     return str(url)
 

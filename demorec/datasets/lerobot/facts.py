@@ -34,7 +34,7 @@ from demorec.annotate.progress import (
     sparse_runs,
     sparse_stages,
 )
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.staging import sync_file
 
@@ -113,7 +113,9 @@ def read_progress(root: Path) -> list[EpisodeProgress]:
             for row in read_table(path, [*STAGE_COLUMNS, "num_goals"]).to_pylist():
                 found.append(EpisodeProgress.from_row(row, int(row["num_goals"])))
     except (ValueError, TypeError, KeyError) as error:
-        raise ExportError(f"The stages of the dataset's episodes cannot be used ({in_words(error)}): {root}") from error
+        raise ExportError(
+            f"The stages of the dataset's episodes cannot be used ({describe_error(error)}): {root}"
+        ) from error
     return found
 
 

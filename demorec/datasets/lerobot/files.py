@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words, resource_error
+from demorec.core.errors import ExportError, describe_error, resource_error
 from demorec.core.files import open_regular, read_text_limited
 from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.pages import longest_row, pages_of
@@ -79,7 +79,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
         if not all(isinstance(line, dict) for line in found):
             raise ValueError("a line is no object")
     except (OSError, ValueError) as error:
-        raise ExportError(f"The table cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The table cannot be read ({describe_error(error)}): {path}") from error
     return found
 
 
@@ -219,7 +219,7 @@ def _table_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError, IndexError, KeyError, MemoryError, pa.ArrowException) as error:
-        damaged = ExportError(f"The table cannot be read ({in_words(error)}): {path}")
+        damaged = ExportError(f"The table cannot be read ({describe_error(error)}): {path}")
         raise resource_error(error, path) or damaged from error
 
 
@@ -285,7 +285,7 @@ def check_video(path: Path) -> None:
             size = os.fstat(file.fileno()).st_size
             claimed = sum(_samples(file, size))
     except (OSError, ValueError, struct.error) as error:
-        raise ExportError(f"The video cannot be opened ({in_words(error)}): {path}") from error
+        raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
     if claimed > size:
         raise ExportError(f"The video claims {claimed:,} bytes or images, but has {size:,} bytes: {path}")
 

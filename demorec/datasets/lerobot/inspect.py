@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from demorec.core.errors import ExportError, in_words, resource_error, without_path
+from demorec.core.errors import ExportError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.files import check_video, open_table, read_json, read_table
 from demorec.datasets.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
@@ -96,7 +96,7 @@ def check_tables(path: Path) -> None:
             elif file.suffix == ".json":
                 read_json(file)
         except (OSError, ValueError) as error:
-            raise ExportError(f"The dataset is damaged ({in_words(error)}): {file}") from error
+            raise ExportError(f"The dataset is damaged ({describe_error(error)}): {file}") from error
 
 
 def dataset_digest(path: Path) -> str:

@@ -19,7 +19,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.annotate import STATES
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.episode.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
@@ -211,5 +211,5 @@ def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> SpokenEpisode:
                     episode.events[episode.num_rows] = found
                 episode.num_rows += 1
     except (ValueError, pa.ArrowException) as error:
-        raise ExportError(f"The language of the dataset cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The language of the dataset cannot be read ({describe_error(error)}): {path}") from error
     return episode

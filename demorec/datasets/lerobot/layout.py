@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.language import TYPES, language_feature
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
@@ -253,7 +253,7 @@ class DatasetInfo:
         except OSError as error:
             raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({in_words(error)}): {root}") from error
+            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({describe_error(error)}): {root}") from error
         return info
 
     def _check(self) -> None:

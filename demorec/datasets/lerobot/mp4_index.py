@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.files import check_video
 
@@ -55,7 +55,7 @@ def mp4_index(path: Path) -> Mp4Index:
                 place += max(length, 8)
         raise ValueError("it has no index")
     except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
-        raise ExportError(f"The video cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:

@@ -205,7 +205,7 @@ def encoded_videos(
 ) -> dict[str, EncodedVideo]:
     """Camera feature -> its images, one a frame: the recorded packets wherever there is no reason to transcode."""
     recording = episode.recording
-    recorded = recording.coded_pictures([camera.name for camera, reason in reasons.items() if not reason])
+    recorded = recording.coded_images([camera.name for camera, reason in reasons.items() if not reason])
     videos = {}
     for camera, reason in reasons.items():
         settings = dataset_settings(episode, camera, video, reason)

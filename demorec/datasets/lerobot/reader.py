@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import (
     TableRows,
     column_numbers,
@@ -244,7 +244,7 @@ class EpisodeRows:
             ]
             return pa.RecordBatch.from_arrays(columns, schema=self._schema)
         except (ValueError, pa.ArrowException) as error:
-            raise ExportError(f"The table has columns of other types ({in_words(error)}): {path}") from error
+            raise ExportError(f"The table has columns of other types ({describe_error(error)}): {path}") from error
 
 
 class RowReader:

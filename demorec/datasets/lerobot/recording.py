@@ -150,8 +150,8 @@ class DatasetRecording:
             time_ns=times[begin:],
             features=features,
             stamps=dict.fromkeys(features, times[begin:]),
-            pictures={name: np.arange(lead, lead + self.num_frames) for name, lead in leads.items()},
-            picture_stamps={name: times[begin - lead :] for name, lead in leads.items()},
+            images={name: np.arange(lead, lead + self.num_frames) for name, lead in leads.items()},
+            image_stamps={name: times[begin - lead :] for name, lead in leads.items()},
         )
 
     def _lead(self, camera: str) -> int:
@@ -167,7 +167,7 @@ class DatasetRecording:
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera in order; `frame_index` is their number, by which frames hold them."""
-        key, lead, times = self.dataset.keys[camera], self._lead(camera), self.columns().picture_stamps[camera]
+        key, lead, times = self.dataset.keys[camera], self._lead(camera), self.columns().image_stamps[camera]
         if self.dataset.info.features[key].is_video:
             for frame, data, is_key in self.dataset.video(key, self.place).packets():
                 number = min(frame + lead, len(times) - 1)

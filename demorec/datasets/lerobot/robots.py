@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.core.errors import DemorecError, ExportError, in_words
+from demorec.core.errors import DemorecError, ExportError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.plain import digest, from_json, leave_out_defaults, to_json
 from demorec.core.tables import ROBOTS
@@ -238,7 +238,7 @@ def read_robot(root: Path, name: str) -> DatasetRobot:
         if missing := named - joints:
             raise ValueError(f"its URDF lacks the joints {', '.join(sorted(missing))}")
     except (OSError, ValueError) as error:
-        raise ExportError(f"The description of the robot cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The description of the robot cannot be read ({describe_error(error)}): {path}") from error
     return robot
 
 

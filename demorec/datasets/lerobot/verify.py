@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import DemorecError, ExportError, in_words, resource_error
+from demorec.core.errors import DemorecError, ExportError, describe_error, resource_error
 from demorec.core.processes import SPAWN
 from demorec.datasets.episode import ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.depth import code_values, quantised
@@ -115,7 +115,7 @@ def _serve(pipe: Connection[Any, Any], cache: str) -> None:
         answer = error
     except Exception as error:
         answer = resource_error(error) or ExportError(
-            f"The new dataset was dropped, it cannot be verified ({in_words(error)})."
+            f"The new dataset was dropped, it cannot be verified ({describe_error(error)})."
         )
     with suppress(OSError):
         pipe.send(answer)
@@ -128,7 +128,7 @@ def _verify(root: Path, samples: Sequence[tuple[int, Path]], options: ExportOpti
         dataset = LeRobotDataset(options.repo_id, root=root, video_backend="pyav", return_uint8=True)
     except Exception as error:  # whatever LeRobot says, the dataset must not be handed out
         raise resource_error(error) or ExportError(
-            f"The new dataset was dropped, LeRobot cannot open it ({in_words(error)})."
+            f"The new dataset was dropped, LeRobot cannot open it ({describe_error(error)})."
         ) from error
     frames = 0
     for number, (episode_index, path) in enumerate(samples):
@@ -152,7 +152,7 @@ def _compare_episode(
         except Exception as error:
             raise ExportError(
                 f"The new dataset was dropped, LeRobot cannot read frame {moment} of episode {episode_index} "
-                f"({in_words(error)})."
+                f"({describe_error(error)})."
             ) from error
         wrong = [
             name for name, values in expected.columns.items() if name in item and not _equal(item[name], values[moment])
@@ -192,7 +192,7 @@ def _is_wrong_image(tensor: Any, episode: ExportEpisode, camera: ExportCamera, m
         return _is_wrong_depth(tensor, next(islice(recording.depth(camera.name), number, None)))
     limit = _TRANSCODED_TOLERANCE if reason_to_transcode(episode, camera) else 0.0
     found = tensor.numpy().transpose(1, 2, 0).astype(np.float64)
-    return bool(np.abs(found - recording.picture(camera.name, number)).mean() > limit)
+    return bool(np.abs(found - recording.numbered_image(camera.name, number)).mean() > limit)
 
 
 def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.core.config import MAX_PIXELS
-from demorec.core.errors import ExportError, in_words
+from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
 from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo, FilePosition
@@ -57,7 +57,7 @@ def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.v
             stream.codec_context.options = {"max_pixels": str((height + _BLOCK) * (width + _BLOCK))}
             yield container, stream
     except (OSError, EOFError, ValueError, IndexError, av.FFmpegError) as error:
-        raise ExportError(f"The video cannot be read ({in_words(error)}): {path}") from error
+        raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
 
 
 class PacketReader:
@@ -333,7 +333,9 @@ class StoredImages:
                     if shape not in (None, image.shape):
                         raise ValueError(f"it is of another size, {image.shape[1]}x{image.shape[0]} pixels")
                 except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-                    raise ExportError(f"An image of {self._key} cannot be read ({in_words(error)}): {path}") from error
+                    raise ExportError(
+                        f"An image of {self._key} cannot be read ({describe_error(error)}): {path}"
+                    ) from error
                 shape = image.shape
                 yield image
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, in_words
+from demorec.core.errors import ConfigError, DemorecError, describe_error
 from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
 from demorec.core.own_versions import plain_differences
 from demorec.core.plain import to_plain
@@ -132,7 +132,7 @@ class Improvement:
             settings = read_json_object(self._plan.config_path)
         except (OSError, ValueError) as error:
             raise ConfigError(
-                f"The settings of the training cannot be read ({in_words(error)}): {self._plan.config_path}"
+                f"The settings of the training cannot be read ({describe_error(error)}): {self._plan.config_path}"
             ) from error
         found = {**plan, "training": settings, "versions": deciding_versions(self._config)}
         for name in ("demonstrations", "config_path"):
@@ -148,7 +148,7 @@ class Improvement:
         try:
             before = {"state": "joint", **read_json_object(path)}  # there was no other kind at first
         except (OSError, ValueError, TypeError) as error:
-            raise DemorecError(f"{SETTINGS_NAME} is damaged ({in_words(error)}): {path}") from error
+            raise DemorecError(f"{SETTINGS_NAME} is damaged ({describe_error(error)}): {path}") from error
         if lines := plain_differences(before, json.loads(json.dumps(found))):
             raise ConfigError(
                 f"Another improvement is in this folder ({'; '.join(lines)}): choose another --out: {self._out}"
@@ -221,7 +221,7 @@ class Improvement:
                 found = read_json_object(done)
                 seconds = float(found["cpu_seconds"])
             except (OSError, ValueError, KeyError, TypeError) as error:
-                raise DemorecError(f"{TRAINED_NAME} is damaged ({in_words(error)}): {done}") from error
+                raise DemorecError(f"{TRAINED_NAME} is damaged ({describe_error(error)}): {done}") from error
             _, digest = policy_summary(find_checkpoint(train))
             if found.get("policy_digest") != digest:
                 raise DemorecError(f"The policy is not the one that was trained here (its digest differs): {train}")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, OptionError, in_words
+from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, OptionError, describe_error
 from demorec.core.files import read_json_object
 from demorec.core.registry import is_allowed
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -46,7 +46,9 @@ def policy_summary(checkpoint: Path) -> tuple[dict[str, Any], str]:
     try:
         config = read_json_object(checkpoint / CONFIG_NAME)
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{CONFIG_NAME} of the policy cannot be used ({in_words(error)}): {checkpoint}") from error
+        raise ConfigError(
+            f"{CONFIG_NAME} of the policy cannot be used ({describe_error(error)}): {checkpoint}"
+        ) from error
     return config, sha.hexdigest()[:16]
 
 
@@ -130,7 +132,7 @@ class Policy:
                 preprocessor_overrides={"device_processor": {"device": device}},
             )
         except Exception as error:  # whatever a foreign format may lack
-            raise ConfigError(f"LeRobot cannot load this policy ({in_words(error)}): {checkpoint}") from error
+            raise ConfigError(f"LeRobot cannot load this policy ({describe_error(error)}): {checkpoint}") from error
         self.inputs = tuple(config.input_features)
         if action_steps is not None:
             chunk = getattr(config, "chunk_size", None)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, in_words
+from demorec.core.errors import ConfigError, DemorecError, describe_error
 from demorec.core.files import read_json_object, replace_text
 from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
@@ -146,7 +146,7 @@ def settings_for(
         if any(len(shape) != 3 for shape in images.values()):
             raise ValueError("an image of other than three dimensions")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"The inputs of the policy cannot be used ({in_words(error)}): {checkpoint}") from error
+        raise ConfigError(f"The inputs of the policy cannot be used ({describe_error(error)}): {checkpoint}") from error
     if images:
         (_, height, width), *_ = images.values()
         own = {camera_name(name): name for name in config.cameras}
@@ -229,7 +229,7 @@ def load_evaluation(folder: Path) -> Evaluation:
     except FileNotFoundError as error:
         raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
     except (OSError, ValueError) as error:
-        raise DemorecError(f"{EVALUATION_NAME} is damaged ({in_words(error)}): {path}") from error
+        raise DemorecError(f"{EVALUATION_NAME} is damaged ({describe_error(error)}): {path}") from error
 
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 from torch.utils.data import default_collate
 
-from demorec.core.errors import ConfigError, DemorecError, in_words
+from demorec.core.errors import ConfigError, DemorecError, describe_error
 from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
 from demorec.learn.training.columns import numbers
 from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
@@ -293,7 +293,7 @@ def _settle(out: Path, settings: dict[str, Any]) -> PretrainResult | None:
         result = _read_result(found)
         others = sorted(name for name in settings if before.get(name) != settings[name])
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DemorecError(f"{RESULT_NAME} is damaged ({in_words(error)}): {path}") from error
+        raise DemorecError(f"{RESULT_NAME} is damaged ({describe_error(error)}): {path}") from error
     if others:
         raise ConfigError(
             f"Another encoder is taught in this folder (another {', another '.join(others)}), choose another --out: "

@@ -153,9 +153,9 @@ class Encoder:
             self.writer.begin(self.info)
             self.info = None
         new = [(camera, stamp, pixels) for camera, (stamp, pixels) in images.items() if pixels is not None]
-        numbers = list(self._pool.map(lambda image: self.writer.picture(*image), new))
+        numbers = list(self._pool.map(lambda image: self.writer.image(*image), new))
         for (camera, _, pixels), number in zip(new, numbers, strict=True):
             self._last[camera] = number
             self._buffers.give_back(pixels)
         held = {camera: self._last[camera] for camera in images}
-        self.writer.write(replace(frame, pictures=held))
+        self.writer.write(replace(frame, images=held))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, RecordingError, in_words
+from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.core.files import Closing
 from demorec.core.registry import nearest_match
 from demorec.episode.episode import Outcome, Sample, SampledFrame
@@ -80,7 +80,7 @@ class RecordedEpisode:
     ) -> None:
         try:
             if isinstance(exc, Exception):
-                self.finish(success=False, reason=in_words(exc))
+                self.finish(success=False, reason=describe_error(exc))
             else:
                 self.finish(reason="" if exc is None else "interrupted")
         except RecordingError:
@@ -167,7 +167,7 @@ class RecordedEpisode:
         self._check.check_frame(frame)
         new = {camera: (stamp, pixels) for camera, (stamp, pixels) in images.items() if pixels is not None}
         for camera, (stamp_ns, pixels) in new.items():
-            self._check.check_picture(camera, stamp_ns, pixels)
+            self._check.check_image(camera, stamp_ns, pixels)
         if not self._encoder.put(frame, images):
             if self._run.when_full == "drop":
                 self.drops[FRAMES] = self.drops.get(FRAMES, 0) + 1
@@ -177,7 +177,7 @@ class RecordedEpisode:
                 '(video=VideoConfig(codec="jpeg")), smaller or fewer images, or when_full="drop" or "wait".'
             )
         for camera, (stamp_ns, _) in new.items():
-            self._check.note_picture(camera, stamp_ns)
+            self._check.note_image(camera, stamp_ns)
             self._image_stamps[camera] = stamp_ns
         self._check.note_frame(frame)
         self.num_frames += 1
@@ -381,4 +381,4 @@ def _camera(name: str, camera: tuple[int, int] | Camera) -> Camera:
 def _as_recording_error(error: BaseException) -> RecordingError:
     if isinstance(error, RecordingError):
         return error
-    return RecordingError(f"The episode cannot be recorded any more ({in_words(error)}).")
+    return RecordingError(f"The episode cannot be recorded any more ({describe_error(error)}).")

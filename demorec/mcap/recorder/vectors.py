@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from demorec.core.errors import ConfigError, RecordingError, SceneError, in_words
+from demorec.core.errors import ConfigError, RecordingError, SceneError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.registry import nearest_match
 from demorec.episode.features import ACTION, STATE
@@ -174,7 +174,7 @@ def robot_facts(robot: RobotLike) -> RobotFacts:
         try:
             return _described(read_text_limited(path, MAX_BYTES), path)
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"The robot's URDF cannot be read ({in_words(error)}): {path}") from error
+            raise ConfigError(f"The robot's URDF cannot be read ({describe_error(error)}): {path}") from error
     if isinstance(robot, str):
         if robot.lstrip().startswith("<"):
             return _described(robot, None)
@@ -195,6 +195,6 @@ def _described(text: str, path: Path | None) -> RobotFacts:
         if path is not None:
             text = self_contained(text, path.parent)
     except (ValueError, SceneError) as error:
-        raise ConfigError(f"The robot's URDF cannot be used ({in_words(error)}){where}") from error
+        raise ConfigError(f"The robot's URDF cannot be used ({describe_error(error)}){where}") from error
     moving = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
     return RobotFacts(name=name, urdf=text, joints=moving)

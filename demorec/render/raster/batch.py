@@ -12,7 +12,7 @@ from demorec.render.raster import textures
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.shapes import Instance
-from demorec.render.raster.textures import Picture
+from demorec.render.raster.textures import Pixels
 
 Ints = NDArray[np.int64]
 Floats32 = NDArray[np.float32]
@@ -110,7 +110,7 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
     faces: list[NDArray[np.integer]] = []
     tables = [np.zeros((0, 4), dtype=np.int32)]
     colors: list[Floats] = [np.zeros((0, 4))]
-    pictures: dict[int, tuple[int, Picture]] = {}
+    images: dict[int, tuple[int, Pixels]] = {}
     num_groups = 0
     for instance, level in zip(instances, levels, strict=True):
         piece = instance.piece(level)
@@ -127,12 +127,12 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
         if instance.texture is None:
             color[:, :3] *= 255
         else:
-            row, _ = pictures.setdefault(id(instance.texture), (len(pictures), instance.texture))
+            row, _ = images.setdefault(id(instance.texture), (len(images), instance.texture))
             table[:, layout.FACE_TEXTURE] = row
         color[:, layout.FACE_SPECULAR] = 255 * specular if n > SPECULAR_FACES else 0
         tables.append(table)
         colors.append(color)
-    texels, mips = textures.pack([picture for _, picture in pictures.values()])
+    texels, mips = textures.pack([image for _, image in images.values()])
     return Batch(
         geometry=merge(attributes, faces, spare=SPARE_VERTICES),
         face_table=np.concatenate(tables),

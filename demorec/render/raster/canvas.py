@@ -21,7 +21,7 @@ from demorec.render.raster.stage import Stage
 
 SHADOW_OFFSET = 0.006
 """How far a point is at least lifted off its surface before it is looked up in the shadow map, metres: the map holds
-coarser meshes than the picture, and half of it leaves blotches."""
+coarser meshes than the image, and half of it leaves blotches."""
 SHADOW_OFFSET_TEXELS = 2.2
 """And in texels: less leaves stripes where the light grazes a surface, since 3x3 texels are looked at."""
 Int32s = NDArray[np.int32]
@@ -36,7 +36,7 @@ class Images:
     segments: Int32s
 
     def copy(self) -> Images:
-        """The same pictures in memory of their own."""
+        """The same images in memory of their own."""
         return Images(self.color.copy(), self.depth.copy(), self.segments.copy())
 
 

@@ -1,4 +1,4 @@
-"""Meshes with fewer triangles for small pictures: geometry by quadric collapse, looks taken over from the original."""
+"""Meshes with fewer triangles for small images: geometry by quadric collapse, looks taken over from the original."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class RasterMesh:
         normals: (f, 3, 3) unit normal at each corner.
         uv: (f, 3, 2) texture coordinates at each corner, v upward; None without.
         colors: (f, 3) each face's own colour, 0..1, by which the shape's colour is multiplied.
-        texture: Picture that covers the faces, or None.
+        texture: Image that covers the faces, or None.
     """
 
     points: Floats

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import RenderError, in_words
+from demorec.core.errors import RenderError, describe_error
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
 from demorec.robots.obj import Material, read_obj
 
@@ -32,7 +32,7 @@ def load_mesh(path: Path) -> RasterMesh:
     except OSError as error:
         raise RenderError(f"The mesh file cannot be read ({error.strerror}): {path}") from error
     except (ValueError, IndexError, KeyError, ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise RenderError(f"The mesh file is broken ({in_words(error)}): {path}") from error
+        raise RenderError(f"The mesh file is broken ({describe_error(error)}): {path}") from error
     if mesh.num_faces == 0:
         raise RenderError(f"The mesh file holds no triangles: {path}")
     if not np.isfinite(mesh.points).all():

@@ -27,7 +27,7 @@ FACES_PER_PIXEL = 9.0
 """Triangles that a mesh keeps for each pixel of its diameter; below about 5, outlines look chipped."""
 WORKING_DISTANCE = {"world": 0.8, "link": 0.3}
 """How far from a camera in the world, or on a link, moving things are expected, metres. Levels of detail depend on
-this and not on where things are, so that nothing pops and pictures depend on the present state alone."""
+this and not on where things are, so that nothing pops and images depend on the present state alone."""
 CASTER_FACES_PER_METRE = 900.0
 """Triangles that a mesh keeps in the shadow map for each metre of its diameter."""
 
@@ -37,7 +37,7 @@ class RasterRenderer:
 
     Args:
         exact: Draw every triangle of every mesh, for depth that must be exact to the file.
-        keep_still: Whether fixed cameras keep what stands still; the pictures are the same to the bit without.
+        keep_still: Whether fixed cameras keep what stands still; the images are the same to the bit without.
     """
 
     def __init__(self, *, exact: bool = False, keep_still: bool = True) -> None:
@@ -112,7 +112,7 @@ class RasterRenderer:
 
 
 def shadow_size(height: int) -> int:
-    """Texels along the shadow map's side, for pictures of a height."""
+    """Texels along the shadow map's side, for images of a height."""
     return 512 if height <= 128 else 768 if height <= 320 else 1024
 
 

@@ -22,7 +22,7 @@ from demorec.render.raster.decimate import decimated
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.mesh import Floats, RasterMesh, unit, weld
 from demorec.render.raster.mesh_files import load_mesh
-from demorec.render.raster.textures import Picture, load_picture, palette_colors
+from demorec.render.raster.textures import Pixels, load_image, palette_colors
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,13 +129,13 @@ class Instance:
     """One visual shape of the scene.
 
     Attributes:
-        segment: Its number in segmentation pictures.
+        segment: Its number in segmentation images.
         row: Of its link in the poses that are drawn.
         model: Its mesh.
         scale: (3,) of the mesh.
         link_from_shape: (3, 4).
         color: (3,) 0..1.
-        texture: Picture, or None.
+        texture: Pixels, or None.
         stands: Whether physics cannot move it.
         has_links: Whether its body has links that reach around its base.
         centre, radius: Bounding sphere in the shape's frame.
@@ -147,7 +147,7 @@ class Instance:
     scale: Floats
     link_from_shape: Floats
     color: Floats
-    texture: Picture | None
+    texture: Pixels | None
     stands: bool
     has_links: bool
     centre: Floats
@@ -166,7 +166,7 @@ class ModelStore:
     """Meshes and textures that were loaded, kept across scenes; files are looked at again when they change."""
 
     _models: dict[tuple[Any, ...], Model] = field(default_factory=dict)
-    _pictures: dict[tuple[Any, ...], Picture] = field(default_factory=dict)
+    _images: dict[tuple[Any, ...], Pixels] = field(default_factory=dict)
 
     def file(self, path: Path) -> Model:
         """The model of a mesh file; RenderError when it cannot be read."""
@@ -180,9 +180,9 @@ class ModelStore:
             mesh = cached_mesh(digest, lambda: load_mesh(path))
             colors = None
             if mesh.texture is not None and mesh.uv is not None:
-                picture = self.picture(mesh.texture)
-                digest += hashlib.sha256(picture.tobytes()).hexdigest()
-                colors = palette_colors(mesh, picture)
+                image = self.image(mesh.texture)
+                digest += hashlib.sha256(image.tobytes()).hexdigest()
+                colors = palette_colors(mesh, image)
             if colors is not None:
                 mesh = replace(mesh, colors=colors, texture=None)
             self._models[place] = Model(key=digest, mesh=mesh)
@@ -199,22 +199,22 @@ class ModelStore:
             self._models[place] = Model(key=repr(place), mesh=mesh, coarse=coarse)
         return self._models[place]
 
-    def procedural(self, texture: Texture) -> Picture:
-        """A procedural texture's picture."""
+    def procedural(self, texture: Texture) -> Pixels:
+        """A procedural texture's image."""
         place = (texture,)
-        if place not in self._pictures:
-            self._pictures[place] = texture_pixels(texture)
-        return self._pictures[place]
+        if place not in self._images:
+            self._images[place] = texture_pixels(texture)
+        return self._images[place]
 
-    def picture(self, path: Path) -> Picture:
-        """A texture file's picture."""
+    def image(self, path: Path) -> Pixels:
+        """A texture file's image."""
         try:
             place = (str(path), path.stat().st_mtime_ns)
         except OSError as error:
             raise RenderError(f"The texture cannot be read ({error.strerror}): {path}") from error
-        if place not in self._pictures:
-            self._pictures[place] = load_picture(path)
-        return self._pictures[place]
+        if place not in self._images:
+            self._images[place] = load_image(path)
+        return self._images[place]
 
 
 def _source_digest(path: Path) -> str:
@@ -281,10 +281,10 @@ def _model(visual: Visual, store: ModelStore) -> tuple[Model, Floats]:
             return store.primitive("plane"), one
 
 
-def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Picture | None:
-    """The picture that covers a shape: one that was set on it, else the mesh file's own."""
+def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Pixels | None:
+    """The image that covers a shape: one that was set on it, else the mesh file's own."""
     if texture is not None and model.mesh.uv is not None:
         return store.procedural(texture)
     if model.mesh.texture is not None and model.mesh.uv is not None:
-        return store.picture(model.mesh.texture)
+        return store.image(model.mesh.texture)
     return None

@@ -1,4 +1,4 @@
-"""Textures as pyramids of ever smaller pictures, and palettes turned into face colours."""
+"""Textures as pyramids of ever smaller images, and palettes turned into face colours."""
 
 from __future__ import annotations
 
@@ -10,48 +10,48 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from demorec.core.errors import RenderError, in_words
+from demorec.core.errors import RenderError, describe_error
 from demorec.render.raster.kernels.layout import MIP_LEVELS
 from demorec.render.raster.mesh import Floats, RasterMesh, face_normals
 
 LARGEST_SIDE = 1 << (MIP_LEVELS - 1)
-Picture = NDArray[np.uint8]
+Pixels = NDArray[np.uint8]
 
 
-def load_picture(path: Path) -> Picture:
-    """(H, W, 3) uint8 RGB of a picture file; RenderError names one that cannot be read."""
+def load_image(path: Path) -> Pixels:
+    """(H, W, 3) uint8 RGB of an image file; RenderError names one that cannot be read."""
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
     except UnidentifiedImageError as error:
-        raise RenderError(f"The texture is no picture that can be read: {path}") from error
+        raise RenderError(f"The texture is no image that can be read: {path}") from error
     except OSError as error:
-        raise RenderError(f"The texture cannot be read ({in_words(error)}): {path}") from error
+        raise RenderError(f"The texture cannot be read ({describe_error(error)}): {path}") from error
 
 
-_pyramids: OrderedDict[int, tuple[Picture, list[NDArray[np.uint32]], int]] = OrderedDict()
+_pyramids: OrderedDict[int, tuple[Pixels, list[NDArray[np.uint32]], int]] = OrderedDict()
 KEPT_PYRAMIDS = 32
 
 
-def pyramid(picture: Picture) -> tuple[list[NDArray[np.uint32]], int]:
-    """As `make_pyramid`; those of the last pictures are kept, since most scenes share them."""
-    found = _pyramids.pop(id(picture), None)
+def pyramid(image: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
+    """As `make_pyramid`; those of the last images are kept, since most scenes share them."""
+    found = _pyramids.pop(id(image), None)
     if found is None:
-        found = (picture, *make_pyramid(picture))  # the picture itself too, so that its id stays its own
-    _pyramids[id(picture)] = found
+        found = (image, *make_pyramid(image))  # the image itself too, so that its id stays its own
+    _pyramids[id(image)] = found
     if len(_pyramids) > KEPT_PYRAMIDS:
         _pyramids.popitem(last=False)
     return found[1], found[2]
 
 
-def make_pyramid(picture: Picture) -> tuple[list[NDArray[np.uint32]], int]:
+def make_pyramid(pixels: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
     """Packed texels of each level, from the largest, and log2 of the largest's side.
 
     Each level is square, a power of two wide, and carries its first row and column again at the end, so that a
     bilinear lookup needs no second wrap.
     """
-    side = min(LARGEST_SIDE, 1 << max(0, math.ceil(math.log2(max(picture.shape[:2])))))
-    image = Image.fromarray(picture).resize((side, side), Image.Resampling.BOX)
+    side = min(LARGEST_SIDE, 1 << max(0, math.ceil(math.log2(max(pixels.shape[:2])))))
+    image = Image.fromarray(pixels).resize((side, side), Image.Resampling.BOX)
     levels: list[NDArray[np.uint32]] = []
     log2_side = side.bit_length() - 1
     for level in range(log2_side + 1):
@@ -62,13 +62,13 @@ def make_pyramid(picture: Picture) -> tuple[list[NDArray[np.uint32]], int]:
     return levels, log2_side
 
 
-def pack(pictures: list[Picture]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+def pack(images: list[Pixels]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
     """All pyramids in one array, and (textures, MIP_LEVELS + 1) where each level starts; the last column is log2."""
     texels: list[NDArray[np.uint32]] = [np.zeros(2, dtype=np.uint32)]
-    table = np.zeros((max(1, len(pictures)), MIP_LEVELS + 1), dtype=np.int64)
+    table = np.zeros((max(1, len(images)), MIP_LEVELS + 1), dtype=np.int64)
     start = 2
-    for row, picture in enumerate(pictures):
-        levels, log2_side = pyramid(picture)
+    for row, image in enumerate(images):
+        levels, log2_side = pyramid(image)
         for level, data in enumerate(levels):
             table[row, level] = start
             texels.append(data)
@@ -83,19 +83,19 @@ PALETTE_COLORS = 24
 """And so few colours cover nearly all of the surface."""
 
 
-def palette_colors(mesh: RasterMesh, picture: Picture) -> Floats | None:
+def palette_colors(mesh: RasterMesh, image: Pixels) -> Floats | None:
     """(f, 3) face colours 0..1 of a mesh whose faces each lie on one colour of the texture; None when they do not.
 
-    Such a texture is a palette: colours by face are faster, do not bleed into each other in small pictures, and
+    Such a texture is a palette: colours by face are faster, do not bleed into each other in small images, and
     survive decimation.
     """
     if mesh.uv is None or mesh.num_faces == 0:
         return None
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     spots = np.concatenate([mesh.uv, mesh.uv.mean(1, keepdims=True)], 1)  # (f, 4, 2)
     x = np.floor(spots[..., 0] % 1.0 * width).astype(np.int64) % width
     y = np.floor((1.0 - spots[..., 1]) % 1.0 * height).astype(np.int64) % height
-    found = picture[y, x].astype(np.float64)
+    found = image[y, x].astype(np.float64)
     difference = np.abs(found - found[:, 3:]).max((1, 2))
     area = np.sqrt((face_normals(mesh.points, mesh.faces) ** 2).sum(1))
     if float((area * difference).sum() / area.sum()) > PALETTE_ERROR:

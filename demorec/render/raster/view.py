@@ -1,4 +1,4 @@
-"""One camera's pictures: everything redrawn, or what stands still kept and only the rest redrawn."""
+"""One camera's images: everything redrawn, or what stands still kept and only the rest redrawn."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Still:
 
     Attributes:
         key: What it depends on: camera pose and the poses of what stands still.
-        images: Finished pictures.
+        images: Finished images.
         values, ids: Samples.
         pixel_ids: Records of pixels.
         num_records, num_vertices: Used up by it.
@@ -44,12 +44,12 @@ class _Still:
 
 
 class CameraView:
-    """The pictures of one camera over one scene.
+    """The images of one camera over one scene.
 
     Args:
         canvas: The camera's buffers.
         stage: What all cameras share.
-        keep_still: Whether what stands still is kept between pictures (fixed cameras).
+        keep_still: Whether what stands still is kept between images (fixed cameras).
     """
 
     def __init__(self, canvas: Canvas, stage: Stage, *, keep_still: bool) -> None:
@@ -66,7 +66,7 @@ class CameraView:
         self._scratch_left, self._scratch_right = np.zeros(sh, dtype=np.int32), np.zeros(sh, dtype=np.int32)
 
     def draw(self, world_from_camera: Pose) -> CameraImages:
-        """The picture of the stage's present state."""
+        """The image of the stage's present state."""
         pose = world_from_camera.vector()
         self._canvas.aim(pose)
         images = self._draw_changes(pose) if self._keep_still else self._draw(len(self._stage.instances), None)[0]
@@ -85,7 +85,7 @@ class CameraView:
             still: As of `Canvas.shade`.
 
         Returns:
-            The pictures, and how many records and vertices they have used up.
+            The images, and how many records and vertices they have used up.
         """
         canvas, stage = self._canvas, self._stage
         records = -1

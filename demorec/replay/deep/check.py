@@ -19,7 +19,7 @@ from demorec.loop import SimulatorCache
 from demorec.mcap import Recording, open_recording
 from demorec.replay.deep.contents import Contents, coded_topics, content_differences
 from demorec.replay.deep.difference import Difference
-from demorec.replay.deep.pictures import picture_differences
+from demorec.replay.deep.images import image_differences
 from demorec.replay.deep.remake import recorded_config, recorded_painter, remake
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
 from demorec.replay.drive import replay
@@ -49,7 +49,7 @@ class DeepReport:
 
     @property
     def level(self) -> Literal["pass", "warn", "fail"]:
-        """Other versions, and other codings of the same pictures, are warnings."""
+        """Other versions, and other codings of the same images, are warnings."""
         if self.error or any(not difference.is_coding for difference in self.differences):
             return "fail"
         return "warn" if self.versions or self.differences else "pass"
@@ -82,7 +82,7 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
             again = Path(folder) / "again.mcap"
             remake(recording, again, simulators, allowed)
             differences = tuple(_differences(recording, again, simulators, allowed))
-            if not report.is_derived and any(not d.is_coding and d.field != "picture" for d in differences):
+            if not report.is_derived and any(not d.is_coding and d.field != "image" for d in differences):
                 report = replace(report, replay=_replayed(recording, simulators, allowed))
             return replace(report, differences=differences)
     except DemorecError as error:
@@ -106,12 +106,12 @@ def _differences(
     with open_recording(again, simulated=True) as remade:
         if recording.is_recovered:
             made.cut_off(found)
-        differences, pictures = content_differences(found, made, remade.info, recording.info.fps)
-        if pictures:
+        differences, images = content_differences(found, made, remade.info, recording.info.fps)
+        if images:
             painter = recorded_painter(remade.info, simulators.acquire(remade.info)[1], allowed)
-            assert painter is not None, "pictures were drawn"
+            assert painter is not None, "images were drawn"
             cameras = coded_topics(remade.info)
-            differences += picture_differences(found, made, remade, painter, cameras, pictures)
+            differences += image_differences(found, made, remade, painter, cameras, images)
     yield from sorted(differences, key=lambda difference: difference.first_frame)
 
 

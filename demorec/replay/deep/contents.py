@@ -1,7 +1,7 @@
 """Two recordings of one episode compared byte by byte, and what differs taken apart into named fields.
 
 Recordings hold no clock, host or path, so that the same episode made again on the same type of machine has the same
-bytes in every message. Coded pictures that differ are left to `pictures`, which looks at what they show.
+bytes in every message. Coded images that differ are left to `images`, which looks at what they show.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from demorec.mcap.metadata import EPISODE
 from demorec.replay.deep.difference import Difference, Differences
 
 CODED = ("h264", "video", "image/compressed", "depth", "segmentation")
-"""Streams of a camera whose messages hold a coded picture in the field `data`."""
+"""Streams of a camera whose messages hold a coded image in the field `data`."""
 _SEAL = "crc32"
 """Follows from the other values of a metadata record."""
 _VERSIONS = "info.versions"
@@ -90,14 +90,14 @@ class Contents:
 
 
 def coded_topics(info: EpisodeInfo) -> dict[str, str]:
-    """Topic -> camera, of all streams of coded pictures."""
+    """Topic -> camera, of all streams of coded images."""
     return {camera_topic(camera.name, stream): camera.name for camera in info.scene.cameras for stream in CODED}
 
 
 def content_differences(
     recorded: Contents, again: Contents, info: EpisodeInfo, fps: int
 ) -> tuple[list[Difference], dict[str, list[int]]]:
-    """What differs, less the coded pictures; and topic -> frames, ascending, whose coded pictures differ.
+    """What differs, less the coded images; and topic -> frames, ascending, whose coded images differ.
 
     Args:
         recorded, again: The two files.
@@ -113,7 +113,7 @@ def content_differences(
         for path, values in _metadata_differences(recorded.metadata.get(name), again.metadata.get(name)):
             if not (name == EPISODE and path.startswith(_VERSIONS)):
                 found.add(f"metadata {name}", path, None, *values)
-    pictures: dict[str, list[int]] = {}
+    images: dict[str, list[int]] = {}
     coded = coded_topics(info)
     for topic in dict.fromkeys((*again.channels, *recorded.channels)):
         if topic not in recorded.channels or topic not in again.channels:
@@ -124,8 +124,8 @@ def content_differences(
             found.add(topic, name, None, *values)
         differing = _topic_differences(found, topic, recorded, again, fps=fps, is_coded=topic in coded)
         if differing:
-            pictures[topic] = differing
-    return list(found), pictures
+            images[topic] = differing
+    return list(found), images
 
 
 def _differing(a: Mapping[str, Value], b: Mapping[str, Value]) -> Iterator[tuple[str, tuple[Any, Any]]]:
@@ -144,11 +144,11 @@ def _is_same(a: Value | None, b: Value | None) -> bool:
 def _topic_differences(
     found: Differences, topic: str, recorded: Contents, again: Contents, *, fps: int, is_coded: bool
 ) -> list[int]:
-    """Add what differs in a topic; return the frames whose coded pictures differ."""
+    """Add what differs in a topic; return the frames whose coded images differ."""
     ours, theirs, schema = recorded.messages[topic], again.messages[topic], again.schemas[topic]
     if ours == theirs:
         return []
-    pictures = []
+    images = []
     for time_ns in sorted(ours.keys() | theirs.keys()):
         a_messages, b_messages = ours.get(time_ns, []), theirs.get(time_ns, [])
         frame = round(time_ns * fps / 1e9)
@@ -165,12 +165,12 @@ def _topic_differences(
             b_fields = message_fields(schema, b)
             differing = dict(_differing(a_fields, b_fields))
             if is_coded and differing.pop("data", None) is not None:
-                pictures.append(frame)
+                images.append(frame)
             for name, values in differing.items():
                 found.add(topic, name, frame, *values)
-            if not differing and not (is_coded and pictures and pictures[-1] == frame):
+            if not differing and not (is_coded and images and images[-1] == frame):
                 found.add(topic, "padding", frame, a, b)
-    return pictures
+    return images
 
 
 def _metadata_differences(

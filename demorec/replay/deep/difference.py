@@ -18,13 +18,13 @@ class Difference:
 
     Attributes:
         stream: A topic, or "metadata NAME", "attachment NAME".
-        field: Of its messages, as `pose.position.x`, or of the metadata, as `info.scene.bodies[1].mass`; "picture" for
+        field: Of its messages, as `pose.position.x`, or of the metadata, as `info.scene.bodies[1].mass`; "image" for
             what a camera shows.
         frames: In which, ascending; empty for what belongs to no frame.
         recorded, again: What is recorded and what comes out, at the first of these frames, in words; `again` is ""
             where `recorded` says it all.
         largest: Largest absolute difference over these frames; None of what is no number.
-        is_coding: Whether a picture is coded otherwise, but shows the same within the coder's own error.
+        is_coding: Whether an image is coded otherwise, but shows the same within the coder's own error.
     """
 
     stream: str

@@ -12,7 +12,7 @@ from demorec.render.raster.kernels.shade import sky_pixel
 
 EDGE, QUEUED, BACKGROUND = at.EDGE, at.QUEUED, at.BACKGROUND
 STILL = -2
-"""In the picture of pixel records: what stood still and was shaded before."""
+"""In the image of pixel records: what stood still and was shaded before."""
 FLAT_ENOUGH = 0.012
 """Samples of one surface whose depths differ by less than this share are shaded as one."""
 SX, SY = at.SCREEN_X, at.SCREEN_Y
@@ -20,7 +20,7 @@ SX, SY = at.SCREEN_X, at.SCREEN_Y
 
 @kernel
 def halve_extents(sample_left, sample_right, left, right, pixel_ids):
-    """Clear what the last picture left in `pixel_ids` and turn extents in samples into extents in pixels."""
+    """Clear what the last image left in `pixel_ids` and turn extents in samples into extents in pixels."""
     for y in range(pixel_ids.shape[0]):
         for x in range(left[y], right[y]):
             pixel_ids[y, x] = STILL

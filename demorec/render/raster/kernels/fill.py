@@ -24,7 +24,7 @@ def fill_triangle(x0, y0, v0, x1, y1, v1, x2, y2, v2, area, width, height, value
 
     Args:
         x0 .. y2: Corners, 1/256 sample, whole numbers in float64.
-        v0, v1, v2: Value at the corners (inverse depth, height), linear over the picture.
+        v0, v1, v2: Value at the corners (inverse depth, height), linear over the image.
         values, ids: (height * width,) greatest value so far, and the record it came from.
         with_ids: Whether ids, left and right are kept.
         left, right: (height,) extents of what was drawn in each row, widened (to the corners, where narrow).
@@ -73,7 +73,7 @@ def fill_triangle(x0, y0, v0, x1, y1, v1, x2, y2, v2, area, width, height, value
     b2 *= 256.0
     span = x_last - x_first
     strips = span // STRIP + 1
-    # What lies beyond the row's end is read and written back: within the picture, that is.
+    # What lies beyond the row's end is read and written back: within the image, that is.
     if span < NARROW and y_last * width + x_first + strips * STRIP <= width * height:
         limit = i4(span)
         number = i4(record)

@@ -14,7 +14,7 @@ import numpy as np
 
 from demorec.core.cache import cache_folder
 
-# Only flags that change no finite result: pictures are equal whatever vector width a CPU has. `contract`, `arcp` and
+# Only flags that change no finite result: images are equal whatever vector width a CPU has. `contract`, `arcp` and
 # `reassoc` are left out on purpose.
 _FLAGS = {"nnan", "ninf", "nsz"}
 

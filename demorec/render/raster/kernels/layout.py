@@ -19,7 +19,7 @@ BLOCK = LANES * ROWS
 POS_X, POS_Y, POS_Z = 0, LANES, 2 * LANES
 NORMAL_X, NORMAL_Y, NORMAL_Z = 3 * LANES, 4 * LANES, 5 * LANES
 TEX_U, TEX_V = 6 * LANES, 7 * LANES
-CLIP_X, CLIP_Y, CLIP_W = 8 * LANES, 9 * LANES, 10 * LANES  # homogeneous, +-w is the picture's border
+CLIP_X, CLIP_Y, CLIP_W = 8 * LANES, 9 * LANES, 10 * LANES  # homogeneous, +-w is the image's border
 SCREEN_X, SCREEN_Y = 11 * LANES, 12 * LANES  # 1/256 sample, whole numbers
 INVERSE_W = 13 * LANES
 TO_LIGHT, UPWARD, HALFWAY = 14 * LANES, 15 * LANES, 16 * LANES  # normal times light, up and half-way vector
@@ -30,7 +30,7 @@ FACE_FLAGS, FACE_TEXTURE, FACE_SEGMENT, FACE_GROUP = 0, 1, 2, 3
 SMOOTH, TEXTURED = 1, 2  # bits of FACE_FLAGS
 FACE_RED, FACE_GREEN, FACE_BLUE, FACE_SPECULAR = 0, 1, 2, 3
 
-# Columns of a record: what a triangle needs while it is shaded. Each quantity q is a plane over the picture, as
+# Columns of a record: what a triangle needs while it is shaded. Each quantity q is a plane over the image, as
 # value at the origin, step in x, step in y; all but the first are divided by depth, so that they are planes at all.
 INVERSE_DEPTH_PLANE = 0
 SHADOW_X_PLANE, SHADOW_Y_PLANE, SHADOW_Z_PLANE = 3, 6, 9
@@ -39,7 +39,7 @@ TEX_U_PLANE, TEX_V_PLANE = 21, 24
 TEXEL_DENSITY = 27  # (texture widths / sample)^2 at inverse depth 1
 RECORD = 28
 
-# Values in the picture of record numbers.
+# Values in the image of record numbers.
 BACKGROUND = -1
 EDGE = -3  # shaded sample by sample
 QUEUED = -4  # an edge that is in the list already

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""Which triangles own samples, and the planes over the picture that shading needs of them."""
+"""Which triangles own samples, and the planes over the image that shading needs of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def flag_owners(left, right, first_record, ids, flags):
 
 @inlined
 def set_plane(records, record, column, vertices, attribute, a, b, c, step_x, step_y, value):
-    """Plane of one attribute over the picture; the weights hold each corner's share, divided by its depth."""
+    """Plane of one attribute over the image; the weights hold each corner's share, divided by its depth."""
     p = vertices[a + attribute]
     q = vertices[b + attribute]
     r = vertices[c + attribute]

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""What stands still before a fixed camera: kept from picture to picture, its shadows looked up anew where they may
+"""What stands still before a fixed camera: kept from image to image, its shadows looked up anew where they may
 have changed."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SHIFT = at.TILE_SHIFT
 
 @kernel
 def restore_samples(values, still_values, ids, still_ids, left, right, width):
-    """Undo the moving layer of the last picture, row by row, and empty the extents."""
+    """Undo the moving layer of the last image, row by row, and empty the extents."""
     for y in range(left.shape[0]):
         start = y * width + left[y]
         n = right[y] - left[y]

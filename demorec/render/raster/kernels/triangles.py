@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""Meshes into the picture, clipped and without the faces that look away, and into the shadow map."""
+"""Meshes into the image, clipped and without the faces that look away, and into the shadow map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from demorec.render.raster.kernels.jit import f4, f8, index, inlined, kernel
 LANES, BLOCK = at.LANES, at.BLOCK
 CX, CY, CW, SX, SY, IW = at.CLIP_X, at.CLIP_Y, at.CLIP_W, at.SCREEN_X, at.SCREEN_Y, at.INVERSE_W
 GUARD = 16.0
-"""Triangles that reach farther than this many half pictures from the middle are clipped: beyond, the edge functions
+"""Triangles that reach farther than this many half images from the middle are clipped: beyond, the edge functions
 would leave the whole numbers that float64 holds."""
 SHIFT = at.TILE_SHIFT
 

@@ -62,14 +62,14 @@ def place_instances(
 
 @kernel
 def aim_camera(pose, lens, focal, width, height, clip_from_world, sky):
-    """Matrix of a camera, and the rays of its picture.
+    """Matrix of a camera, and the rays of its image.
 
     Args:
         pose: (7,) world_from_camera, position and quaternion xyzw, OpenCV axes.
-        lens: (2,) focal lengths in half pictures.
+        lens: (2,) focal lengths in half images.
         focal: In pixels.
         width, height: Pixels.
-        clip_from_world: (3, 4) result, rows x, y (picture between -w and w, y down), w = depth.
+        clip_from_world: (3, 4) result, rows x, y (image between -w and w, y down), w = depth.
         sky: Result: origin and steps of the rays (see layout); the colours stay.
     """
     x = pose[3]

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from demorec.core.config import MAX_PIXELS
-from demorec.core.errors import in_words
+from demorec.core.errors import describe_error
 from demorec.mcap.cdr import Values
 from demorec.mcap.lossless import decode_millimetres
 from demorec.mcap.video import DECODERS, Rgb, is_keyframe, nal_units
-from demorec.sources.fields import FieldError, picture_bytes, whole
+from demorec.sources.fields import FieldError, image_bytes, whole
 
 _CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
     "rgb8": (3, (0, 1, 2)),
@@ -47,7 +47,7 @@ _PIXEL_BYTES = (
 RAW_ENCODINGS = tuple(_PIXEL_BYTES)
 
 
-def raw_picture(values: Values) -> NDArray[Any]:
+def raw_image(values: Values) -> NDArray[Any]:
     """(H, W, 3) uint8 of a message, or (H, W) distances as they are: uint16 (16UC1) or float32 (32FC1).
 
     Raises:
@@ -71,7 +71,7 @@ def check_raw(values: Values) -> tuple[int, int]:
     used = _bytes_of_row(encoding, width)
     step = whole(values, "step") if values.get("step") and height > 1 else used
     data = values["data"]
-    count = len(data) if isinstance(data, bytes | np.ndarray) else len(picture_bytes(values))
+    count = len(data) if isinstance(data, bytes | np.ndarray) else len(image_bytes(values))
     if step < used or count < step * (height - 1) + used:
         raise FieldError(f"its image has {count:,} bytes, too few for {width}x{height} {encoding}")
     return step, used
@@ -86,7 +86,7 @@ def _bytes_of_row(encoding: str, width: int) -> int:
 def _rows(values: Values) -> NDArray[np.uint8]:
     """(H, B) bytes, without what pads each row."""
     step, used = check_raw(values)
-    height, data = whole(values, "height"), np.frombuffer(picture_bytes(values), np.uint8)
+    height, data = whole(values, "height"), np.frombuffer(image_bytes(values), np.uint8)
     if step == used:
         return data[: used * height].reshape(height, used)
     padded = np.zeros(step * height, np.uint8)
@@ -142,7 +142,7 @@ _HEAD_BYTES = 12
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-class PictureHead(NamedTuple):
+class ImageHead(NamedTuple):
     """What is known of an image before it is decoded.
 
     Attributes:
@@ -159,15 +159,15 @@ class PictureHead(NamedTuple):
     is_keyframe: bool
 
 
-class PictureHeads:
+class ImageHeads:
     """The heads of a camera's images in order: a bag has a million of them, which are of a few kinds."""
 
     def __init__(self) -> None:
-        self._kinds: list[PictureHead] = []
-        self._places: dict[PictureHead, int] = {}
+        self._kinds: list[ImageHead] = []
+        self._places: dict[ImageHead, int] = {}
         self._of = array("I")
 
-    def append(self, head: PictureHead) -> None:
+    def append(self, head: ImageHead) -> None:
         """Add the next one."""
         place = self._places.get(head)
         if place is None:
@@ -178,10 +178,10 @@ class PictureHeads:
     def __len__(self) -> int:
         return len(self._of)
 
-    def __getitem__(self, index: int) -> PictureHead:
+    def __getitem__(self, index: int) -> ImageHead:
         return self._kinds[self._of[index]]
 
-    def kinds(self, among: NDArray[np.int64] | None = None) -> list[PictureHead]:
+    def kinds(self, among: NDArray[np.int64] | None = None) -> list[ImageHead]:
         """The different ones, of all or of the images of these numbers."""
         if among is None:
             return list(self._kinds)
@@ -193,21 +193,21 @@ class PictureHeads:
         return np.array([head.is_keyframe for head in self._kinds], bool)[np.array(self._of, np.intp)]
 
 
-def picture_head(values: Values) -> PictureHead:
+def image_head(values: Values) -> ImageHead:
     """Of a message; FieldError when it holds no image, a damaged one, or one in a format that is not read."""
     if "data" not in values:
         raise FieldError("it holds no image")
     if "encoding" in values and "width" in values and "height" in values:
         size = whole(values, "width"), whole(values, "height")
-        head = _checked(PictureHead("raw", str(values["encoding"]), *size, True))
+        head = _checked(ImageHead("raw", str(values["encoding"]), *size, True))
         check_raw(values)
         return head
     if "format" not in values:
         raise FieldError("it holds no image")
-    data = picture_bytes(values)
+    data = image_bytes(values)
     name = str(values["format"]).lower()
     if "compresseddepth" in name:
-        head = _checked(PictureHead("compressedDepth", *compressed_depth_head(str(values["format"]), data), True))
+        head = _checked(ImageHead("compressedDepth", *compressed_depth_head(str(values["format"]), data), True))
         decode_compressed_depth(data)
         return head
     if data.startswith((_JPEG, _PNG)):
@@ -216,11 +216,11 @@ def picture_head(values: Values) -> PictureHead:
     if codec not in VIDEO_FORMATS:
         raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
     if not _starts_by_itself(codec, data):
-        return PictureHead(codec, "", 0, 0, False)
-    return _checked(PictureHead(codec, "", *_sizes.of(codec, data), True))
+        return ImageHead(codec, "", 0, 0, False)
+    return _checked(ImageHead(codec, "", *_sizes.of(codec, data), True))
 
 
-def _checked(head: PictureHead) -> PictureHead:
+def _checked(head: ImageHead) -> ImageHead:
     if head.width < 1 or head.height < 1 or head.width * head.height > MAX_PIXELS:
         raise FieldError(f"its image has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
     if head.format == "raw" and head.encoding not in RAW_ENCODINGS:
@@ -228,7 +228,7 @@ def _checked(head: PictureHead) -> PictureHead:
     return head
 
 
-def file_head(data: bytes) -> PictureHead:
+def file_head(data: bytes) -> ImageHead:
     """Of a JPEG or PNG file; FieldError when it is none, damaged, or too large."""
     kind = "jpeg" if data.startswith(_JPEG) else "png"
     try:
@@ -238,11 +238,11 @@ def file_head(data: bytes) -> PictureHead:
                 _check_mode(image)
                 image.verify()
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its image is damaged ({in_words(error)})") from error
+        raise FieldError(f"its image is damaged ({describe_error(error)})") from error
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
     if end not in data[-64:]:  # some cameras pad their images
         raise FieldError("its image is cut off")
-    return _checked(PictureHead(kind, "", width, height, True))
+    return _checked(ImageHead(kind, "", width, height, True))
 
 
 def _check_mode(image: Image.Image) -> None:
@@ -250,13 +250,13 @@ def _check_mode(image: Image.Image) -> None:
         raise FieldError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
 
 
-def decode_picture(values: Values) -> NDArray[Any]:
+def decode_image(values: Values) -> NDArray[Any]:
     """(H, W, 3) RGB of an image that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
     if "encoding" in values:
-        return raw_picture(values)
+        return raw_image(values)
     if "compresseddepth" in str(values["format"]).lower():
-        return decode_compressed_depth(picture_bytes(values))
-    return decode_file(picture_bytes(values))
+        return decode_compressed_depth(image_bytes(values))
+    return decode_file(image_bytes(values))
 
 
 def decode_file(data: bytes) -> NDArray[np.uint8]:
@@ -266,7 +266,7 @@ def decode_file(data: bytes) -> NDArray[np.uint8]:
             _check_mode(image)
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its image cannot be decoded ({in_words(error)})") from error
+        raise FieldError(f"its image cannot be decoded ({describe_error(error)})") from error
 
 
 def _starts_by_itself(codec: str, data: bytes) -> bool:
@@ -351,7 +351,7 @@ def decode_compressed_depth(data: bytes) -> NDArray[np.uint16]:
     except UnidentifiedImageError as error:
         raise FieldError("its distances cannot be decoded (they are no whole PNG file)") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its distances cannot be decoded ({in_words(error)})") from error
+        raise FieldError(f"its distances cannot be decoded ({describe_error(error)})") from error
 
 
 def _size(data: bytes) -> tuple[int, int]:

@@ -1,6 +1,6 @@
-"""Sheets of pictures for the docs: every task at its grasp and at its end, and many looks of one task.
+"""Sheets of images for the docs: every task at its grasp and at its end, and many looks of one task.
 
-python benchmarks/pictures.py --out docs/images
+python benchmarks/images.py --out docs/images
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.tables import TASKS
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 
-Picture = NDArray[np.uint8]
+Pixels = NDArray[np.uint8]
 WIDTH, HEIGHT = 320, 240
 CAPTION_LETTERS = 48
 CARRYING = {"lift", "transport", "hold"}
@@ -26,8 +26,8 @@ EPISODES = {"line_up": 2}
 """Of which not the first is shown: one at whose end the hand hides none of the things."""
 
 
-def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Picture, Picture, str]:
-    """The front camera's picture when something is first held and at the end of an episode, and its instruction."""
+def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Pixels, Pixels, str]:
+    """The front camera's image when something is first held and at the end of an episode, and its instruction."""
     episode = prepare(EpisodePlan(config=config, episode_index=index))
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
         frames = list(Session.of_episode(world, episode, renderer).run(ScriptAgent(episode)))
@@ -35,16 +35,16 @@ def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Picture, Picture,
     return held.images["front"].color, frames[-1].images["front"].color, episode.info.instruction
 
 
-def sheet(rows: list[list[tuple[Picture, str]]]) -> Image.Image:
-    """Rows of captioned pictures; long captions take several lines."""
+def sheet(rows: list[list[tuple[Pixels, str]]]) -> Image.Image:
+    """Rows of captioned images; long captions take several lines."""
     lines = max(len(textwrap.wrap(caption, CAPTION_LETTERS)) for row in rows for _, caption in row)
     line = 3 + 15 * lines
     columns = max(len(row) for row in rows)
     canvas = Image.new("RGB", (columns * WIDTH, len(rows) * (HEIGHT + line)), "white")
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=12)
     for y, row in enumerate(rows):
-        for x, (picture, caption) in enumerate(row):
-            canvas.paste(Image.fromarray(picture), (x * WIDTH, y * (HEIGHT + line)))
+        for x, (image, caption) in enumerate(row):
+            canvas.paste(Image.fromarray(image), (x * WIDTH, y * (HEIGHT + line)))
             text = textwrap.fill(caption, CAPTION_LETTERS)
             draw.text((x * WIDTH + 4, y * (HEIGHT + line) + HEIGHT + 2), text, fill="black", font=font, spacing=2)
     return canvas
@@ -67,7 +67,7 @@ def main() -> None:
             variation=variation,  # type: ignore[arg-type]
         )
 
-    cells: list[list[tuple[Picture, str]]] = []
+    cells: list[list[tuple[Pixels, str]]] = []
     for task in TASKS.names():
         held, end, instruction = grasp_and_end(config(task, "mild"), EPISODES.get(task, 0))
         cells.append([(held, f"{task}: {instruction}"), (end, f"{task}, end")])

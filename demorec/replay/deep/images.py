@@ -1,9 +1,9 @@
-"""Recorded pictures against the drawn ones, within what the coder itself does to them.
+"""Recorded images against the drawn ones, within what the coder itself does to them.
 
 Only asked where coded bytes differ from those made again. Colours are compared in three ways: no block of 8x8 pixels
 may be farther from the drawn one than twice what the coder makes of it, or of one beside it, and two levels (a torn,
-painted or shifted part); the picture is as sharp as the coder leaves it (a blurred one is a little off along all
-edges); and its mean colour is the same to three levels. Pictures that were decoded and coded a second time, with H.264
+painted or shifted part); the image is as sharp as the coder leaves it (a blurred one is a little off along all
+edges); and its mean colour is the same to three levels. Images that were decoded and coded a second time, with H.264
 at crf 23 and 35, AV1 and JPEG, at 96 and 224 pixels, reach 0.95 of the first limit and a sharpness of 0.89 to 1.12 of
 the coder's own. Depth and labels are coded without loss, so every pixel counts.
 """
@@ -34,7 +34,7 @@ _LEAST_SHARP, _MOST_SHARP = 0.84, 1.2
 _LEVELS_OF_THE_MEAN = 3.0
 
 
-def picture_differences(
+def image_differences(
     recorded: Contents,
     again: Contents,
     remade: Recording,
@@ -42,26 +42,26 @@ def picture_differences(
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
 ) -> Iterator[Difference]:
-    """One or two differences for each stream whose coded pictures differ: what shows something else, and what does not.
+    """One or two differences for each stream whose coded images differ: what shows something else, and what does not.
 
     Args:
         recorded, again: The two files.
         remade: The one made again, open.
         painter: Draws what it shows.
-        cameras: Topic -> camera, of streams of coded pictures.
-        differing: Topic -> frames whose coded pictures differ.
+        cameras: Topic -> camera, of streams of coded images.
+        differing: Topic -> frames whose coded images differ.
     """
     for topic, frames in differing.items():
         settings = remade.video_settings(cameras[topic])
-        pictures = _coded(recorded, topic), _coded(again, topic)
+        images = _coded(recorded, topic), _coded(again, topic)
         if topic.rpartition("/")[2] in ("depth", "segmentation"):
-            found = dict(_lossless(topic, *pictures, (settings.height, settings.width)))
+            found = dict(_lossless(topic, *images, (settings.height, settings.width)))
         else:
-            found = dict(_colours(settings, *pictures, _drawn(remade, painter, cameras[topic])))
+            found = dict(_colours(settings, *images, _drawn(remade, painter, cameras[topic])))
         if found:
             yield Difference(
                 stream=topic,
-                field="picture",
+                field="image",
                 frames=tuple(found),
                 recorded=next(iter(found.values())),
                 again="",
@@ -72,22 +72,22 @@ def picture_differences(
                 stream=topic,
                 field="data",
                 frames=coding,
-                recorded="coded otherwise, but the same picture within the coder's own error",
+                recorded="coded otherwise, but the same image within the coder's own error",
                 again="",
                 is_coding=True,
             )
 
 
 def _coded(contents: Contents, topic: str) -> list[bytes]:
-    """The coded pictures of a topic in order; empty bytes for what is no message of a picture."""
-    pictures = []
+    """The coded images of a topic in order; empty bytes for what is no message of an image."""
+    images = []
     for _, found in sorted(contents.messages[topic].items()):
         try:
             data = message_fields(contents.schemas[topic], found[0]).get("data")
         except ValueError:
             data = None
-        pictures.append(data if isinstance(data, bytes) else b"")
-    return pictures
+        images.append(data if isinstance(data, bytes) else b"")
+    return images
 
 
 def _drawn(remade: Recording, painter: Painter, camera: str) -> Iterator[Rgb]:
@@ -104,7 +104,7 @@ def _drawn(remade: Recording, painter: Painter, camera: str) -> Iterator[Rgb]:
 def _lossless(
     topic: str, recorded: Sequence[bytes], again: Sequence[bytes], size: tuple[int, int]
 ) -> Iterator[tuple[int, str]]:
-    """(frame, what is off) of every depth or segmentation picture that is not the same."""
+    """(frame, what is off) of every depth or segmentation image that is not the same."""
     is_depth = topic.endswith("/depth")
     read: Any = decode_depth if is_depth else decode_labels
     for frame, (data, expected) in enumerate(zip(recorded, again, strict=False)):
@@ -124,24 +124,24 @@ def _lossless(
 def _colours(
     settings: VideoSettings, recorded: Sequence[bytes], again: Sequence[bytes], drawn: Iterator[Rgb]
 ) -> Iterator[tuple[int, str]]:
-    """(frame, what is off) of every colour picture that is farther from the drawn one than the coder's own."""
-    pictures = _decoded(settings, recorded)
+    """(frame, what is off) of every colour image that is farther from the drawn one than the coder's own."""
+    images = _decoded(settings, recorded)
     for frame, (own, true) in enumerate(zip(_decoded(settings, again), drawn, strict=True)):
         try:
-            picture = next(pictures, None)
+            image = next(images, None)
         except RecordingError as error:
             yield frame, f"cannot be decoded ({error})"
             return  # a decoder that has lost the thread
-        if picture is None:
-            return  # missing pictures are told as missing messages
-        words = _beyond_coding(picture, own, true)
+        if image is None:
+            return  # missing images are told as missing messages
+        words = _beyond_coding(image, own, true)
         if words:
             yield frame, words
 
 
-def _beyond_coding(picture: Rgb, own: Rgb, true: Rgb) -> str:
-    """In what a picture is farther from the true one than the coder's own, in words; "" in nothing."""
-    off, coders = _blocks(picture, true), _blocks(own, true)
+def _beyond_coding(image: Rgb, own: Rgb, true: Rgb) -> str:
+    """In what an image is farther from the true one than the coder's own, in words; "" in nothing."""
+    off, coders = _blocks(image, true), _blocks(own, true)
     allowed = _TIMES_IN_A_BLOCK * _around(coders) + _LEVELS_IN_A_BLOCK
     beyond = off > allowed
     if beyond.any():
@@ -149,10 +149,10 @@ def _beyond_coding(picture: Rgb, own: Rgb, true: Rgb) -> str:
         place = f"({column * _BLOCK}, {row * _BLOCK})"
         levels = f"{off[row, column]:.0f} levels where {allowed[row, column]:.0f} are allowed"
         return f"shows something else in {int(beyond.sum())} of {beyond.size} blocks, at {place} by {levels}"
-    sharpness = (_edges(picture) + 0.1) / (_edges(own) + 0.1)  # 0.1: of a picture without edges nothing is asked
+    sharpness = (_edges(image) + 0.1) / (_edges(own) + 0.1)  # 0.1: of an image without edges nothing is asked
     if not _LEAST_SHARP <= sharpness <= _MOST_SHARP:
         return f"has {sharpness:.0%} of the sharpness that the coder leaves"
-    mean = np.abs(picture.mean(axis=(0, 1)) - own.mean(axis=(0, 1))).max()
+    mean = np.abs(image.mean(axis=(0, 1)) - own.mean(axis=(0, 1))).max()
     return f"has another mean colour, by {mean:.1f} levels" if mean > _LEVELS_OF_THE_MEAN else ""
 
 
@@ -165,7 +165,7 @@ def _decoded(settings: VideoSettings, coded: Sequence[bytes]) -> Iterator[Rgb]:
 
 
 def _blocks(a: Rgb, b: Rgb) -> Array:
-    """(rows, columns) mean absolute difference of two pictures in blocks, levels; an incomplete one counts as well."""
+    """(rows, columns) mean absolute difference of two images in blocks, levels; an incomplete one counts as well."""
     off = np.abs(a.astype(np.int16) - b).mean(axis=2)
     starts = [np.arange(0, length, _BLOCK) for length in off.shape]
     sums = np.add.reduceat(np.add.reduceat(off, starts[0], axis=0), starts[1], axis=1)
@@ -181,8 +181,8 @@ def _around(blocks: Array) -> Array:
     return np.asarray(np.max(shifted, axis=0))
 
 
-def _edges(picture: Rgb) -> float:
-    """Mean size of the second differences of a picture's brightness, levels."""
-    grey = picture.astype(np.float64).mean(axis=2)
+def _edges(image: Rgb) -> float:
+    """Mean size of the second differences of an image's brightness, levels."""
+    grey = image.astype(np.float64).mean(axis=2)
     inner = 4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
     return float(np.abs(inner).mean())

@@ -1,4 +1,4 @@
-"""Are the pictures worth looking at: they decode, change when something moves, and are neither black nor burnt."""
+"""Are the images worth looking at: they decode, change when something moves, and are neither black nor burnt."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from demorec.check.base import (
     Lacking,
     Measurement,
     NotMeasured,
-    picture_check,
+    image_check,
     worst_frame,
 )
-from demorec.check.drawn import PictureComparison, judge_unlike
+from demorec.check.drawn import ImageComparison, judge_unlike
 from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
 from demorec.check.rows import longest_run
@@ -26,18 +26,18 @@ from demorec.core.geometry import Array
 from demorec.episode.scene import SceneCamera
 
 MIN_MOTION = 2.5
-"""Root mean square change of the drawn cells from frame to frame, of 255, that a picture must show."""
+"""Root mean square change of the drawn cells from frame to frame, of 255, that an image must show."""
 STALE_SHARE, STALE_EXCESS = 0.3, 2.5
-"""A picture is stale that shows less than this share of the motion, and is more unlike the drawn one than the usual
-picture by more than this, of 255: a predicted picture may leave a small motion to the next keyframe."""
+"""An image is stale that shows less than this share of the motion, and is more unlike the drawn one than the usual
+image by more than this, of 255: a predicted image may leave a small motion to the next keyframe."""
 _PREDICTED_WEIGHT = 0.25
-"""Of the difference of a predicted picture of AV1, which leaves whole motions to the next keyframe (15 levels seen)."""
+"""Of the difference of a predicted image of AV1, which leaves whole motions to the next keyframe (15 levels seen)."""
 
 
 def of_each_camera(
-    judge: Callable[[CheckedEpisode, SceneCamera, PictureComparison], Found],
+    judge: Callable[[CheckedEpisode, SceneCamera, ImageComparison], Found],
 ) -> Callable[[CheckedEpisode], Iterator[Found]]:
-    """A check of the colour pictures of one camera, against what the recorded numbers make of them, as one of all."""
+    """A check of the colour images of one camera, against what the recorded numbers make of them, as one of all."""
 
     @wraps(judge)
     def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
@@ -60,42 +60,42 @@ def at_full_size(judge: Callable[[SceneCamera, FullSize], Found]) -> Callable[[C
     return judge_all
 
 
-@picture_check(
-    measures="frames without a picture that decodes",
+@image_check(
+    measures="frames without an image that decodes",
 )
-def pictures_decode(episode: CheckedEpisode) -> Iterator[Found]:
-    """Every camera's video, depth and labels decode to their end, one picture a frame."""
+def images_decode(episode: CheckedEpisode) -> Iterator[Found]:
+    """Every camera's video, depth and labels decode to their end, one image a frame."""
     for camera in episode.cameras:
         for kind in episode.kinds(camera.name):
-            summary = episode.pictures(camera, kind)
-            missing = episode.num_frames - summary.num_pictures
-            detail = f"camera {camera.name}, {kind}: {summary.error or f'{summary.num_pictures} pictures'}"
+            summary = episode.images(camera, kind)
+            missing = episode.num_frames - summary.num_images
+            detail = f"camera {camera.name}, {kind}: {summary.error or f'{summary.num_images} images'}"
             if summary.error and missing == 0:
                 missing = 1
-            frame = summary.num_pictures if missing else None
+            frame = summary.num_images if missing else None
             yield Measurement(value=abs(missing), frame=frame, detail=detail)
 
 
-@picture_check(
-    measures="largest share of a picture that is black or white",
+@image_check(
+    measures="largest share of an image that is black or white",
 )
 def exposure(episode: CheckedEpisode) -> Iterator[Found]:
-    """Most of every picture is neither under- nor overexposed."""
+    """Most of every image is neither under- nor overexposed."""
     for camera in episode.cameras:
-        summary = episode.pictures(camera)
+        summary = episode.images(camera)
         yield worst_frame(np.maximum(summary.dark, summary.bright), f"camera {camera.name}")
 
 
-@picture_check(
-    measures="difference of the pictures from what the recorded numbers make of them, median of 255",
+@image_check(
+    measures="difference of the images from what the recorded numbers make of them, median of 255",
 )
-def pictures_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
-    """The pictures show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
+def images_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
+    """The images show robot, objects, colours and light as recorded: drawn anew and compared in every frame."""
     for camera in episode.cameras:
         yield judge_unlike(episode.compared(camera), f"camera {camera.name}")
 
 
-@picture_check(
+@image_check(
     measures="mean difference of a colour from what is drawn and encoded at full size, in units of the encoder's error",
 )
 @at_full_size
@@ -104,7 +104,7 @@ def image_colors(camera: SceneCamera, compared: FullSize) -> Found:
     return Measurement(value=compared.color, frame=compared.color_frame, detail=f"camera {camera.name}")
 
 
-@picture_check(
+@image_check(
     measures="blur or sharpening of some images at full size, as half its variance",
     unit="px^2",
 )
@@ -116,7 +116,7 @@ def image_sharpness(camera: SceneCamera, compared: FullSize) -> Found:
     return Measurement(value=abs(compared.sharpness), frame=frame, detail=f"camera {camera.name}, {word}")
 
 
-@picture_check(
+@image_check(
     measures="error of an image at full size, or of its worst block, in units of the encoder's own",
 )
 @at_full_size
@@ -125,57 +125,57 @@ def image_errors(camera: SceneCamera, compared: FullSize) -> Found:
     return worst_frame(compared.errors, f"camera {camera.name}", frames=compared.frames.astype(np.intp))
 
 
-@picture_check(
-    measures="difference of a single picture from what was recorded at its frame, beyond the usual, of 255",
+@image_check(
+    measures="difference of a single image from what was recorded at its frame, beyond the usual, of 255",
 )
 @of_each_camera
-def odd_pictures(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
-    """No single picture is another one, torn, blurred, shifted or off in colour."""
+def odd_images(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
+    """No single image is another one, torn, blurred, shifted or off in colour."""
     excess = _excess(compared)
     excess[~_is_exact(episode, camera)[: len(excess)]] *= _PREDICTED_WEIGHT
     return worst_frame(excess, f"camera {camera.name}")
 
 
-def _excess(compared: PictureComparison) -> Array:
-    """(T,) by how much each picture is more unlike the drawn one than the usual picture."""
+def _excess(compared: ImageComparison) -> Array:
+    """(T,) by how much each image is more unlike the drawn one than the usual image."""
     return np.maximum(compared.unlike - np.median(compared.unlike), 0.0)
 
 
 def _is_exact(episode: CheckedEpisode, camera: SceneCamera) -> NDArray[np.bool_]:
-    """(T,) pictures whose coder leaves nothing to the next: all but the predicted ones of AV1."""
+    """(T,) images whose coder leaves nothing to the next: all but the predicted ones of AV1."""
     if episode.recording.video_settings(camera.name).codec != "av1":
         return np.ones(episode.num_frames, dtype=np.bool_)
     return np.array([packet.is_keyframe for packet in episode.recording.packets(camera.name)], dtype=np.bool_)
 
 
-def _stale(compared: PictureComparison) -> NDArray[np.bool_]:
-    """(T,) pictures that show what was before, though something moves."""
+def _stale(compared: ImageComparison) -> NDArray[np.bool_]:
+    """(T,) images that show what was before, though something moves."""
     still = (compared.motion > MIN_MOTION) & (compared.shown < STALE_SHARE)
     return np.asarray(still & (_excess(compared) > STALE_EXCESS))
 
 
-@picture_check(
-    measures="longest run of unchanged pictures while something moves before the camera, frames",
+@image_check(
+    measures="longest run of unchanged images while something moves before the camera, frames",
 )
 @of_each_camera
-def frozen(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
+def frozen(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
     """A camera does not stand still while something moves in its view."""
     return _stale_frames(camera, compared, *longest_run(_stale(compared)))
 
 
-@picture_check(
-    measures="pictures that repeat the one before, in the midst of motion",
+@image_check(
+    measures="images that repeat the one before, in the midst of motion",
 )
 @of_each_camera
-def repeated_pictures(episode: CheckedEpisode, camera: SceneCamera, compared: PictureComparison) -> Found:
-    """No picture was dropped and the one before shown in its place."""
+def repeated_images(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
+    """No image was dropped and the one before shown in its place."""
     stale = _stale(compared)
     stale &= _is_exact(episode, camera)[: len(stale)]
     return _stale_frames(camera, compared, int(stale.sum()), int(np.argmax(stale)))
 
 
-def _stale_frames(camera: SceneCamera, compared: PictureComparison, count: int, first: int) -> Found:
-    """So many pictures of a camera are stale, of those in which something moves."""
+def _stale_frames(camera: SceneCamera, compared: ImageComparison, count: int, first: int) -> Found:
+    """So many images of a camera are stale, of those in which something moves."""
     num_moving = int((compared.motion > MIN_MOTION).sum())
     if not num_moving:
         return NotMeasured(why=f"too little moves before camera {camera.name}")
@@ -183,7 +183,7 @@ def _stale_frames(camera: SceneCamera, compared: PictureComparison, count: int, 
     return Measurement(value=count, frame=first if count else None, detail=detail)
 
 
-@picture_check(
+@image_check(
     measures="likeness of two cameras' images (correlation over time)",
     warn=0.9999,
     on=("simulated", "external", "dataset"),
@@ -205,18 +205,18 @@ class Filmed(Protocol):
         ...
 
 
-@picture_check(
-    measures="mean colour of the decoded pictures against the recorded histogram, of 255",
+@image_check(
+    measures="mean colour of the decoded images against the recorded histogram, of 255",
 )
 def pixel_statistics(episode: CheckedEpisode) -> Iterator[Found]:
-    """The histograms, counted before coding, are those of the pictures: catches swapped channels and other pictures."""
+    """The histograms, counted before coding, are those of the images: catches swapped channels and other images."""
     for camera in episode.cameras:
-        decoded = episode.pictures(camera).mean
+        decoded = episode.images(camera).mean
         if not len(decoded):
             continue
         counted = episode.recording.pixel_statistics(camera.name)
-        if counted.num_images != (episode.num_frames + 1) // 2:  # every other picture is counted
-            detail = f"camera {camera.name}: {counted.num_images} pictures are counted of {episode.num_frames}"
+        if counted.num_images != (episode.num_frames + 1) // 2:  # every other image is counted
+            detail = f"camera {camera.name}: {counted.num_images} images are counted of {episode.num_frames}"
             yield Measurement(value=math.inf, detail=detail)
             continue
         levels = np.arange(256)

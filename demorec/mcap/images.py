@@ -51,13 +51,13 @@ class PixelCounter:
         self._num_seen = 0
         self._num_images = 0
 
-    def add(self, picture: NDArray[np.uint8]) -> None:
+    def add(self, image: NDArray[np.uint8]) -> None:
         """Take the next image, (H, W, 3) uint8."""
         if self._num_seen % 2 == 0:
-            longer_side = max(picture.shape[:2])
+            longer_side = max(image.shape[:2])
             step = longer_side // 150 if longer_side >= 300 else 1
             first_row = step * (self._num_images % 4)
-            for counts, channel in zip(self._counts, np.moveaxis(picture, 2, 0), strict=True):
+            for counts, channel in zip(self._counts, np.moveaxis(image, 2, 0), strict=True):
                 counts += np.bincount(channel[first_row :: 4 * step, ::step].ravel(), minlength=256)
             self._num_images += 1
         self._num_seen += 1
@@ -117,8 +117,8 @@ class CameraWriter:
             settings = self._encoder.settings
         self.streams = CameraStreams(video=settings, **dict.fromkeys(beside, True))
         self._codec, self._frame_id = settings.codec, camera_frame(camera.name)
-        self._layout = messages.PictureMessages(self._frame_id, DEPTH_FORMAT if self._codec == "16UC1" else self._codec)
-        self._layouts = {kind: messages.PictureMessages(self._frame_id, form) for kind, (form, _) in _BESIDE.items()}
+        self._layout = messages.ImageMessages(self._frame_id, DEPTH_FORMAT if self._codec == "16UC1" else self._codec)
+        self._layouts = {kind: messages.ImageMessages(self._frame_id, form) for kind, (form, _) in _BESIDE.items()}
         self._waiting: list[tuple[int, list[Message]]] = []
         self._packets: list[bytes] = []
         self._num_images = self.num_ready = self.num_video_bytes = self.last_ns = 0
@@ -128,9 +128,9 @@ class CameraWriter:
         if self._encoder is None:
             self._keep([data if isinstance(data, bytes) else encode_distances(data)])
         else:
-            picture = np.asarray(data)
-            self._pixels.add(picture)
-            self._keep(self._encoder.encode(picture))
+            image = np.asarray(data)
+            self._pixels.add(image)
+            self._keep(self._encoder.encode(image))
         others: list[Message] = []
         for kind, pixels in beside.items():
             if pixels is not None:

@@ -1,6 +1,6 @@
-"""Faults of pictures, depth and labels, each caught by the check that compares them with what the numbers make of them.
+"""Faults of images, depth and labels, each caught by the check that compares them with what the numbers make of them.
 
-The pictures of a good recording are decoded once and changed in memory.
+The images of a good recording are decoded once and changed in memory.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from support.check import checked, simulate
 from support.faults import Good, Rows
 
 from demorec.check.cells import ImageKind
-from demorec.check.drawn import DrawnPictures, PictureComparison, fill_between, frames_to_draw
+from demorec.check.drawn import DrawnImages, ImageComparison, fill_between, frames_to_draw
 from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import DrawnEpisode
 from demorec.core.geometry import Array
@@ -25,12 +25,12 @@ from demorec.render.recorded import RecordedWorld
 Fault = Callable[[Rows], Rows]
 RANDOM = np.random.default_rng(1)
 ONE = 100
-"""The frame of a single odd picture: the hand is closing in on the cube."""
+"""The frame of a single odd image: the hand is closing in on the cube."""
 
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Good:
-    """One pick-and-place by an iiwa, whose orange is nearly the cube's red, with all kinds of pictures."""
+    """One pick-and-place by an iiwa, whose orange is nearly the cube's red, with all kinds of images."""
     path = tmp_path_factory.mktemp("good") / "good.mcap"
     return Good.open(simulate(path, seed=5, robot="iiwa", cameras=("front", "wrist"), depth=True, segmentation=True))
 
@@ -191,30 +191,30 @@ def as_bt709(rows: Rows) -> Rows:
 
 
 COLOR: list[tuple[str, Fault, str]] = [
-    ("one frame late", late(1), "picture_lag"),
-    ("two frames late", late(2), "picture_lag"),
-    ("three frames late", late(3), "picture_lag"),
-    ("one frame early", early, "picture_lag"),
-    ("backwards", lambda rows: rows[::-1], "odd_pictures"),
+    ("one frame late", late(1), "image_lag"),
+    ("two frames late", late(2), "image_lag"),
+    ("three frames late", late(3), "image_lag"),
+    ("one frame early", early, "image_lag"),
+    ("backwards", lambda rows: rows[::-1], "odd_images"),
     ("stuck for ten frames", stuck(20, 30), "frozen"),
     ("stuck from the lift on", stuck(ONE + 10, 400), "frozen"),
-    ("every other one twice", every_other_twice, "repeated_pictures"),
-    ("one blurred", one(blurred), "odd_pictures"),
-    ("one greenish", one(greenish), "odd_pictures"),
-    ("one torn", torn, "odd_pictures"),
-    ("one of the beginning", of_frame(0), "odd_pictures"),
-    ("one of the end", of_frame(-1), "odd_pictures"),
-    ("one shifted", one(rolled(4)), "odd_pictures"),
-    ("one mirrored", one(lambda rows: rows[:, :, ::-1]), "odd_pictures"),
-    ("one upside down", one(lambda rows: rows[:, ::-1]), "odd_pictures"),
-    ("one inverted", one(lambda rows: 255 - rows), "odd_pictures"),
-    ("one black", one(lambda rows: rows * 0), "odd_pictures"),
-    ("one with red for blue", one(lambda rows: rows[..., ::-1]), "odd_pictures"),
-    ("all inverted", lambda rows: 255 - rows, "pictures_as_drawn"),
-    ("all darker", darker, "pictures_as_drawn"),
-    ("all greenish", greenish, "pictures_as_drawn"),
-    ("all with red for blue", lambda rows: rows[..., ::-1], "pictures_as_drawn"),
-    ("all grey", grey, "pictures_as_drawn"),
+    ("every other one twice", every_other_twice, "repeated_images"),
+    ("one blurred", one(blurred), "odd_images"),
+    ("one greenish", one(greenish), "odd_images"),
+    ("one torn", torn, "odd_images"),
+    ("one of the beginning", of_frame(0), "odd_images"),
+    ("one of the end", of_frame(-1), "odd_images"),
+    ("one shifted", one(rolled(4)), "odd_images"),
+    ("one mirrored", one(lambda rows: rows[:, :, ::-1]), "odd_images"),
+    ("one upside down", one(lambda rows: rows[:, ::-1]), "odd_images"),
+    ("one inverted", one(lambda rows: 255 - rows), "odd_images"),
+    ("one black", one(lambda rows: rows * 0), "odd_images"),
+    ("one with red for blue", one(lambda rows: rows[..., ::-1]), "odd_images"),
+    ("all inverted", lambda rows: 255 - rows, "images_as_drawn"),
+    ("all darker", darker, "images_as_drawn"),
+    ("all greenish", greenish, "images_as_drawn"),
+    ("all with red for blue", lambda rows: rows[..., ::-1], "images_as_drawn"),
+    ("all grey", grey, "images_as_drawn"),
     ("shifted to the right by two pixels", rolled(2), "projection"),
     ("shifted up by two pixels", rolled(-2, axis=1), "projection"),
     ("mirrored", lambda rows: rows[:, :, ::-1], "projection"),
@@ -243,8 +243,8 @@ FULL_SIZE: list[tuple[str, Fault, str]] = [
 """Faults too small for the cells."""
 
 DEPTH: list[tuple[str, Fault, str]] = [
-    ("one frame late", late(1), "picture_lag"),
-    ("one frame early", early, "picture_lag"),
+    ("one frame late", late(1), "image_lag"),
+    ("one frame early", early, "image_lag"),
     ("stuck from the lift on", stuck(ONE + 10, 400), "depth_matches_scene"),
     ("one of the beginning", of_frame(0), "depth_matches_scene"),
     ("half of it", lambda rows: rows * np.float32(0.5), "depth_matches_scene"),
@@ -265,8 +265,8 @@ DEPTH: list[tuple[str, Fault, str]] = [
 ]
 
 LABELS: list[tuple[str, Fault, str]] = [
-    ("one frame late", late(1), "picture_lag"),
-    ("one frame early", early, "picture_lag"),
+    ("one frame late", late(1), "image_lag"),
+    ("one frame early", early, "image_lag"),
     ("stuck from the lift on", stuck(ONE + 10, 400), "segmentation_matches_scene"),
     ("one of the beginning", of_frame(0), "segmentation_matches_scene"),
     ("two labels swapped", swapped_labels, "segmentation_matches_scene"),
@@ -289,7 +289,7 @@ CASES: list[tuple[ImageKind, str, Fault, str]] = [
 
 def test_the_good_one_passes(good: Good) -> None:
     assert [r for r in checked(good.episode.path).results if r.level in ("warn", "fail")] == []
-    spoilt = good.with_pictures({})
+    spoilt = good.with_images({})
     for name in sorted({check for *_, check in CASES}):
         result = CHECKS.load(name).run(spoilt)
         assert result.level == "pass", (name, result.value, result.detail)
@@ -298,10 +298,10 @@ def test_the_good_one_passes(good: Good) -> None:
 @pytest.mark.parametrize(("kind", "name", "fault", "check"), CASES, ids=[f"{kind}: {name}" for kind, name, *_ in CASES])
 @pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=pytest.mark.slow)])
 def test_a_fault(camera: str, kind: ImageKind, name: str, fault: Fault, check: str, good: Good) -> None:
-    rows = good.pictures[camera, kind]
+    rows = good.images[camera, kind]
     changed = fault(rows)
     assert not np.array_equal(changed, rows)
-    result = CHECKS.load(check).run(good.with_pictures({(camera, kind): changed}))
+    result = CHECKS.load(check).run(good.with_images({(camera, kind): changed}))
     assert result.level == "fail", (result.value, result.detail)
 
 
@@ -314,15 +314,15 @@ def poses(good: Good) -> Array:
 
 
 def drawn_in_part(good: Good, changed: Mapping[tuple[str, ImageKind], Rows], poses: Array) -> CheckedEpisode:
-    """The episode with other pictures, as if it had colour alone: only some of its frames are drawn."""
-    episode, whole = good.with_pictures(changed), good.episode._drawn
+    """The episode with other images, as if it had colour alone: only some of its frames are drawn."""
+    episode, whole = good.with_images(changed), good.episode._drawn
     assert isinstance(whole, DrawnEpisode)
-    frames = frames_to_draw([episode.pictures(camera).cells for camera in episode.cameras], poses)
-    cells = {key: rows.copy() for key, rows in whole.pictures.cells.items() if key[1] == "color"}
+    frames = frames_to_draw([episode.images(camera).cells for camera in episode.cameras], poses)
+    cells = {key: rows.copy() for key, rows in whole.images.cells.items() if key[1] == "color"}
     for rows in cells.values():
         rows[np.setdiff1d(np.arange(len(rows)), frames)] = 0  # so that nothing but what is drawn counts
         fill_between(rows, frames)
-    episode.__dict__["_drawn"] = DrawnEpisode(pictures=DrawnPictures(frames=frames, cells=cells), shift={})
+    episode.__dict__["_drawn"] = DrawnEpisode(images=DrawnImages(frames=frames, cells=cells), shift={})
     episode._comparisons.clear()
     return episode
 
@@ -330,14 +330,14 @@ def drawn_in_part(good: Good, changed: Mapping[tuple[str, ImageKind], Rows], pos
 def test_the_good_one_passes_drawn_in_part(good: Good, poses: Array) -> None:
     episode = drawn_in_part(good, {}, poses)
     assert isinstance(episode._drawn, DrawnEpisode)
-    assert len(episode._drawn.pictures.frames) < 0.9 * episode.num_frames
-    for name in sorted({check for *_, check in COLOR} - {"picture_lag"}):  # it also asks for depth and labels
+    assert len(episode._drawn.images.frames) < 0.9 * episode.num_frames
+    for name in sorted({check for *_, check in COLOR} - {"image_lag"}):  # it also asks for depth and labels
         result = CHECKS.load(name).run(episode)
         assert result.level == "pass", (name, result.value, result.detail)
     for camera in episode.cameras:
         part, whole = episode.compared(camera), good.episode.compared(camera)
-        assert isinstance(part, PictureComparison)
-        assert isinstance(whole, PictureComparison)
+        assert isinstance(part, ImageComparison)
+        assert isinstance(whole, ImageComparison)
         assert part.lag == pytest.approx(whole.lag, abs=0.03)
         assert part.shift == pytest.approx(whole.shift, abs=0.001)
 
@@ -347,10 +347,10 @@ def test_the_good_one_passes_drawn_in_part(good: Good, poses: Array) -> None:
 def test_a_fault_of_one_drawn_in_part(
     camera: str, name: str, fault: Fault, check: str, good: Good, poses: Array
 ) -> None:
-    episode = drawn_in_part(good, {(camera, "color"): fault(good.pictures[camera, "color"])}, poses)
-    if check == "picture_lag":
+    episode = drawn_in_part(good, {(camera, "color"): fault(good.images[camera, "color"])}, poses)
+    if check == "image_lag":
         compared = episode.compared(next(c for c in episode.cameras if c.name == camera))
-        assert isinstance(compared, PictureComparison)
+        assert isinstance(compared, ImageComparison)
         assert compared.lag is not None
         assert abs(compared.lag) > CHECKS.load(check).fail
         return
@@ -360,7 +360,7 @@ def test_a_fault_of_one_drawn_in_part(
 
 def test_what_does_not_move_is_not_measured(good: Good) -> None:
     still = RecordedStill(good)
-    result = CHECKS.load("picture_lag").run(still.episode)
+    result = CHECKS.load("image_lag").run(still.episode)
     assert result.level == "skip"
     assert "too little moves" in result.detail
 
@@ -369,10 +369,10 @@ class RecordedStill:
     """The good recording as if nothing had moved in it."""
 
     def __init__(self, good: Good) -> None:
-        first = {key: np.repeat(rows[:1], len(rows), axis=0) for key, rows in good.pictures.items()}
-        self.episode = good.with_pictures(first)
+        first = {key: np.repeat(rows[:1], len(rows), axis=0) for key, rows in good.images.items()}
+        self.episode = good.with_images(first)
         drawn = good.episode._drawn
         assert isinstance(drawn, DrawnEpisode)
-        still = {key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.pictures.cells.items()}
-        pictures = DrawnPictures(frames=drawn.pictures.frames, cells=still)
-        self.episode.__dict__["_drawn"] = DrawnEpisode(pictures=pictures, shift={})
+        still = {key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.images.cells.items()}
+        images = DrawnImages(frames=drawn.images.frames, cells=still)
+        self.episode.__dict__["_drawn"] = DrawnEpisode(images=images, shift={})
