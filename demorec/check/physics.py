@@ -50,6 +50,10 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=total, frame=first[1], detail=first[0])
 
 
+_STANDS = 1e-6
+"""rad by which a target that stands differs from the one before."""
+
+
 @physics_check(
     measures="largest acceleration of the wanted motion in units of its limit",
 )
@@ -60,7 +64,7 @@ def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """
     c, fps, robot = episode.columns, episode.info.fps, episode.info.robot
     targets = c.action_joint_target
-    stops = (targets == c.joint_position[:, : episode.num_arm]).all(axis=1)
+    stops = np.abs(targets - c.joint_position[:, : episode.num_arm]).max(axis=1) < _STANDS
     asked = ~(stops[2:] | stops[1:-1])
     acceleration = np.abs(np.diff(targets, 2, axis=0)) * fps**2 * asked[:, None]
     return worst_entry(acceleration / np.array(robot.acceleration_limit), robot.arm_joints, first=1)
@@ -79,8 +83,6 @@ def joint_acceleration(episode: CheckedEpisode) -> Measurement | None:
     return worst_entry(acceleration / np.array(robot.acceleration_limit), robot.arm_joints, first=1)
 
 
-_STANDS = 1e-6
-"""rad by which a target that stands differs from the one before."""
 _SLOW = 0.02
 """rad/s below which a joint's velocities say nothing."""
 
@@ -215,8 +217,10 @@ def ends_at_rest(episode: CheckedEpisode) -> Found:
     if POLICY_PHASE in c.phase:
         return NotMeasured(why="a policy may succeed in mid-motion")
     steps, robot = np.abs(np.diff(c.action_joint_target, axis=0)), episode.info.robot
-    stood = np.flatnonzero(steps.max(axis=1) < _STANDS)
-    length = (len(steps) - 1 - stood[-1] if len(stood) else len(steps)) / fps
+    # A motion begins where the last one stood, or where its phase begins.
+    begins = (steps.max(axis=1) < _STANDS) | (np.array(c.phase[1:]) != np.array(c.phase[:-1]))
+    begins[0] = True
+    length = (len(steps) - 1 - np.flatnonzero(begins)[-1]) / fps
     speed = steps[-1:] * fps * (fps / 30) ** 2 / np.array(robot.acceleration_limit)
     return worst_entry(speed * length, robot.arm_joints, first=c.num_frames - 1)
 

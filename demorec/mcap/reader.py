@@ -80,6 +80,7 @@ class RecordingReader(EpisodeFile):
 
     def joint_samples(self) -> Iterator[JointSample]:
         """Every recorded joint state in order of time: the frames' own and those between them."""
+        assert self.info.robot, "else NotSimulatedError"
         stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
         read = self._read(channels.JOINT_STATES, lambda data: stream.layout.decode([data]).reshape(3, -1))
         for time_ns, (position, velocity, effort) in read:

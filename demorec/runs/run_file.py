@@ -288,7 +288,10 @@ def load_any_run_file(folder: Path) -> RunFile:
         lines, sessions = plain.pop("episodes"), plain.pop("sessions", [])
         del plain["digest"]
         if plain.pop("kind", "") == _EXTERNAL:
-            return from_plain({**plain, "attempts": lines, "sessions": sessions}, RunFile)
+            external = from_plain({**plain, "attempts": lines, "sessions": sessions}, RunFile)
+            if not external.robot or external.fps < 1:
+                raise ValueError("robot or fps is missing")
+            return external
         attempts = [line for line in lines if line.pop("state") != "planned"]
         for derived in ("config_digest", "complete"):
             plain.pop(derived)
