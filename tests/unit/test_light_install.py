@@ -86,7 +86,7 @@ import importlib, pkgutil, sys
 sys.modules.update(dict.fromkeys({ABSENT!r}))
 import demorec
 for module in pkgutil.walk_packages(demorec.__path__, "demorec."):
-    plug_ins = ("demorec.lerobot_env", "demorec.lerobot_robot", "demorec.learn.training.")
+    plug_ins = ("demorec.lerobot_env", "demorec.lerobot_robot", "demorec.lerobot_policy", "demorec.learn.training.")
     if not module.name.startswith(plug_ins) and module.name != "demorec.generate.on_ray":
         importlib.import_module(module.name)
 """
