@@ -92,12 +92,16 @@ def cube(
 
 
 def robot_at_origin(robot: RobotSpec, sampler: Sampler) -> RobotPlacement:
-    """The robot at the world's origin, its arm near the home configuration (range joint_spread), gripper open."""
+    """The robot at the world's origin, its arm near the home configuration (range joint_spread), gripper open.
+
+    A joint whose home lies close to a limit starts within it.
+    """
     spread = sampler.ranges.number("joint_spread")
+    drawn = [q + sampler.uniform(-spread, spread) for q in robot.home_q]
     return RobotPlacement(
         name=robot.name,
         world_from_base=Pose(),
-        joint_position=tuple(q + sampler.uniform(-spread, spread) for q in robot.home_q),
+        joint_position=tuple(map(float, np.clip(drawn, robot.position_lower, robot.position_upper))),
         gripper_width=robot.gripper.max_width,
     )
 

@@ -40,6 +40,13 @@ def spec(request: pytest.FixtureRequest) -> RobotSpec:
     return ROBOTS.load(request.param)
 
 
+def test_it_starts_within_its_limits(spec: RobotSpec) -> None:
+    """Also where its home lies closer to one than `joint_spread` reaches."""
+    starts = [episode(i, robot=spec.name, variation="full").info.scene.robot.joint_position for i in range(20)]
+    assert (np.array(starts) >= spec.position_lower).all()
+    assert (np.array(starts) <= spec.position_upper).all()
+
+
 def test_the_wrench_holds_the_weight_of_the_hand(
     spec: RobotSpec, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
