@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import av.logging
 import hypothesis
 import pytest
 
@@ -35,7 +36,8 @@ def pytest_fixture_setup() -> Iterator[None]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Iterator[None]:
-    """As in fixtures."""
+    """As in fixtures; and LeRobot's code leaves libav writing to the terminal."""
+    av.logging.set_level(None)
     with ordinary_scheduling():
         return (yield)
 
