@@ -15,7 +15,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
-from demorec.robots.motors import MotorUnits
+from demorec.robots.motors import Motors, MotorUnits
 from demorec.sources.formats import FORMATS, SourceFormat
 
 MAX_WORKERS = 1000
@@ -76,10 +76,11 @@ class Import:
             refuse_inside([self.out])
         check_option("workers", self.workers, 1, MAX_WORKERS)
         word = str(self.bags[0])
-        if word in FORMATS:
-            return self._import_frames(word, FORMATS[word], self.bags[1:])
-        if self.motor_units is not None or self.calibration is not None:
+        form, motors = FORMATS.get(word), named_motors(self.motor_units, self.calibration)
+        if motors is not None and (form is None or not form.has_motor_units):
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
+        if form is not None:
+            return self._import_frames(word, form, self.bags[1:], motors)
         from demorec.sources.bag import bags_in, open_bag
 
         if self.suggest:
@@ -93,14 +94,11 @@ class Import:
         self.video.validate()
         return self._import_bags(self.bags, self.mapping, self.out)
 
-    def _import_frames(self, word: str, form: SourceFormat, paths: Sequence[Path]) -> int:
+    def _import_frames(self, word: str, form: SourceFormat, paths: Sequence[Path], motors: Motors | None) -> int:
         if self.skip_bad or self.workers > 1:
             raise ConfigError(
                 "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
             )
-        motors = named_motors(self.motor_units, self.calibration)
-        if motors is not None and not form.has_motor_units:
-            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
         example = f"demorec import {word} {form.example}"
         if not paths:
             raise ConfigError(
