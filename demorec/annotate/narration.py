@@ -45,25 +45,25 @@ def narrate(
     Raises:
         RecordingError: The recording is damaged.
     """
-    told = _Told(recording, columns, rows)
+    narrator = _Narrator(recording, columns, rows)
     stride = int(rows[1] - rows[0]) if len(rows) > 1 else 1
     a_second = range(0, len(rows), max(1, recording.info.fps // stride))
     asked = {row: turn for turn, row in enumerate(a_second) if about is None or row in about}
     found: dict[LanguageKind, Callable[[], Iterator[Statement]]] = {
-        "subtask": told.subtasks,
-        "plan": told.plans,
-        "memory": told.memories,
-        "motion": told.motions,
-        "task_aug": told.wordings,
+        "subtask": narrator.subtasks,
+        "plan": narrator.plans,
+        "memory": narrator.memories,
+        "motion": narrator.motions,
+        "task_aug": narrator.wordings,
         "vqa": lambda: questions(recording, columns, rows, cameras, asked),
         "trace": lambda: traces(recording, columns, rows, cameras, asked),
-        "interjection": told.interjections,
+        "interjection": narrator.interjections,
     }
     statements = [statement for kind in KINDS if kind in kinds for statement in found[kind]()]
     return sorted(statements, key=lambda statement: statement.row)
 
 
-class _Told:
+class _Narrator:
     """The sentences of one episode, kind by kind."""
 
     def __init__(self, recording: Recording, columns: Columns, rows: NDArray[np.intp]) -> None:
@@ -134,10 +134,10 @@ class _Told:
         correction = self._story.correction
         if correction is None or (row := self._row_of(correction.frame)) >= len(self._rows):
             return
-        told = interjection(correction, self._situation(correction.frame), self._rng("interjection"))
-        if told is not None:
-            yield Statement(row=row, kind="interjection", role="user", text=told[0])
-            yield Statement(row=row, kind="interjection", role="assistant", text=told[1])
+        exchange = interjection(correction, self._situation(correction.frame), self._rng("interjection"))
+        if exchange is not None:
+            yield Statement(row=row, kind="interjection", role="user", text=exchange[0])
+            yield Statement(row=row, kind="interjection", role="assistant", text=exchange[1])
 
     def _remaining(self, frame: int, goal: int) -> list[GoalWords]:
         now = self._situation(frame)

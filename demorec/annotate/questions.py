@@ -113,8 +113,8 @@ def questions(
             now=moments[index],
             middles=dict(zip(numbers, middles[name][index], strict=True)),
         )
-        if (told := _ask(view, turn + number)) is not None:
-            text, answer = told
+        if (exchange := _ask(view, turn + number)) is not None:
+            text, answer = exchange
             found[name] += [
                 Statement(row=row, kind="vqa", role="user", text=text, camera=name),
                 Statement(row=row, kind="vqa", role="assistant", text=json.dumps(answer), camera=name),

@@ -41,7 +41,7 @@ _RECOVERY = {
     "dropped": "open the gripper and rise after dropping {object}",
 }
 _SMALLEST_MOVE, _SMALLEST_OPENING = 0.005, 0.0025
-"""Metres below which a motion is not worth a word: half of the last digit that is told, or a change of the opening."""
+"""Metres below which a motion or a change of the opening is left out: half of the last digit that is printed."""
 
 
 @dataclass(frozen=True, kw_only=True)

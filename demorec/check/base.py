@@ -60,7 +60,7 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class NotMeasured:
-    """That there is something to measure, but nothing can be told of it: neither good nor bad.
+    """That there is something to measure, but that it cannot be judged: neither good nor bad.
 
     Attributes:
         why: For people: "too little moves before the camera".
@@ -211,7 +211,7 @@ class Result:
 
     @property
     def allowed(self) -> float:
-        """The limit that the value is told with: the one that a failure or a warning broke."""
+        """The limit that the value is reported with: the one that a failure or a warning broke."""
         return self.fail if self.level == "fail" else self.warn
 
     @property

@@ -23,7 +23,7 @@ from demorec.check.images import at_full_size, of_each_camera
 from demorec.check.rows import displacement, matrices
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
-from demorec.episode.camera_error import told_error
+from demorec.episode.camera_error import stated_error
 from demorec.episode.scene import SceneCamera
 from demorec.mcap import channels
 
@@ -44,10 +44,10 @@ def intrinsics(episode: CheckedEpisode) -> Iterator[Found]:
         if scan is None or not scan.first:
             yield Measurement(value=math.inf, detail=f"camera {camera.name} has no calibration")
             continue
-        told = episode.recording.calibration(camera.name)
+        recorded = episode.recording.calibration(camera.name)
         settings = episode.recording.video_settings(camera.name)
-        off = float(np.abs(told.intrinsics - camera.intrinsics).max())
-        off = max(off, abs(told.width - settings.width), abs(told.height - settings.height))
+        off = float(np.abs(recorded.intrinsics - camera.intrinsics).max())
+        off = max(off, abs(recorded.width - settings.width), abs(recorded.height - settings.height))
         yield Measurement(value=off, detail=f"camera {camera.name}")
 
 
@@ -78,7 +78,7 @@ def _expected(episode: CheckedEpisode, camera: SceneCamera) -> Array:
 
 def _allowance(episode: CheckedEpisode, camera: SceneCamera) -> float:
     """By how much images may be shifted, of their height: older recordings do not tell how they are turned."""
-    if told_error(camera.name, episode.info.behaviour) is not None:
+    if stated_error(camera.name, episode.info.behaviour) is not None:
         return 0.0
     angle = episode.info.behaviour.get(f"calibration_{camera.name}_angle", 0.0)
     return angle / (2 * math.tan(camera.fov_y / 2))
@@ -101,8 +101,8 @@ def projection(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComp
     if usual > UNRELATED:
         detail = f"camera {camera.name}: its images show something else than the recorded numbers ({usual:.0f})"
         return Measurement(value=math.inf, frame=int(np.argmax(compared.unlike)), detail=detail)
-    told = (episode.recording.calibration(camera.name).intrinsics - camera.intrinsics)[:2, 2] / camera.height
-    off = float(np.linalg.norm(compared.shift - told))
+    recorded = (episode.recording.calibration(camera.name).intrinsics - camera.intrinsics)[:2, 2] / camera.height
+    off = float(np.linalg.norm(compared.shift - recorded))
     detail = f"camera {camera.name}: {off * camera.height:.2f} px"
     return Measurement(value=100 * max(off - _allowance(episode, camera), 0.0), detail=detail)
 
@@ -139,7 +139,7 @@ def image_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """Image t shows state t: robot and objects are where the numbers of the same frame put them.
 
     Colour, depth and labels of each camera against the images that are drawn of the frames before and after. Where
-    less than a dozen frames show any motion nothing is told.
+    less than a dozen frames show any motion nothing is measured.
     """
     for camera in episode.cameras:
         for kind in episode.kinds(camera.name):

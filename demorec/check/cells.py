@@ -55,7 +55,7 @@ class CellGrid:
         side = cell_side(width, height, counts)
         self._shape = rows, columns
         self._area = side * side
-        # The border's cells are added up, too, for what is told of the whole image.
+        # The border's cells are added up, too, for what is measured of the whole image.
         self._columns, self._rows = (_lines(count, side, size) for count, size in ((columns, width), (rows, height)))
         self._num_pixels = width * height
         size = (height, width)

@@ -196,7 +196,7 @@ class Dataset:
     def compared(self) -> list[tuple[int, str, ImageComparison | NotMeasured]]:
         """(episode, camera, how its images begin against states and scene); only with a sidecar.
 
-        Where nothing can be told of an episode it is there once, without a camera.
+        An episode that cannot be compared is there once, without a camera.
         """
         keys = {key.removeprefix(IMAGE_PREFIX): key for key in self.colour_keys}
         found: list[tuple[int, str, ImageComparison | NotMeasured]] = []
@@ -264,16 +264,16 @@ class Dataset:
 
     def tcp_poses(self, info: EpisodeInfo, rows: Rows) -> dict[str, Array]:
         """Feature -> the TCP's poses (T, 7) that it holds, base frame."""
-        told = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}
+        poses = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}
         if self.state_kind(info) == "joint_ee":
-            told[STATE] = rows[STATE].astype(np.float64)[:, -7:]
-        return told
+            poses[STATE] = rows[STATE].astype(np.float64)[:, -7:]
+        return poses
 
     def hand_poses(self) -> Iterator[tuple[str, Array, Array]]:
         """(where, poses (T, 7), base_from_tcp (T, 4, 4) by the joints) of every simulated episode."""
         for each in self.described():
             rows, info = each.rows, each.info
-            if not (told := self.tcp_poses(info, rows)):
+            if not (poses := self.tcp_poses(info, rows)):
                 return
             if (model := self.robot_digests[each.number]) is not None:
                 urdf = self.robots[model].model
@@ -281,7 +281,7 @@ class Dataset:
                 urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)  # as of older datasets
             joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
             hand = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
-            yield from ((f"{name}, episode {each.number}", poses, hand) for name, poses in told.items())
+            yield from ((f"{name}, episode {each.number}", tcp, hand) for name, tcp in poses.items())
 
     def check_simulated(self) -> None:
         """Raise ConfigError for a dataset of external episodes, which no simulator can make or replay."""

@@ -221,6 +221,6 @@ def dataset_opens(dataset: Dataset) -> Measurement | None:
         # It asks the Hub for files that are missing here, and complains that it may not.
         problems = dataset_problems(dataset.path, dataset.info)
         return Measurement(value=1, detail=f"LeRobot cannot open it ({problems[0] if problems else said})")
-    told = json.loads(done.stdout.splitlines()[-1])
-    same = (told["episodes"], told["frames"]) == (dataset.info.total_episodes, dataset.info.total_frames)
-    return Measurement(value=int(not same), detail=f"{told['episodes']} episodes, {told['frames']} frames")
+    found = json.loads(done.stdout.splitlines()[-1])
+    same = (found["episodes"], found["frames"]) == (dataset.info.total_episodes, dataset.info.total_frames)
+    return Measurement(value=int(not same), detail=f"{found['episodes']} episodes, {found['frames']} frames")

@@ -33,14 +33,14 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
             continue
         mean = np.average([p.mean for p in images], axis=0, weights=[p.count for p in images])
         yield _off_colour(stats.get(key, {}).get("mean"), mean, key)
-        told = episode_column(dataset, f"stats/{key}/mean")
-        for number, (said, p) in enumerate(zip(told, images, strict=False)):
+        stated = episode_column(dataset, f"stats/{key}/mean")
+        for number, (said, p) in enumerate(zip(stated, images, strict=False)):
             yield _off_colour(said, p.mean, f"{key}, episode {number}")
 
 
 def _off_colour(said: Any, mean: Array, detail: str) -> Measurement:
-    told = numbers_of(said)
-    value = float(np.abs(told - mean).max()) if told.shape == (3,) else math.inf
+    stated = numbers_of(said)
+    value = float(np.abs(stated - mean).max()) if stated.shape == (3,) else math.inf
     return Measurement(value=value, detail=detail)
 
 

@@ -189,9 +189,9 @@ def _wrong_interjections(
 ) -> Iterator[str]:
     """Interjections come where the expert listens, say what is meant and what was mistaken, and renew the plan."""
     said = {
-        frame: told
+        frame: entries
         for frame, rows in episode.events.items()
-        if (told := [entry for entry in rows if entry.get("style") in ("interjection", None)])
+        if (entries := [entry for entry in rows if entry.get("style") in ("interjection", None)])
     }
     listens = [phase["from"] for phase in row["phases"] if phase["name"] == CORRECTED_PHASE]
     if said and sorted(said) != listens:
@@ -199,19 +199,19 @@ def _wrong_interjections(
         return
     states = {(entry.get("style"), round(entry["timestamp"] * fps)): entry for entry in episode.persistent}
     plans = [frame for style, frame in states if style == "plan"]
-    for frame, told in said.items():
+    for frame, entries in said.items():
         wanted = {goal.object for goal in info.scene.goals[:1]}
         before = states.get(("subtask", row["phases"][0]["from"]), {})
         mistaken = _named(before.get("content") or "", start)
         if mistaken & wanted:
             yield f"the subtask before the interjection at frame {frame} names what is meant"
-        if [entry.get("style") for entry in told] != ["interjection", None]:
+        if [entry.get("style") for entry in entries] != ["interjection", None]:
             yield f"the interjection at frame {frame} and its answer are not both there"
             return
-        named = _named(told[0].get("content") or "", start)
+        named = _named(entries[0].get("content") or "", start)
         if not wanted <= named or (before and not named <= wanted | mistaken):
             yield f"the interjection at frame {frame} names {', '.join(sorted(named)) or 'nothing'}"
-        if _named("".join(told[1].get("tool_calls") or ()), start) != wanted:
+        if _named("".join(entries[1].get("tool_calls") or ()), start) != wanted:
             yield f"the answer at frame {frame} does not name what is meant"
         if plans and frame not in plans:
             yield f"the interjection at frame {frame} does not renew the plan"

@@ -64,8 +64,8 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
 def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
     """The columns stats/... of the episodes' table, from which LeRobot merges those of several datasets."""
     names = _numeric(dataset)
-    told = read_rows(dataset.path / "meta", [f"stats/{name}/{quantity}" for name in names for quantity in NAMES])
-    for number, (row, rows) in enumerate(zip(told, dataset.rows, strict=False)):
+    stored = read_rows(dataset.path / "meta", [f"stats/{name}/{quantity}" for name in names for quantity in NAMES])
+    for number, (row, rows) in enumerate(zip(stored, dataset.rows, strict=False)):
         for name in names:
             said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
             values = _vectors(dataset, name, rows[name])
@@ -151,15 +151,15 @@ def _off(
     found = []
     scale = np.maximum(true["std"], _SMALLEST_DEVIATION)
     for quantity, value in true.items():
-        told = numbers_of(said.get(quantity, np.inf))
+        stored = numbers_of(said.get(quantity, np.inf))
         off, merged = math.inf, ""
-        if told.shape == value.shape:
-            distance = np.abs(told - value)
+        if stored.shape == value.shape:
+            distance = np.abs(stored - value)
             for low, high in (known[quantity] for known in ranges if quantity in known):
-                distance = np.minimum(distance, np.maximum(np.maximum(low - told, told - high), 0.0))
+                distance = np.minimum(distance, np.maximum(np.maximum(low - stored, stored - high), 0.0))
             distance = distance if quantity == "count" else distance / scale
             lowest, highest = between.get(quantity, (np.inf, -np.inf))
-            is_between = (lowest <= told) & (told <= highest) & (distance > _MERGED)
+            is_between = (lowest <= stored) & (stored <= highest) & (distance > _MERGED)
             off = float(np.where(is_between, _MERGED, distance).max())
             merged = ", between the episodes' own, as LeRobot's merge leaves it" if off == _MERGED else ""
         found.append(Measurement(value=off, detail=f"{quantity} of {detail}{merged}"))

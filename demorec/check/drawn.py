@@ -124,7 +124,7 @@ def frames_to_draw(seen: Iterable[Cells], poses: Array) -> NDArray[np.int64]:
     chosen = np.arange(len(poses)) % _STRIDE == 0
     chosen[-1:] = True
     while True:
-        # With other neighbours, frames may be told less well than before.
+        # With other neighbours, frames may be placed less well than before.
         more = chosen | _not_between(rows, poses, *_neighbours(np.flatnonzero(chosen), len(poses)))
         if np.array_equal(more, chosen):
             return np.flatnonzero(chosen)
@@ -232,7 +232,7 @@ _TURNED_STRAY = 16.0
 _MAX_LAG = 3
 _MOVING = 1.0
 _MIN_MOVING = 12
-"""A lag is told from this many frames on in which the drawn cells change by so much (root mean square, of 255)."""
+"""A lag is measured from this many frames on in which the drawn cells change by so much (root mean square, of 255)."""
 
 
 def fit(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Array:
@@ -244,7 +244,7 @@ def fit(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Array:
     usual = frames[size <= 3 * np.median(size) + 1e-6]
     gram, right = np.zeros((4, 4)), np.zeros(4)
     kernels.normal_equations(seen, drawn, usual, gram, right)
-    # Enough that a direction in which nothing can be told gets nothing.
+    # Enough that a direction in which nothing can be measured gets nothing.
     gram += np.eye(4) * max(1e-3 * float(np.trace(gram)) / 4, 1e-9)
     return np.asarray(np.linalg.solve(gram, right))
 

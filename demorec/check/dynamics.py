@@ -2,7 +2,7 @@
 
 The model's masses, each at its link's centre of mass, accelerated as the recorded joints say, give the torque of every
 arm joint and the force on the hand (Newton and d'Alembert, without the links' own rotational inertia). What is carried
-adds its weight. That is exact enough where nothing is hit and the motion is smooth: medians, and the gain, are told.
+adds its weight. That is exact enough where nothing is hit and the motion is smooth: medians and the gain are reported.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Dynamics:
             acceleration[1:-1] = (point[2:] - 2 * point[1:-1] + point[:-2]) * fps**2
             joints = frozenset(joint.name for joint in urdf.path_to(name))
             self.loads.append(Load(point, mass * (acceleration - gravity), joints))
-        # Its acceleration is told by the frames around; the two frames at either end have too few.
+        # Its acceleration comes from the frames around; the two frames at either end have too few.
         acceleration = np.diff(links(tip)[:, :3, 3], 2, axis=0) * fps**2
         change = np.linalg.norm(np.diff(acceleration, axis=0), axis=1)
         smooth = np.zeros(len(links(tip)), dtype=np.bool_)

@@ -28,7 +28,7 @@ from demorec.check.summary import ImageSummary, summarise
 from demorec.check.topic_scan import TopicScan, scan_topics
 from demorec.core.errors import RecordingError, SceneError
 from demorec.core.geometry import Array
-from demorec.episode.camera_error import told_error
+from demorec.episode.camera_error import stated_error
 from demorec.episode.episode import Columns, Event, Outcome, frame_time_ns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
@@ -339,7 +339,7 @@ class CheckedEpisode(ExitStack):
         drawn = self._drawn_full_size
         if isinstance(drawn, NotMeasured):
             return drawn
-        if told_error(camera.name, self.info.behaviour) is None and f"calibration_{camera.name}_angle" in (
+        if stated_error(camera.name, self.info.behaviour) is None and f"calibration_{camera.name}_angle" in (
             self.info.behaviour
         ):
             return NotMeasured(why=f"how camera {camera.name} is turned off its recorded pose is not recorded exactly")

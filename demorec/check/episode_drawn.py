@@ -2,7 +2,7 @@
 
 Recorded camera poses may be off on purpose, as those of a real camera are (`--variation full`). The recording tells by
 how much, so that the images are drawn from where the camera was. Older recordings tell the error's offset, and how
-far but not about which axis it turns: there the turn is found in the images, as far as it is no larger than told.
+far but not about which axis it turns: there the turn is found in the images, as far as it is no larger than stated.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
 from demorec.check.drawn import DrawnImages, draw, fit, frames_to_draw, warm_renderer
 from demorec.core.geometry import Array, Pose
-from demorec.episode.camera_error import told_error, true_camera
+from demorec.episode.camera_error import stated_error, true_camera
 from demorec.episode.episode import Columns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
@@ -29,7 +29,7 @@ _NUM_FITTED = 9
 _NUM_STEPS = 2
 """Fits, each from where the last one led: the first comes out too large by a tenth or two, since cells blur edges."""
 _TURN_MARGIN = 1.3
-"""A turn that comes out larger than what is told, by this factor, is no calibration error."""
+"""A turn that comes out larger than what is stated, by this factor, is no calibration error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,7 +121,7 @@ def drawable_scene(info: EpisodeInfo) -> Scene:
 
 
 def _moved_back(camera: SceneCamera, behaviour: Mapping[str, float]) -> SceneCamera:
-    error = told_error(camera.name, behaviour)
+    error = stated_error(camera.name, behaviour)
     if error is not None:
         return true_camera(camera, error)
     offset = np.array([behaviour.get(f"calibration_{camera.name}_{axis}", 0.0) for axis in "xyz"])
@@ -143,12 +143,12 @@ def _turns(
     info: EpisodeInfo, world: RecordedWorld, counts: Mapping[str, tuple[int, int]], colors: Mapping[str, Cells]
 ) -> dict[str, Array]:
     """Camera name -> (3,) rotation vector of its calibration error, rad in its own axes, where images show one."""
-    told = {
+    stated = {
         camera.name: info.behaviour.get(f"calibration_{camera.name}_angle", 0.0)
         for camera in world.scene.cameras
-        if told_error(camera.name, info.behaviour) is None
+        if stated_error(camera.name, info.behaviour) is None
     }
-    cameras = [camera for camera in world.scene.cameras if told.get(camera.name) and len(colors[camera.name])]
+    cameras = [camera for camera in world.scene.cameras if stated.get(camera.name) and len(colors[camera.name])]
     if not cameras:
         return {}
     count = min(len(colors[camera.name]) for camera in cameras)
@@ -162,7 +162,7 @@ def _turns(
             # What is seen in the direction (x, y, 1) moves by the turn's cross product with it.
             size = cell_side(camera.width, camera.height, counts[camera.name]) / camera.height * _height(camera)
             turns[camera.name] = turns[camera.name] + np.array([-size * down, size * right, about])
-    return {name: turn for name, turn in turns.items() if np.linalg.norm(turn) <= _TURN_MARGIN * told[name]}
+    return {name: turn for name, turn in turns.items() if np.linalg.norm(turn) <= _TURN_MARGIN * stated[name]}
 
 
 def _height(camera: SceneCamera) -> float:

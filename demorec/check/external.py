@@ -102,8 +102,8 @@ def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
         without = np.flatnonzero(numbers == NO_IMAGE)
         if len(numbers):
             first = int(without[0]) if len(without) else None
-            told = f"camera {camera}: {len(without)} of {len(numbers)} frames"
-            yield Measurement(value=len(without) / len(numbers), frame=first, detail=told)
+            text = f"camera {camera}: {len(without)} of {len(numbers)} frames"
+            yield Measurement(value=len(without) / len(numbers), frame=first, detail=text)
 
 
 @check(

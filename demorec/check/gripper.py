@@ -1,4 +1,4 @@
-"""Does the gripper do what it is told, and is what it is told what the label says."""
+"""Does the gripper follow its command, and does the command agree with the label."""
 
 from __future__ import annotations
 

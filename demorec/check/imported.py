@@ -20,7 +20,7 @@ _TIMES = frozenset(
     ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
 ) | {"duplicates", "late_start", "early_end", "cut_off", "repeats", "skips"}
 _IMAGES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
-_MOST_TOLD = 5
+_MOST_LISTED = 5
 
 import_check = partial(check, on=("external run",), needs="a run that was imported", fail=math.inf)
 
@@ -62,7 +62,7 @@ def import_dropped(run: CheckedRun) -> Found:
         return None
     rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
     dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
-    return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_TOLD]))
+    return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_LISTED]))
 
 
 def _import(run: CheckedRun) -> ImportFile | None:
@@ -74,10 +74,10 @@ def _import(run: CheckedRun) -> ImportFile | None:
 def _found(run: CheckedRun, is_mine: Callable[[str], bool]) -> Found:
     if (found := _import(run)) is None:
         return None
-    told = [
+    words = [
         f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
         for bag in found.bags
         for finding in bag.odd
         if is_mine(finding.kind)
     ]
-    return Measurement(value=len(told), detail="; ".join(told[:_MOST_TOLD]))
+    return Measurement(value=len(words), detail="; ".join(words[:_MOST_LISTED]))

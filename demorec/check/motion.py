@@ -197,9 +197,9 @@ def velocity_matches_position(subject: Moving) -> Found:
         mean = (motion.velocity[1:] + motion.velocity[:-1]) / 2
         ways = np.vstack([np.zeros(mean.shape[1]), np.cumsum(mean * motion.steps_s[:, None], axis=0)])
         reach = min(max(1, round(_VELOCITY_S * motion.fps)), len(ways) - 1)
-        told, moved = ways[reach:] - ways[:-reach], motion.state[reach:] - motion.state[:-reach]
+        integrated, moved = ways[reach:] - ways[:-reach], motion.state[reach:] - motion.state[:-reach]
         count += len(moved)
-        sums += [(moved * told).sum(axis=0), (told * told).sum(axis=0), (moved * moved).sum(axis=0)]
+        sums += [(moved * integrated).sum(axis=0), (integrated * integrated).sum(axis=0), (moved * moved).sum(axis=0)]
     known = np.flatnonzero(np.isfinite(sums[0]) & (sums[2] > 0))
     if not len(known):
         return None
@@ -330,7 +330,7 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     reach = span if math.isfinite(span) else float(np.ptp(command))
     if len(command) <= wait:
         return NotMeasured(why=f"an episode is shorter than {settle_s:g} s")
-    # Of increments and speeds nothing is told: they are small beside the opening, and come back to 0.
+    # Increments and speeds are left out: they are small beside the opening, and come back to 0.
     if reach < 0.2 * float(np.ptp(opening)) or reach < 1e-4:
         return NotMeasured(why="the gripper's command is none of its opening, or never changes")
     steady = np.ones(len(command), dtype=np.bool_)

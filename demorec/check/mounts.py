@@ -1,4 +1,4 @@
-"""Does a recorded EE pose follow the joints, through mounts that nobody told of."""
+"""Does a recorded EE pose follow the joints, through mounts that nobody stated."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def outcome_consistent(episode: CheckedEpisode) -> Measurement | None:
 def instruction_fits_scene(episode: CheckedEpisode) -> Found:
     """The instruction speaks of colours that are in the scene, and of those of the objects that have a goal.
 
-    In demorec's tasks the first thing that it names is the one that is moved first; only a tower is told of from the
+    In demorec's tasks the first thing that it names is the one that is moved first; only a tower is described from the
     bottom. What it calls a target, mark or tray is one.
     """
     scene, instruction = episode.info.scene, episode.info.instruction

@@ -24,7 +24,7 @@ _MOVING = 0.3
 _REACH_S = 0.7
 """How far apart in time motions of images and state are compared, seconds."""
 _SHOWN = 0.35
-"""The least usual correlation from which anything is told."""
+"""The least usual correlation from which anything is concluded."""
 _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
 _OTHER_VIEW = 0.7
@@ -96,7 +96,7 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
     """
     for camera, films in subject.films.items():
         known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
-        known = [pair for pair in known if not is_blank(pair[0])]  # told of by `images_show_something`
+        known = [pair for pair in known if not is_blank(pair[0])]  # left to `images_show_something`
         steps = [np.linalg.norm(np.diff(state, axis=0), axis=1) for _, state in known]
         if not known:
             continue
@@ -176,7 +176,7 @@ def steady_exposure(subject: Filmed) -> Iterator[Found]:
     """What stands still before a fixed camera keeps its colours: catches exposure and white balance that drift or hunt.
 
     The gain of an image is the median over its parts; where half of them do not stay what they are but for that gain,
-    the camera moves, and nothing is told.
+    the camera moves, and nothing is concluded.
     """
     for camera, films in subject.films.items():
         for film in films:

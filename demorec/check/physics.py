@@ -241,8 +241,8 @@ def velocity_follows_servo(episode: CheckedEpisode) -> Found:
     for joint, name in enumerate(info.robot.arm_joints):
         rows = is_free[:, joint] & (np.abs(expected[:, joint]) > _SLOW)
         if rows.sum() >= MIN_FRAMES:
-            seen, told = c.joint_velocity[1:, joint][rows], expected[rows, joint]
+            seen, due = c.joint_velocity[1:, joint][rows], expected[rows, joint]
             # What pushes the joint adds to slow motions and hardly to fast ones; false velocities are so in both.
-            usual, fast = np.median(np.abs(seen / told - 1)), np.abs(seen - told).sum() / np.abs(told).sum()
+            usual, fast = np.median(np.abs(seen / due - 1)), np.abs(seen - due).sum() / np.abs(due).sum()
             found.append(Measurement(value=float(min(usual, fast)), detail=f"{name}, {int(rows.sum())} frames"))
     return worst(*found) or NotMeasured(why="no joint moves for long")

@@ -256,7 +256,7 @@ def _run(options: CheckOptions, subject: Checked, gates: tuple[str, ...], read: 
     """
     checks = [check for check in options.checks(subject.form) if options.images or not check.needs_images]
     results: list[Result] = []
-    told: set[str] = set()
+    printed: set[str] = set()
     unreadable = ""
     try:
         read()
@@ -270,9 +270,9 @@ def _run(options: CheckOptions, subject: Checked, gates: tuple[str, ...], read: 
             continue
         result = check.run(subject)
         if result.level == "fail" and result.value is None:  # something could not be read
-            if result.detail in told:
+            if result.detail in printed:
                 result = check.blocked()
-            told.add(result.detail)
+            printed.add(result.detail)
         results.append(result)
         if check.name == "opens" and result.level == "fail":
             results += [other.blocked() for other in checks if other is not check]

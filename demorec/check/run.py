@@ -30,8 +30,8 @@ _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "fi
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Told:
-    """What a recording tells of itself.
+class RecordedAttempt:
+    """What a recording states about itself.
 
     Attributes:
         info, outcome: As recorded.
@@ -92,13 +92,13 @@ class CheckedRun:
         return [path for folder in (EPISODES, FAILED) for path in sorted((self.path / folder).glob("*.mcap"))]
 
     @cached_property
-    def told(self) -> dict[str, Told]:
-        """File (relative) -> what it tells of itself, of the recordings that can be read."""
+    def attempts(self) -> dict[str, RecordedAttempt]:
+        """File (relative) -> what it states about itself, of the recordings that can be read."""
         found = {}
         for path in self.recordings:
             try:
                 with open_recording(path, simulated=True) as recording:
-                    found[str(path.relative_to(self.path))] = Told(
+                    found[str(path.relative_to(self.path))] = RecordedAttempt(
                         info=recording.info,
                         outcome=recording.outcome,
                         digest=recording.digest(),
@@ -132,8 +132,8 @@ class CheckedRun:
         if self.form == "external run":
             motions = dict(self._external_motions())
             return list(motions), list(motions.values()), []
-        told = {file: told for file, told in self.told.items() if file.startswith("episodes/")}
-        return list(told), [t.motion for t in told.values()], [start_vector(t.info.scene) for t in told.values()]
+        kept = {file: attempt for file, attempt in self.attempts.items() if file.startswith("episodes/")}
+        return list(kept), [a.motion for a in kept.values()], [start_vector(a.info.scene) for a in kept.values()]
 
     def _external_motions(self) -> Iterator[tuple[str, Array]]:
         """Of the recordings that can be read and have a state."""
@@ -149,7 +149,7 @@ class CheckedRun:
     def successes(self) -> list[EpisodeInfo]:
         """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
         asked = self.run["num_episodes"]
-        infos = [told.info for file, told in self.told.items() if file.startswith("episodes/")]
+        infos = [attempt.info for file, attempt in self.attempts.items() if file.startswith("episodes/")]
         return [info for info in infos if info.episode_index < asked]
 
 
@@ -188,10 +188,10 @@ def run_agrees(run: CheckedRun) -> Measurement:
 def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
     """What a line of run.json says otherwise than its recording."""
     file = line["file"]
-    told = run.told.get(file)
-    if told is None:
+    attempt = run.attempts.get(file)
+    if attempt is None:
         return
-    info = told.info
+    info = attempt.info
     said = (line["episode_index"], line["attempt"], line["seed"])
     if (info.episode_index, info.attempt, info.root_seed) != said:
         yield f"{file} is episode {info.episode_index}, attempt {info.attempt}"
@@ -206,7 +206,7 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
     stem = Path(file).name.partition(".")[0]
     if stem != f"episode_{info.episode_index:06d}":
         yield f"{file} is episode {info.episode_index}"
-    outcome = told.outcome
+    outcome = attempt.outcome
     if outcome is None:
         return
     found = {
@@ -214,8 +214,8 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
         "phase": outcome.failure_phase,
         "reason": outcome.failure_reason,
         "num_frames": outcome.num_frames,
-        "num_bytes": told.num_bytes,
-        "digest": told.digest,
+        "num_bytes": attempt.num_bytes,
+        "digest": attempt.digest,
     }
     for name, value in found.items():
         if line.get(name, value) != value:

@@ -37,14 +37,14 @@ class DatasetEpisode:
         rows: Feature -> (T, D).
         videos: Camera feature -> SHA-256 (hex) of its coded images.
         tasks: Instructions.
-        told: The sidecar's row.
+        details: The sidecar's row.
     """
 
     number: int
     rows: Rows
     videos: Mapping[str, str]
     tasks: tuple[str, ...]
-    told: Mapping[str, Any]
+    details: Mapping[str, Any]
 
 
 @run_check(
@@ -61,7 +61,11 @@ def run_dataset_content(run: CheckedRun) -> Measurement | None:
     options = export_options(path)
     wrong: list[str] = []
     for episode in dataset_episodes(dataset):
-        file = run.path / ("episodes" if episode.told["success"] else "failed") / Path(str(episode.told["source"])).name
+        file = (
+            run.path
+            / ("episodes" if episode.details["success"] else "failed")
+            / Path(str(episode.details["source"])).name
+        )
         if words := [what for what, _ in episode_differences(file, options, episode)]:
             wrong.append(f"episode {episode.number}: {', '.join(words)}")
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.sidecar)} episodes")
@@ -69,18 +73,18 @@ def run_dataset_content(run: CheckedRun) -> Measurement | None:
 
 def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:
     """Every episode that the sidecar knows, in order; ExportError when a file cannot be read."""
-    told = read_rows(dataset.path / SIDECAR_DIR, EPISODE_SCHEMA.names)
+    details = read_rows(dataset.path / SIDECAR_DIR, EPISODE_SCHEMA.names)
     with ExitStack() as stack:
         readers = {
             key: stack.enter_context(closing(PacketReader(dataset.path, dataset.info, key)))
             for key in dataset.info.video_keys
         }
-        for row in sorted(told, key=lambda row: int(row["episode_index"])):
+        for row in sorted(details, key=lambda row: int(row["episode_index"])):
             if (number := int(row["episode_index"])) in range(len(dataset.rows)):
                 place = dataset.places[number]
                 videos = {key: _digest(reader.read(place)) for key, reader in readers.items()}
                 rows = dataset.rows[number]
-                yield DatasetEpisode(number=number, rows=rows, videos=videos, tasks=place.tasks, told=row)
+                yield DatasetEpisode(number=number, rows=rows, videos=videos, tasks=place.tasks, details=row)
 
 
 def _digest(samples: Iterable[bytes]) -> str:
@@ -151,5 +155,5 @@ def episode_differences(
         if key not in transcoded and episode.videos.get(key) != video.digest:
             yield key, ()
     for name, value in record.row.items():
-        if name not in _OF_THE_PLACE and episode.told.get(name) != value:
+        if name not in _OF_THE_PLACE and episode.details.get(name) != value:
             yield f"sidecar's {name}", ()

@@ -55,11 +55,11 @@ def state_follows_action(subject: Moving) -> Found:
         # The variance: a zero that is off, and weight, keep state and action apart whatever the lag.
         squares += [len(state) * (state[core] - np.roll(action, lag, axis=0)[core]).var(axis=0) for lag in lags]
     off = np.sqrt(squares)
-    told = np.flatnonzero(off.min(axis=0) < 0.8 * np.minimum(off[0], off[-1]))
-    if not len(told):
+    moved = np.flatnonzero(off.min(axis=0) < 0.8 * np.minimum(off[0], off[-1]))
+    if not len(moved):
         return NotMeasured(why="state and action move too little to tell which of them is first")
     # The middle one: a gripper is slower than the arm, and stops at what it holds.
-    lag = float(np.median([finest_lag(lags, off[:, element].tolist()) for element in told]))
+    lag = float(np.median([finest_lag(lags, off[:, element].tolist()) for element in moved]))
     late = lag - _LATEST_S * subject.motions.all[0].fps
     return Measurement(value=max(1 - lag, late, 0.0), detail=f"the state follows by {lag:+.2f} frames")
 
@@ -78,8 +78,8 @@ def actions_in_order(subject: Moving) -> Found:
     best = table.argmax(axis=1)
     # Two joints of one motion may go alike; an exchange shows where an element hardly follows its own action at all.
     wrong = [i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3]
-    told = [f"{names[i]} follows that of {names[best[i]]}" for i in wrong]
-    return Measurement(value=len(wrong), detail="; ".join(told[:3]))
+    words = [f"{names[i]} follows that of {names[best[i]]}" for i in wrong]
+    return Measurement(value=len(wrong), detail="; ".join(words[:3]))
 
 
 @target_check(

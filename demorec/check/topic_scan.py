@@ -75,8 +75,8 @@ def scan_topics(container: Container, blocks: Mapping[str, Block]) -> dict[str, 
 def _scan(schema: str, block: Block) -> TopicScan:
     stamps = None
     if schema in _STAMP_FIRST and len(block) and int(block.lengths.min()) >= _STAMP_BYTES:
-        told = np.ascontiguousarray(block.heads(_STAMP_BYTES)[:, 4:]).view(_STAMP).reshape(-1)
-        stamps = told["seconds"] * np.int64(1_000_000_000) + told["nanoseconds"]
+        heads = np.ascontiguousarray(block.heads(_STAMP_BYTES)[:, 4:]).view(_STAMP).reshape(-1)
+        stamps = heads["seconds"] * np.int64(1_000_000_000) + heads["nanoseconds"]
     elif schema in _STAMP_FIRST:
         stamps = np.array([_stamp(data) for data in block.messages()], dtype=np.int64)
     first = next(block.messages(), b"")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from demorec.cli.replay import demonstrations, told
+from demorec.cli.replay import demonstrations, describe_replay
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
@@ -38,7 +38,7 @@ class Check:
     """Check recordings, runs and datasets: files, time, physics, alignment, calibration, images.
 
     Exit code 0: everything passed (warnings allowed); 1: a check failed. The failed attempts that a run keeps are
-    judged apart: their own failures are told, but only a damaged file counts. `demorec list checks` says what is
+    judged apart: their own failures are reported, but only a damaged file counts. `demorec list checks` says what is
     measured and with which limits.
 
     Examples:
@@ -134,7 +134,7 @@ class Check:
             for replayed, is_as_recorded in _replays(self.paths, self.replay, allowed):
                 replays.append((replayed, is_as_recorded))
                 if not self.json:
-                    say(told(replayed))
+                    say(describe_replay(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
         if self.coverage_image is not None:
             self._draw(self.coverage_image, subjects)
@@ -358,8 +358,8 @@ def _verdict(report: DeepReport) -> str:
         return f"the same to the bit in all {report.num_frames} frames{aside}"
     frames = {frame for difference in report.differences for frame in difference.frames}
     count = len(report.differences)
-    told = "1 field differs" if count == 1 else f"{count} fields differ"
-    return f"{told}, in {len(frames)} of {report.num_frames} frames"
+    amount = "1 field differs" if count == 1 else f"{count} fields differ"
+    return f"{amount}, in {len(frames)} of {report.num_frames} frames"
 
 
 def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) -> str:

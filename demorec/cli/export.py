@@ -69,14 +69,14 @@ class Export:
             ProgressBar("exporting") as bar,
         ):
             report = exporter.export(sources, self.out, self.options, bar.set)
-        say(*_told(report))
+        say(*_summary_lines(report))
         return 0
 
 
 _TAKEN = "taken with --include-failures"
 
 
-def _told(report: ExportReport) -> Iterator[str]:
+def _summary_lines(report: ExportReport) -> Iterator[str]:
     added = f", {report.new_episodes} of them new" if report.new_episodes != report.num_episodes else ""
     yield f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames{added}: {report.path}"
     if report.skipped_failures:

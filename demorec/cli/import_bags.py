@@ -89,7 +89,7 @@ class Import:
             say(*suggested_mapping(bags_in(self.bags[0])[0], tell))
             return 0
         if self.mapping is None or self.out is None:
-            open_bag(bags_in(self.bags[0])[0])  # what is no bag is told what it is first
+            open_bag(bags_in(self.bags[0])[0])  # first of all says what it is, if it is no bag
             raise _incomplete(f"--suggest {self.bags[0]} > robot.toml")
         self.video.validate()
         return self._import_bags(self.bags, self.mapping, self.out)
@@ -115,7 +115,7 @@ class Import:
             raise ConfigError(f"An import needs --out: {example}.")
         self.video.validate()
         result = form.read(paths, self.mapping, self.out, self.video, motors)
-        say(*(f"camera {name}: {told}" for name, told in result.cameras.items()), *result.left_out_lines())
+        say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:
             tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
         say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {self.out}")

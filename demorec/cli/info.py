@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
-"""Of a dataset that are told one by one."""
+"""Of a dataset that are listed one by one."""
 _SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 
@@ -214,11 +214,11 @@ def _external_run_lines(path: Path, run: RunFile) -> list[str]:
     """About a run."""
     frames = sum(line.num_frames for line in run.attempts)
     counts = {word: sum(line.success is success for line in run.attempts) for success, word in _SUCCESS_WORDS.items()}
-    told = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
+    parts = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     facts = [
         ("run", f"{path} (external)"),
         ("robot", run.robot),
-        ("episodes", f"{len(run.attempts)} ({told})"),
+        ("episodes", f"{len(run.attempts)} ({parts})"),
         ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
         ("size", size_in_words(sum(line.num_bytes for line in run.attempts))),
         ("digest", run.digest),

@@ -96,7 +96,7 @@ class Replay:
                     reports.append(report)
                     bar.advance()
                     if not self.json:
-                        say(told(report))
+                        say(describe_replay(report))
                     if written is not None:
                         pairs.append(written)
             if not reports:
@@ -176,7 +176,7 @@ def _replayable(path: Path) -> Found:
     return found
 
 
-def told(report: ReplayReport) -> str:
+def describe_replay(report: ReplayReport) -> str:
     """One line about a replay."""
     if report.is_identical:
         how = "identical"

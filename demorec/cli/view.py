@@ -21,8 +21,8 @@ from demorec.runs.find import expect
 if TYPE_CHECKING:
     from demorec.view.sources import PlaybackSource
 
-_MOST, _TOLD = 50, 10
-"""How many episodes are shown unless --episodes asks for more, and of how many of --rank the reasons are told."""
+_MOST, _MOST_REASONS = 50, 10
+"""How many episodes are shown unless --episodes asks for more, and of how many of --rank the reasons are shown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +130,7 @@ class View:
         return code
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
-        """The worst first; what is wrong with them is told."""
+        """The worst first; and what is wrong with them."""
         from demorec.cli.dataset import scored
         from demorec.runs.find import find
 
@@ -138,7 +138,7 @@ class View:
             raise ConfigError(f"--rank score is for LeRobot datasets, which this is not: {others[0]}")
         found = {f"{path}: episode {episode.episode_index}": episode for path in self.paths for episode in scored(path)}
         ranked = sorted(sources, key=lambda source: found[source.name].score)
-        for episode in [found[source.name] for source in ranked[:_TOLD]]:
+        for episode in [found[source.name] for source in ranked[:_MOST_REASONS]]:
             reasons = "; ".join(reason.text for reason in episode.reasons)
             tell(f"{episode.score:.2f}  episode {episode.episode_index}{': ' * bool(reasons)}{reasons}")
         return ranked

@@ -1,4 +1,4 @@
-"""The errors that demorec raises on purpose: one tree, each told to the user as one sentence.
+"""The errors that demorec raises on purpose: one tree, each one sentence to the user.
 
 A dropped cube is not an error but an `Outcome`; an error means that no trustworthy result could be made.
 All arguments go to `super().__init__`, so that errors cross process borders (pickle) unchanged.
@@ -28,7 +28,7 @@ class ConfigError(DemorecError):
 
 
 class OptionError(ConfigError):
-    """The value of one option is impossible. Told with the name of the field, as Python and TOML files have it.
+    """The value of one option is impossible. Reported with the name of the field, as Python and TOML files have it.
 
     Args:
         option: Name of the field ("max_attempts").

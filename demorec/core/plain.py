@@ -30,8 +30,8 @@ _MAX_DIGITS = 20
 """Of a whole number: 64 bits need no more."""
 _LENGTH = re.compile(r"^(Not enough|Too many) values in .* to structure as (.*)$", re.DOTALL)
 """What cattrs says of a list that is not as long as it must be."""
-MAX_TOLD = 8
-"""Mistakes that are told at once; a hostile file may have hundreds of thousands."""
+MAX_LISTED = 8
+"""Mistakes that are listed at once; a hostile file may have hundreds of thousands."""
 
 
 def _exactly[T](kind: type[T], accepted: type | tuple[type, ...]) -> Callable[[object, object], T]:
@@ -223,11 +223,11 @@ def _in_words(error: BaseException, type_: type | None) -> str:
     return words if isinstance(error, ValueError) and " is no " in words else format_exception(error, type_)
 
 
-def listed(words: Iterable[str], most: int = MAX_TOLD, separator: str = "; ") -> str:
+def listed(words: Iterable[str], most: int = MAX_LISTED, separator: str = "; ") -> str:
     """The first of some words as one sentence's part, and how many more there are."""
-    told = list(words)
-    more = [f"and {len(told) - most:,} more"] if len(told) > most else []
-    return separator.join(told[:most] + more)
+    items = list(words)
+    more = [f"and {len(items) - most:,} more"] if len(items) > most else []
+    return separator.join(items[:most] + more)
 
 
 def to_plain(value: object) -> Any:

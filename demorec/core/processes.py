@@ -161,14 +161,14 @@ def _stand_between(command: Sequence[str]) -> int:
     return abs(program.wait())
 
 
-def _interrupt_again(told: sys.UnraisableHookArgs) -> None:
+def _interrupt_again(args: sys.UnraisableHookArgs) -> None:
     """Where Ctrl-C falls into a destructor or a callback, Python prints it and goes on: say it again after that."""
-    if issubclass(told.exc_type, KeyboardInterrupt):
+    if issubclass(args.exc_type, KeyboardInterrupt):
         again = threading.Timer(_LATER_S, os.kill, (os.getpid(), signal.SIGINT))
         again.daemon = True
         again.start()
     else:
-        sys.__unraisablehook__(told)
+        sys.__unraisablehook__(args)
 
 
 def _end_with_parent() -> None:

@@ -144,9 +144,9 @@ def _refuse_differences(
                         difference = f"{what} is {value} instead of {traits[what]}"
                         files_by_difference.setdefault(difference, []).append(file.name)
     if files_by_difference:
-        told = "; ".join(
+        differences = "; ".join(
             f"{difference} ({listed(files, 3, ', ')})" for difference, files in files_by_difference.items()
         )
         raise ConfigError(
-            f"These recordings do not go into one dataset with {reference.name}: {told}. Export them separately."
+            f"These recordings do not go into one dataset with {reference.name}: {differences}. Export them separately."
         )

@@ -37,7 +37,7 @@ def error_values(errors: Mapping[str, Pose]) -> dict[str, float]:
     return values
 
 
-def told_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
+def stated_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
     """true_from_recorded of a camera, as recorded numbers have it.
 
     Args:

@@ -30,7 +30,7 @@ _MOST = {"bodies": 255, "goals": 255, "cameras": 64, "arm joints": 64, "gripper 
 """Segmentation images tell 255 bodies apart; the others are far beyond any scene that was ever made."""
 _SIZE_LENGTH = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3, "urdf": 3}
 _MAX_METRES = 1e4
-_MAX_TOLD = 5
+_MAX_LISTED = 5
 
 
 def from_description[T](text: str, cls: type[T]) -> T:
@@ -59,7 +59,7 @@ def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
         raise ValueError(f"it describes {'no' if simulated else 'a'} simulated episode")
     wrong = find_problems(info)
     if wrong:
-        raise ValueError("; ".join(wrong[:_MAX_TOLD]))
+        raise ValueError("; ".join(wrong[:_MAX_LISTED]))
     return info
 
 

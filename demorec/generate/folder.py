@@ -96,7 +96,7 @@ class RunFolder:
         try:
             self.save()
         except GenerationError:
-            if state != "stopped":  # else the reason why it stopped is the one to be told
+            if state != "stopped":  # else the reason why it stopped is the one to report
                 raise
 
     def save(self) -> None:

@@ -130,7 +130,7 @@ class RayExecutor(Executor):
                 raise GenerationError(f"A Ray worker cannot work: {_last_line(error)}") from error
             except ray.exceptions.RuntimeEnvSetupError as error:
                 raise GenerationError(f"A Ray worker cannot be set up: {_last_line(error)}") from error
-            except ray.exceptions.LocalRayletDiedError:  # told when the other reports have been taken in
+            except ray.exceptions.LocalRayletDiedError:  # reported when the other reports have been taken in
                 self._pending[reference], self._is_cut_off = plan, True
             except ray.exceptions.RayError as error:
                 self._counted_at = -math.inf  # it may have been a whole node

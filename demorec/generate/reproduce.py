@@ -63,7 +63,7 @@ def reproduce(
     Args:
         source: A run or a dataset.
         options: How it is carried out.
-        progress: Is told how it goes, and first of all in which versions the source differs from what is here.
+        progress: Is called with how it goes, and first of all in which versions the source differs from what is here.
         allowed: The user's own modules that may be imported for what the source names.
 
     Returns:

@@ -58,7 +58,7 @@ def generate(
     Args:
         config: What decides the data.
         options: How it is carried out; `out` must be set.
-        progress: Is told how it goes.
+        progress: Hears how it goes.
         maker: "module:function" that makes an attempt, imported in the workers.
         inspect: Reads a recording that run.json does not know.
         episodes: Order in which episodes are begun (default: ascending); the result does not depend on it.

@@ -65,12 +65,12 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         """Of the elements of state and action."""
         return state_names(self.spec, "joint")
 
-    def told(self, joint_position: Array) -> Array:
+    def state_values(self, joint_position: Array) -> Array:
         """(D,) values of (n_joints,) positions, rad and m."""
         arm = len(self.spec.arm_joints)
         return np.append(joint_position[:arm], self.spec.gripper.width(joint_position[arm:]))
 
-    def meant(self, values: Array) -> Array:
+    def joint_targets(self, values: Array) -> Array:
         """(n_arm + 1,) joint targets, rad, and opening, m, of (D,) values."""
         return values
 
@@ -124,11 +124,11 @@ class SimulatedArm(Robot):  # type: ignore[misc]
                 f"{', '.join(self.names)}: choose one for this arm."
             )
         self._target |= {name: float(action[name]) for name in self.names if name in action}
-        *_, about = self._env.step(self.meant(np.array([self._target[name] for name in self.names])))
+        *_, about = self._env.step(self.joint_targets(np.array([self._target[name] for name in self.names])))
         self._record()
         command = about["command"]
         joints = np.append(command[:-1], self.spec.gripper.joint_position(command[-1]))
-        return self._named(self.told(joints))
+        return self._named(self.state_values(joints))
 
     def disconnect(self) -> None:
         """Finish the recording and free the simulator."""
@@ -149,7 +149,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         self._env.close()
 
     def _state(self) -> dict[str, float]:
-        return self._named(self.told(self._env.situation.observation.joint_position))
+        return self._named(self.state_values(self._env.situation.observation.joint_position))
 
     def _named(self, values: Array) -> dict[str, float]:
         return dict(zip(self.names, values.tolist(), strict=True))
@@ -186,11 +186,11 @@ class DemorecSO101(SimulatedArm):
         """As of the real arm."""
         return self.motors.names
 
-    def told(self, joint_position: Array) -> Array:
+    def state_values(self, joint_position: Array) -> Array:
         """(6,) values of (6,) positions, rad."""
         return np.asarray(self.motors.values(joint_position[np.newaxis])[0])
 
-    def meant(self, values: Array) -> Array:
+    def joint_targets(self, values: Array) -> Array:
         """(6,) joint targets, rad, and opening, m, of (6,) values."""
         factor, offset = np.array(self.motors.to_positions).T
         position = values * factor + offset

@@ -1,4 +1,4 @@
-"""From what a policy says to what the motors are told: the inverse of `demorec.episode.features.action_vectors`."""
+"""From what a policy says to what the motors get: the inverse of `demorec.episode.features.action_vectors`."""
 
 from __future__ import annotations
 

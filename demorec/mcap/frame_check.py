@@ -67,9 +67,9 @@ class FrameCheck:
         vectors = list(self._vectors(frame))
         for owner, name, vector, shape in vectors:
             if vector is None or vector.shape != shape:
-                told = f"no {name}" if vector is None else f"a {name} of shape {vector.shape}"
+                given = f"no {name}" if vector is None else f"a {name} of shape {vector.shape}"
                 raise RecordingError(
-                    f"Frame {frame.frame_index} has {told} in its {owner}, it must be of shape {shape}."
+                    f"Frame {frame.frame_index} has {given} in its {owner}, it must be of shape {shape}."
                 )
         if not np.isfinite(np.concatenate([vector for _, _, vector, _ in vectors])).all():
             owner, name = next((owner, name) for owner, name, vector, _ in vectors if not np.isfinite(vector).all())
@@ -128,7 +128,7 @@ MAX_SUBTASK = 1000
 
 
 class SampledFrameCheck:
-    """Looks at images and frames in the order in which they come, and is told of those that were taken."""
+    """Looks at images and frames in the order in which they come, and notes those that were taken."""
 
     def __init__(self, info: EpisodeInfo) -> None:
         self._features = {feature.name: feature for feature in info.features}

@@ -96,7 +96,7 @@ class Unpacked:
 
 
 class Budget:
-    """So much of something that is made of a file, taken bit by bit: what is built is counted, whatever it is told by.
+    """How much of something may be built from a file, taken bit by bit: what is built counts, whatever the file says.
 
     Args:
         total: The most that all calls of `take` may take together.

@@ -20,7 +20,7 @@ from demorec.core.plain import digest, from_plain, to_json
 from demorec.core.registry import nearest_match, split_name
 from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
-from demorec.episode.camera_error import told_error, true_camera
+from demorec.episode.camera_error import stated_error, true_camera
 from demorec.episode.episode import Columns, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
@@ -127,8 +127,8 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
             return SceneView(
                 scene=info.scene, true_cameras=episode.cameras, true_from_recorded=dict(episode.true_from_recorded)
             )
-    told = {camera.name: told_error(camera.name, info.behaviour) for camera in info.scene.cameras}
-    errors = {name: error for name, error in told.items() if error is not None}
+    stated = {camera.name: stated_error(camera.name, info.behaviour) for camera in info.scene.cameras}
+    errors = {name: error for name, error in stated.items() if error is not None}
     true_cameras = tuple(
         true_camera(camera, errors[camera.name]) if camera.name in errors else camera for camera in info.scene.cameras
     )

@@ -58,9 +58,9 @@ def link_masses(text: str) -> dict[str, tuple[float, Array]]:
         if not mass and name != urdf.root:
             wrong.setdefault(name, "moves, but weighs nothing")
     if wrong:
-        told = listed([f"{name!r} ({problem})" for name, problem in wrong.items()], _SHOWN, ", ")
+        listing = listed([f"{name!r} ({problem})" for name, problem in wrong.items()], _SHOWN, ", ")
         raise ValueError(
-            f"its URDF does not say what these links weigh: {told}; give each the mass and inertia of a body (only "
+            f"its URDF does not say what these links weigh: {listing}; give each the mass and inertia of a body (only "
             "frames without shapes on fixed joints need none)"
         )
     return {name: found for name, found in masses.items() if found[0]}

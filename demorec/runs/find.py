@@ -1,7 +1,7 @@
 """What a path is: a recording, a run, a dataset, something of another program, nothing, or something unreadable.
 
 Every command that is given a path asks here, so that all of them take the same things and refuse the rest in the same
-words. Nothing is opened that could block: a FIFO, a socket or a device is told as what it is.
+words. Nothing is opened that could block: a FIFO, a socket or a device is named as what it is.
 """
 
 from __future__ import annotations

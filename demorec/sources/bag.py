@@ -202,8 +202,8 @@ def _folder(path: Path) -> Bag:
             f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"
         ) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        told = f" ({error})" if isinstance(error, LimitError) else ""
-        raise resource_error(error, path) or BagError(f"The bag's {METADATA} cannot be read{told}: {path}") from error
+        reason = f" ({error})" if isinstance(error, LimitError) else ""
+        raise resource_error(error, path) or BagError(f"The bag's {METADATA} cannot be read{reason}: {path}") from error
     if mode not in ("", "none") and compression != "zstd":
         raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is read: {path}")
     if not names:

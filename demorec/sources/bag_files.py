@@ -50,8 +50,8 @@ def read_mcap(path: Path, tell: Callable[[str], None], unpacked: Unpacked) -> It
         except MemoryError as error:
             raise resource_error(error, path) or error from error
         except Exception as error:
-            is_told = isinstance(error, LimitError | CutOffError)
-            tell(str(error) if is_told else f"a record is damaged: {describe_error(error)}")
+            is_own = isinstance(error, LimitError | CutOffError)
+            tell(str(error) if is_own else f"a record is damaged: {describe_error(error)}")
 
 
 SQLITE_MAGIC = b"SQLite format 3\0"
@@ -86,7 +86,7 @@ def read_sqlite(path: Path, tell: Callable[[str], None], unpacked: Unpacked) -> 
             for topic_id, log_ns, data in _rows(database, "messages", path, " ORDER BY rowid"):
                 started = True
                 num_bytes += _ROW_BYTES + (len(data) if isinstance(data, bytes | str) else 0)
-                if num_bytes > size:  # pages that are told to belong to several others
+                if num_bytes > size:  # pages that several others claim
                     raise sqlite3.DatabaseError("it gives more than it holds")
                 unpacked.add(0, 1)
                 if topic_id not in channels or not isinstance(log_ns, int) or not isinstance(data, bytes):

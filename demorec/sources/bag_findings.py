@@ -92,8 +92,8 @@ def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
         others = [other for other in regular if (other.stream.topic, other.is_header) == key]
         early = max(int(other.times_ns[-1]) for other in others) - int(line.times_ns[-1])
         if joints and early > GAP * line.period_ns:
-            told = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")
-            text = f"{told} stop {early / NS:.2f} s before other joints of the topic"
+            names = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")
+            text = f"{names} stop {early / NS:.2f} s before other joints of the topic"
             yield of_stream(line.stream, "early_end", text)
 
 
@@ -250,12 +250,12 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
             advice = "they come too unevenly for these rows"
         yield of_stream(line.stream, "repeats", f"{repeats} and {skips}: {advice}")
     elif max(num_free / num_rows, num_skipped / num_images) > RATE:
-        told = f"{repeats if num_free else skips}, since it comes {rate:.1f} times a second and rows {clock.fps} times"
+        text = f"{repeats if num_free else skips}, since it comes {rate:.1f} times a second and rows {clock.fps} times"
         # Every second image can be meant; now the next one and now the one after it only beside a slower camera.
         is_uneven = abs(rate / clock.fps - round(rate / clock.fps)) > RATE
         if num_skipped and is_uneven and not any(rows.follows for rows in episodes):
-            yield of_stream(line.stream, "skips", f"{told}: use fps = {max(1, round(rate))}")
+            yield of_stream(line.stream, "skips", f"{text}: use fps = {max(1, round(rate))}")
         else:
-            yield of_stream(line.stream, NOTE, told)
+            yield of_stream(line.stream, NOTE, text)
     elif num_skipped and (follows := next((rows.follows for rows in episodes if rows.follows), "")):
         yield of_stream(line.stream, NOTE, f"{skips}: rows follow {follows}")

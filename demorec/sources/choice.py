@@ -92,7 +92,7 @@ def _rank(vector: Vector) -> tuple[bool, bool, bool, int, int]:
 
 
 def _are_same(one: Vector, other: Vector) -> bool:
-    """Whether two vectors are likely the same joints told twice: a relay, a merged topic, a driver's own message."""
+    """Whether two vectors are likely the same joints sent twice: a relay, a merged topic, a driver's own message."""
     if one.topic == other.topic:
         return False
     joints, others = set(one.layout.joints), set(other.layout.joints)

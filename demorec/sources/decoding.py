@@ -166,7 +166,7 @@ def _in_order(files: Iterable[Any]) -> Iterator[Any]:
 
 
 class _ProtobufSize:
-    """Whether a message of a type takes little memory, told before any is taken.
+    """Whether a message of a type takes little memory, found out before any is taken.
 
     An element of two bytes may be of a type with thousands of fields, and takes the memory of all of them.
     """

@@ -167,15 +167,15 @@ def urdf_in_bag(bag: Bag, streams: BagStreams, topic: str) -> str:
 def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints: Container[str]) -> Feature:
     """A feature as recordings know it, given the joints of the robot's model."""
     sources = lines.mapping.features[name]
-    told = []
+    rules = []
     for index, source in enumerate(sources):
         if source.next:
-            told.append(f"{source.next} of the next frame")
+            rules.append(f"{source.next} of the next frame")
             continue
         clock = "header" if lines.lines[name, index].is_header else "log"
-        told.append(f"{source.topic} {source.field}, {lines.rule((name, index))[0]} by {clock} time")
+        rules.append(f"{source.topic} {source.field}, {lines.rule((name, index))[0]} by {clock} time")
     moved = (element if element in joints else "" for element in feature.names)
-    return imported_feature(name, feature.values.dtype, feature.names, feature.units, moved, "; ".join(told))
+    return imported_feature(name, feature.values.dtype, feature.names, feature.units, moved, "; ".join(rules))
 
 
 def described_camera(name: str, plan: CameraRows, lines: Timelines) -> Camera:

@@ -15,7 +15,7 @@ from demorec.sources.mapping import Episodes, SourceMapping
 from demorec.sources.streams import BagStreams, Text
 from demorec.sources.words import task_in_name
 
-_SHOWN, _MOST_TOLD = 40, 5
+_SHOWN, _MOST_LISTED = 40, 5
 """Characters of a marker, and markers, in an error."""
 
 
@@ -106,7 +106,7 @@ def _unknown_words(markers: list[Text], mapping: SourceMapping) -> str:
         return isinstance(value, str | int | float) and ((is_shared and isinstance(value, str)) or value in known)
 
     found = dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if not is_known(marker.value))
-    return listed(found, _MOST_TOLD, ", ")
+    return listed(found, _MOST_LISTED, ", ")
 
 
 def _between_markers(markers: list[Text], mapping: SourceMapping) -> list[Window]:
@@ -142,10 +142,10 @@ def task_text(bag: Bag, streams: BagStreams, window: Window, mapping: SourceMapp
         if text := task_in_name(bag.name):
             return text
         raise BagError(f"The bag's name says no task, which the mapping takes from it: {bag.path}")
-    told = [text for text in streams.texts[task.topic] if text.time_ns <= window.end_ns]
-    if not told:
+    texts = [text for text in streams.texts[task.topic] if text.time_ns <= window.end_ns]
+    if not texts:
         raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown: {bag.path}")
-    value = max(told, key=lambda text: text.time_ns).value
+    value = max(texts, key=lambda text: text.time_ns).value
     if not isinstance(value, str) or not value.strip():
         raise BagError(f"The task of {task.topic} is no text: {bag.path}")
     return value.strip()

@@ -19,9 +19,9 @@ from demorec.sources.streams import NO_STAMP, Stream
 _JITTER = 0.25
 """Of a period: what nine of ten steps of a sensor stay within."""
 GAP = 5.0
-"""Periods without a message that are told as a gap; shorter ones are lost messages."""
+"""Periods without a message that are reported as a gap; shorter ones are lost messages."""
 _STEP_S = 0.05
-"""By which a clock must jump, or drift in a bag, to be told."""
+"""By which a clock must jump, or drift in a bag, to be reported."""
 STILL_S = 0.5
 """For which a sensor with noise never gives the same number."""
 FROZEN = 5
@@ -238,8 +238,8 @@ def _image_findings(line: Timeline) -> Iterator[tuple[str, str]]:
         return
     formats = {(head.format, head.encoding) for head in stream.heads.kinds()}
     if len(formats) > 1:
-        told = ", ".join(sorted(f"{name} {encoding}".strip() for name, encoding in formats))
-        yield "format", f"its images are of several kinds ({told})"
+        kinds = ", ".join(sorted(f"{name} {encoding}".strip() for name, encoding in formats))
+        yield "format", f"its images are of several kinds ({kinds})"
     sizes = {(head.width, head.height) for head in stream.heads.kinds() if head.width}
     if len(sizes) > 1:
         yield "size", f"its images change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"

@@ -150,7 +150,7 @@ class StoredCamera:
         width, height: Pixels.
         kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are
             encoded once.
-        told: What becomes of the images, in words.
+        description: What becomes of the images, in words.
 
     Args:
         name: Of the camera.
@@ -184,21 +184,21 @@ class StoredCamera:
             head = self._head(array.read(0, 1)[0], 0)[1]
             self.width, self.height = head.width, head.height
             self.kept = "jpeg" if camera.colors == "rgb" else ""
-            self.told = (
+            self.description = (
                 "jpeg passed through as it is" if self.kept else "jpeg with red and blue exchanged, encoded once"
             )
         elif form == "depth":
             self.height, self.width = shape[1:3]
             self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
-            self.told = f"distances ({self.kept}) passed through as they are"
+            self.description = f"distances ({self.kept}) passed through as they are"
         else:
             self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
-            self.told = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
+            self.description = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
         if not 1 <= self.width * self.height <= MAX_PIXELS:
             raise Hdf5FitError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
         if form == "pixels" and array.dtype.kind == "f":
             self._scale = _float_scale(array)
-            self.told = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.told}"
+            self.description = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.description}"
 
     def described(self) -> Camera:
         """The camera as recordings know it."""

@@ -75,7 +75,9 @@ def import_hdf5(
                 plans.append(
                     (path, place, _alike(info, plans[0][2] if plans else info, file, place), episode.outcome())
                 )
-                cameras = cameras or {one.name: f"{one.width}x{one.height}, {one.told}" for one in episode.cameras}
+                cameras = cameras or {
+                    one.name: f"{one.width}x{one.height}, {one.description}" for one in episode.cameras
+                }
                 has_last |= episode.has_last
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
     if has_last:
@@ -121,14 +123,14 @@ class _Stored:
             arrays += [] if feature.shift else [column.array for column in feature.columns]
         self.num_rows = num_rows = _num_rows(observed, others)
         self.has_last = len(observed[0]) > num_rows
-        told = file.attribute(place, "num_samples")
-        if told is not None and told != num_rows:
+        stated = file.attribute(place, "num_samples")
+        if stated is not None and stated != num_rows:
             raise Hdf5FitError(
-                f"{place or 'the episode'} has {num_rows} rows, but its attribute num_samples says {reprlib.repr(told)}"
+                f"{place or 'the episode'} has {num_rows} rows, but its num_samples says {reprlib.repr(stated)}"
             )
         files = [images for _, images in cameras.values() if len(images.shape) == 2]
-        is_told = files and file.has(f"{place}/{_LENGTHS}")
-        lengths = image_lengths(array(_LENGTHS), len(files[0])) if is_told else None
+        has_lengths = files and file.has(f"{place}/{_LENGTHS}")
+        lengths = image_lengths(array(_LENGTHS), len(files[0])) if has_lengths else None
         self.num_frames = min(num_rows, len(observed[0]) - max(feature.shift for feature in self.features))
         if self.num_frames < 1:
             raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
@@ -226,7 +228,7 @@ def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str,
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """What does not fit is told with the file's name."""
+    """Errors about what does not fit name the file."""
     try:
         yield
     except Hdf5FitError as error:
@@ -304,7 +306,7 @@ def rate_of(file: ForeignFile, place: str, mapping: SourceMapping) -> int:
     """Rows a second; Hdf5Error when neither the mapping nor the file says it, or no whole number."""
     if mapping.clock.fps:
         return mapping.clock.fps
-    found = told_rate(file, place)
+    found = stated_rate(file, place)
     if found is None:
         raise Hdf5Error(
             f"Nothing in the file says how many rows a second has: give clock.fps in the mapping: {file.path}"
@@ -317,7 +319,7 @@ def rate_of(file: ForeignFile, place: str, mapping: SourceMapping) -> int:
     return int(found)
 
 
-def told_rate(file: ForeignFile, place: str) -> float | None:
+def stated_rate(file: ForeignFile, place: str) -> float | None:
     """What the file's attributes say of the rate; None when they say nothing."""
     for name in _RATES:
         found = found_attribute(file, place, name)

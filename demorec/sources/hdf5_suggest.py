@@ -16,7 +16,7 @@ from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
 from demorec.episode.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.runs.find import expect
 from demorec.sources.hdf5_arrays import is_camera
-from demorec.sources.hdf5_import import episode_places, found_attribute, told_rate
+from demorec.sources.hdf5_import import episode_places, found_attribute, stated_rate
 from demorec.sources.mapping import Episodes
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
@@ -154,7 +154,7 @@ def _task(contents: _Contents, path: Path) -> list[str]:
 
 
 def _clock(contents: _Contents, is_aloha: bool) -> list[str]:
-    rate = told_rate(contents.file, contents.place)
+    rate = stated_rate(contents.file, contents.place)
     if rate is not None:
         return [f"# fps = {rate:g}  # as the file says"]
     if is_aloha:

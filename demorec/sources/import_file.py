@@ -193,8 +193,8 @@ def _episode_lines(episode: EpisodeReport) -> Iterator[str]:
     verdict = {True: ", success", False: ", failure", None: ""}[episode.success]
     rows = f", one for each message of {episode.follows}" if episode.follows else ""
     yield f"  episode {episode.episode_index}: {place}, {episode.num_frames} frames{rows}{verdict}"
-    for camera, told in episode.pictures.items():
-        yield f"    camera {camera}: {told}"
+    for camera, text in episode.pictures.items():
+        yield f"    camera {camera}: {text}"
 
 
 FORMAT = 1

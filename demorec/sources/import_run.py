@@ -139,8 +139,8 @@ class _Importer:
                     kinds = {finding.kind: finding.kind for finding in findings}
                     offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]
                     kinds |= {"clock_offset": f"clock_offset, {offsets[0]}"} if offsets else {}
-                    told = f" (the bag's report: {'; '.join(sorted(kinds.values()))})" if kinds else ""
-                    raise BagError(f"The bag gives no whole episode: {error}{told}: {bag.path}") from error
+                    reported = f" (the bag's report: {'; '.join(sorted(kinds.values()))})" if kinds else ""
+                    raise BagError(f"The bag gives no whole episode: {error}{reported}: {bag.path}") from error
                 reports.append(_report(window, begin, None, str(error)))
                 continue
             episode = self._episode(bag, files, lines, rows, len(episodes))
@@ -300,7 +300,7 @@ def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason
         num_frames=count,
         success=window.success,
         trimmed_s=(trimmed_ns[0] / NS, trimmed_ns[1] / NS),
-        pictures={} if episode is None else {name: plan.told for name, plan in episode.rows.cameras.items()},
+        pictures={} if episode is None else {name: plan.description for name, plan in episode.rows.cameras.items()},
         reason=reason,
         discarded=window.discarded,
         follows=follows,

@@ -13,7 +13,7 @@ from typing import Any
 
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
-from demorec.core.plain import MAX_TOLD, from_plain, listed
+from demorec.core.plain import MAX_LISTED, from_plain, listed
 from demorec.core.registry import nearest_match
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.validity import MAX_CAMERAS, MAX_FEATURES
@@ -42,7 +42,7 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
     problems = (
         [problem]
         if (problem := _excess(data))
-        else list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_TOLD))
+        else list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_LISTED))
     )
     if problems:
         other: SourceKind = "hdf5" if kind == "bag" else "bag"

@@ -84,7 +84,7 @@ class CameraRows:
         return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """What becomes of them, for people."""
         shown = len(np.unique(self.positions))
         what = f"{len(self.taken)} images {self.head.width}x{self.head.height}, "
@@ -388,5 +388,5 @@ def _first_rows(feature: FeatureRows, count: int) -> FeatureRows:
 
 
 def _next_of(feature: FeatureRows, times: Int) -> FeatureRows:
-    """What a feature is one row later; its age is told from the row that has it, and so is below 0."""
+    """What a feature is one row later; its age counts from the row that has it, and so is below 0."""
     return replace(feature, values=feature.values[1:], ages_ns=feature.ages_ns[1:] - np.diff(times))

@@ -199,11 +199,11 @@ def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
         rate = f"{topic.rate_hz:.1f} Hz, " if topic.rate_hz else ""
         stamp = "" if topic.has_stamp else ", no times in its headers"
         yield f"#   {name}  {topic.type}, {rate}{topic.count} messages{stamp}"
-        told = topic.problem or (_told(topic.values[0]) if topic.values else "none of its messages can be read")
-        yield f"#     {told}"
+        shown = topic.problem or (_examples(topic.values[0]) if topic.values else "none of its messages can be read")
+        yield f"#     {shown}"
 
 
-def _told(values: Values) -> str:
+def _examples(values: Values) -> str:
     times = ("header", "ts", "timestamp", "stamp")
     return (
         "; ".join(f"{key}: {_short(value)}" for key, value in values.items() if key not in times)[:160] or "no fields"
@@ -277,8 +277,8 @@ def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
 
 
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
-    if told := _task_topics(topics):
-        return [f"topic = {quoted(told[0])}"]
+    if found := _task_topics(topics):
+        return [f"topic = {quoted(found[0])}"]
     text = f"# text = {quoted('what the robot was asked to do')}  # the same for all bags"
     if name := task_in_name(bag.name):
         return [f"file_name = true  # the name of each bag is its task, here {quoted(name)}; or write:", text]

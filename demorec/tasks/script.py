@@ -1,4 +1,4 @@
-"""What the expert is told about an episode, the steps that its script is made of, and what these wait for."""
+"""What the expert knows about an episode, the steps that its script is made of, and what these wait for."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
     """
     files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
     for source, file in zip(sources, files, strict=True):
-        with _refusals_told(file):
+        with _refusals_reported(file):
             _save_episode(source, file, is_alone=len(sources) == 1)
     return files
 
@@ -88,12 +88,12 @@ def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Bl
 @contextmanager
 def _partial(target: Path) -> Iterator[Path]:
     """A name beside the target, renamed when the block ends well and removed when not."""
-    with _refusals_told(target), written_whole(target, RERUN_FILE) as part:
+    with _refusals_reported(target), written_whole(target, RERUN_FILE) as part:
         yield part
 
 
 @contextmanager
-def _refusals_told(target: Path) -> Iterator[None]:
+def _refusals_reported(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

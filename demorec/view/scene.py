@@ -72,8 +72,8 @@ def log_words(
     """The page of what holds, anew whenever something changes; `frames_ns` (T,) are the times of all frames."""
     holds: dict[str, str] = {}
     times, pages = [], []
-    told = sorted((item for item in statements if item[1] in _HEADINGS), key=lambda item: item[0])
-    for time_ns, group in groupby(told, key=lambda item: item[0]):
+    shown = sorted((item for item in statements if item[1] in _HEADINGS), key=lambda item: item[0])
+    for time_ns, group in groupby(shown, key=lambda item: item[0]):
         holds |= {kind: text for _, kind, text in group}
         times.append(time_ns)
         pages.append("\n\n".join(f"**{title}**\n\n{holds[kind]}" for kind, title in _HEADINGS.items() if kind in holds))

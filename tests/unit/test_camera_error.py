@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from demorec.core.geometry import Pose
-from demorec.episode.camera_error import error_values, told_error
+from demorec.episode.camera_error import error_values, stated_error
 
 
 @pytest.mark.parametrize(
@@ -25,5 +25,5 @@ def test_numbers_that_contradict_each_other_tell_nothing(lie: dict[str, float]) 
     turn = Pose(position=np.array([1e-3, 0, 0]), quat_xyzw=np.array([0.003, 0.004, 0.0, math.sqrt(1 - 25e-6)]))
     values = error_values({"front": turn})
     assert values["calibration_front_angle"] == pytest.approx(2 * math.asin(0.005))
-    assert told_error("front", values) is not None
-    assert told_error("front", values | lie) is None
+    assert stated_error("front", values) is not None
+    assert stated_error("front", values | lie) is None

@@ -169,17 +169,17 @@ def _strokes(guide: Array, fps: float) -> int:
 
 def _hand(motion: Motion, scale: Scale, element: int) -> tuple[Array, Array]:
     """(T,) opening and command of a gripper in units of their ranges; the opening for both where none is commanded."""
-    opens, told = scale.state[:, element], scale.action[:, element]
-    narrow, wide = sorted((opens[1] - opens[0], told[1] - told[0]))
-    if wide < _ALIKE * narrow and max(opens[0], told[0]) < min(opens[1], told[1]):  # in the same unit
-        opens = told = np.array([min(opens[0], told[0]), max(opens[1], told[1])])
+    opens, target = scale.state[:, element], scale.action[:, element]
+    narrow, wide = sorted((opens[1] - opens[0], target[1] - target[0]))
+    if wide < _ALIKE * narrow and max(opens[0], target[0]) < min(opens[1], target[1]):  # in the same unit
+        opens = target = np.array([min(opens[0], target[0]), max(opens[1], target[1])])
 
     def of(values: Array, ranges: Array) -> Array:
         return np.asarray((values[:, element] - ranges[0]) / max(ranges[1] - ranges[0], 1e-9))
 
     if motion.action is None or not np.isfinite(motion.action[:, element]).all():
         return of(motion.state, scale.state[:, element]), of(motion.state, scale.state[:, element])
-    return of(motion.state, opens), of(motion.action, told)
+    return of(motion.state, opens), of(motion.action, target)
 
 
 def _levels(command: Array) -> Flags:

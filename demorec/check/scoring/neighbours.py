@@ -129,7 +129,7 @@ def words_of(tasks: Sequence[str]) -> Iterator[tuple[str, Flags]]:
                 yield term, has
 
 
-def told_otherwise(tasks: Sequence[str], looks: Array) -> tuple[Array, list[str]]:
+def contradicted_words(tasks: Sequence[str], looks: Array) -> tuple[Array, list[str]]:
     """How surely what is seen contradicts a word of the instruction, or the lack of it, and which word.
 
     For each word a linear model of all other episodes predicts from the colours whether the instruction has it. Words
@@ -149,12 +149,12 @@ def told_otherwise(tasks: Sequence[str], looks: Array) -> tuple[Array, list[str]
     influence = np.linalg.solve(gram, centred.T)
     leverage = np.minimum(np.einsum("np,pn->n", centred, influence) + 1 / len(tasks), 0.95)
     for word, has in words_of(tasks):
-        told = np.where(has, 1.0, -1.0)
-        mean = told.mean()
-        seen = told - (told - mean - centred @ (influence @ (told - mean))) / (1 - leverage)
+        given = np.where(has, 1.0, -1.0)
+        mean = given.mean()
+        seen = given - (given - mean - centred @ (influence @ (given - mean))) / (1 - leverage)
         # A rare word is predicted too low everywhere: what is usual with it is 1, what is usual without it -1.
         high, low = float(np.median(seen[has])), float(np.median(seen[~has]))
-        agrees = told * (2 * seen - high - low) / max(high - low, 1e-9)
+        agrees = given * (2 * seen - high - low) / max(high - low, 1e-9)
         if high <= low or min((agrees[has] > 0).mean(), (agrees[~has] > 0).mean()) < _PREDICTED:
             continue
         usual = np.sort((1 - agrees) ** 2)[: -max(_FEWEST_ODD, round(_ODD_SHARE * len(tasks)))]

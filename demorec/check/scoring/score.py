@@ -278,7 +278,7 @@ def _otherwise(episodes: Sequence[Measured]) -> Iterator[tuple[int, Reason]]:
     if len(seen) < neighbours.FEWEST:
         return
     looks = np.array([np.concatenate([episode.sights[camera].look for camera in cameras]) for episode in seen])
-    off, words = neighbours.told_otherwise([episode.task for episode in seen], looks)
+    off, words = neighbours.contradicted_words([episode.task for episode in seen], looks)
     for episode, spreads, word in zip(seen, off.tolist(), words, strict=True):
         yield (
             episode.number,

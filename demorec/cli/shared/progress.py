@@ -116,7 +116,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         tell(", ".join(filter(None, (f"{self._title}: {how_far}", passed, self._last_words()))))
 
     def _last_words(self) -> str:
-        """How much time is left, if that can be told, and the note."""
+        """How much time is left, if that can be estimated, and the note."""
         words = [self._note] if self._note else []
         if self._first_end is not None and self.done < self.total:
             began, done_then = self._first_end

@@ -27,7 +27,7 @@ def left_out(plan: Plan) -> tuple[str, ...]:
     for reason, names in found.items():
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         phrases.append(f"{', '.join(sorted(names)[:_NAMED])}{more} ({reason})")
-    return (*phrases, *_scenes(plan), *_told(plan), *_attempts(plan), *_facts(plan))
+    return (*phrases, *_scenes(plan), *_descriptions(plan), *_attempts(plan), *_facts(plan))
 
 
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
@@ -65,7 +65,7 @@ def _scenes(plan: Plan) -> Iterator[str]:
         yield f"scenes of simulated episodes: {lost} (they describe the episode as it was recorded)"
 
 
-def _told(plan: Plan) -> Iterator[str]:
+def _descriptions(plan: Plan) -> Iterator[str]:
     spoken = any(feature.dtype == "language" for feature in plan.info.features.values())
     if spoken and (count := sum(bool(cut.task) for cut in plan.cuts)):
         yield f"other wordings (task_aug) in episodes: {count} (they are wordings of the old instruction)"

@@ -72,7 +72,7 @@ class StoredArray:
 
     def read(self, begin: int, end: int) -> NDArray[np.generic]:
         """Rows from `begin` to before `end`; Hdf5Error when they cannot be read."""
-        with _errors_told(f"{self.place} cannot be read", self._file):
+        with _errors_reported(f"{self.place} cannot be read", self._file):
             rows: NDArray[np.generic] = self._dataset[begin:end]
             if self.is_ragged:  # rows may share their bytes
                 self._unpacked += sum(map(len, rows))
@@ -112,7 +112,7 @@ class ForeignFile(Closing):
         self.path = path
         self._claimed: set[str] = set()
         self._num_bytes = self._num_rows = 0
-        with _errors_told("The HDF5 file cannot be read", path):
+        with _errors_reported("The HDF5 file cannot be read", path):
             with open_regular(path) as file:
                 if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                     raise Hdf5Error(f"This is no HDF5 file: {path}")
@@ -131,7 +131,7 @@ class ForeignFile(Closing):
         group = self._find(place)
         if not isinstance(group, h5py.Group):
             raise Hdf5Error(f"{_shown(place)} is no group: {self.path}")
-        with _errors_told(f"{_shown(place)} cannot be read", self.path):
+        with _errors_reported(f"{_shown(place)} cannot be read", self.path):
             if len(group) > trial.MAX_OBJECTS:
                 raise Hdf5Error(
                     f"{_shown(place)} has {len(group):,} entries, at most {trial.MAX_OBJECTS:,} are read: {self.path}"
@@ -187,7 +187,7 @@ class ForeignFile(Closing):
                 or claims more than a file of this size may unpack to.
         """
         found = self._find(place)
-        with _errors_told(f"{place} cannot be read", self.path):
+        with _errors_reported(f"{place} cannot be read", self.path):
             reason = _why_unusable(found, may_be_ragged)
             if not reason:
                 self._claim(place, found)
@@ -213,7 +213,7 @@ class ForeignFile(Closing):
             Hdf5Error: There is none, or it is no list of so many short texts.
         """
         found = self._find(place)
-        with _errors_told(f"{place} cannot be read", self.path):
+        with _errors_reported(f"{place} cannot be read", self.path):
             is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
             kind = h5py.check_string_dtype(found.dtype) if is_list else None
             if kind is None or found.external or len(found) > trial.MAX_OBJECTS or (kind.length or 0) > trial.MAX_NAME:
@@ -223,7 +223,7 @@ class ForeignFile(Closing):
     def address(self, place: str) -> int:
         """By which a group or dataset is known, whatever it is called: it may have several names."""
         found = self._find(place)
-        with _errors_told(f"{_shown(place)} cannot be read", self.path):
+        with _errors_reported(f"{_shown(place)} cannot be read", self.path):
             return int(h5py.h5o.get_info(found.id).addr)
 
     def _find(self, place: str) -> h5py.Group | h5py.Dataset:
@@ -231,7 +231,7 @@ class ForeignFile(Closing):
         found: h5py.Group | h5py.Dataset = self._root
         walked = ""
         for part in filter(None, place.split("/")):
-            with _errors_told(f"{walked}{part} cannot be read", self.path):
+            with _errors_reported(f"{walked}{part} cannot be read", self.path):
                 names = found if isinstance(found, h5py.Group) else ()
                 if part not in names:
                     near = nearest_match(part, list(names)[: trial.MAX_OBJECTS]).rstrip("?")
@@ -277,7 +277,7 @@ def _is_written(dataset: h5py.Dataset) -> bool:
 
 
 def _attribute(found: h5py.Group | h5py.Dataset, name: str, place: str, path: Path) -> Scalar | None:
-    with _errors_told(f"The attribute {name} of {place} cannot be read", path):
+    with _errors_reported(f"The attribute {name} of {place} cannot be read", path):
         if name not in found.attrs:
             return None
         if not trial.is_single(found.attrs.get_id(name)):
@@ -299,7 +299,7 @@ def _shown(place: str) -> str:
 
 
 @contextmanager
-def _errors_told(what: str, path: Path) -> Iterator[None]:
+def _errors_reported(what: str, path: Path) -> Iterator[None]:
     """Turn what the HDF5 library raises into an error that begins with what it was."""
     try:
         yield

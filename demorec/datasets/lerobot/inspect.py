@@ -65,7 +65,7 @@ def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
 
 @contextmanager
 def _noted(problems: list[str], path: Path) -> Iterator[None]:
-    """Turn an ExportError into one more problem, told without the dataset's own path."""
+    """Turn an ExportError into one more problem, stated without the dataset's own path."""
     try:
         yield
     except ExportError as error:

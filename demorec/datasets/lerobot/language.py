@@ -94,9 +94,9 @@ def language_feature(name: str) -> dict[str, Any]:
 def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Array]:
     """Column -> array of so many rows."""
     counts = np.zeros(frames + 1, dtype=np.int32)
-    for row, told in language.events.items():
-        counts[row + 1] = len(told)
-    said = [entry for _, told in sorted(language.events.items()) for entry in told]
+    for row, entries in language.events.items():
+        counts[row + 1] = len(entries)
+    said = [entry for _, entries in sorted(language.events.items()) for entry in entries]
     state = _structs(language.persistent, _STATE)
     # In two steps, since each costs by the number of its parts; `take` costs three times as much.
     several = pa.concat_arrays([state] * _AT_ONCE)
@@ -125,8 +125,8 @@ def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArra
     """Column -> (T, 1) SHA-256 (hex) of what stands in each row; equal to `column_digests` of the column read back."""
     state = _digest(language.persistent)
     events = np.full((frames, 1), _digest([]))
-    for row, told in language.events.items():
-        events[row] = _digest(told)
+    for row, entries in language.events.items():
+        events[row] = _digest(entries)
     return {PERSISTENT: np.full((frames, 1), state), EVENTS: events}
 
 
@@ -158,11 +158,11 @@ def column_digests(column: pa.Array) -> NDArray[np.str_]:
 
 def _digest(rows: Sequence[Mapping[str, Any]]) -> str:
     """Of the entries that are there; an empty list of tool calls is as good as none, and JSON is what it says."""
-    told = [{name: value for name, value in row.items() if value is not None and value != []} for row in rows]
-    for row in told:
+    known = [{name: value for name, value in row.items() if value is not None and value != []} for row in rows]
+    for row in known:
         if "tool_calls" in row:
             row["tool_calls"] = [_parsed(call) for call in row["tool_calls"]]
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
 def _parsed(call: Any) -> Any:

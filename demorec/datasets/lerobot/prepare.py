@@ -41,8 +41,8 @@ def dataset_features(episode: ExportEpisode, options: ExportOptions) -> dict[str
     images = {camera.feature: _camera_feature(episode, camera, options) for camera in episode.cameras}
     action = {ACTION: vectors.pop(ACTION)} if ACTION in vectors else {}
     scalars = {name: DatasetFeature(dtype=SCALARS[name], shape=(1,)) for name in episode.scalars if options.takes(name)}
-    told = {} if options.language is None else dict.fromkeys(COLUMNS, LANGUAGE_FEATURE)
-    return {**vectors, **images, **action, **scalars, **AUTOMATIC_FEATURES, **told}
+    language = {} if options.language is None else dict.fromkeys(COLUMNS, LANGUAGE_FEATURE)
+    return {**vectors, **images, **action, **scalars, **AUTOMATIC_FEATURES, **language}
 
 
 def _camera_feature(episode: ExportEpisode, camera: ExportCamera, options: ExportOptions) -> DatasetFeature:
@@ -118,8 +118,8 @@ def _language(episode: ExportEpisode, options: ExportOptions, about: Collection[
             "Questions about images (vqa) need recordings with segmentation (generate --segmentation), leave them "
             f"out: {recording.path}"
         )
-    told = narrate(recording, episode.columns, episode.rows, options.spoken, cameras, about=about)
-    return episode_language(told, fps=episode.fps)
+    statements = narrate(recording, episode.columns, episode.rows, options.spoken, cameras, about=about)
+    return episode_language(statements, fps=episode.fps)
 
 
 def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:

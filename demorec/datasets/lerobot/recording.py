@@ -61,8 +61,8 @@ class DatasetRecording:
     @cached_property
     def info(self) -> EpisodeInfo:
         """What is known of it; its robot and cameras as the sidecar describes them."""
-        is_told = self.known.get("robot_digest") is not None or self.dataset.motors is not None
-        robot = self.robot if self.dataset.has_one_robot and is_told else None
+        is_stated = self.known.get("robot_digest") is not None or self.dataset.motors is not None
+        robot = self.robot if self.dataset.has_one_robot and is_stated else None
         links = set() if robot is None else {robot.model.root, *(joint.child for joint in robot.model.joints)}
         described = {camera["name"]: camera for camera in self.known.get("cameras") or () if camera is not None}
         cameras = [

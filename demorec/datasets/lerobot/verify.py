@@ -182,7 +182,7 @@ def _equal(tensor: Any, values: Any) -> bool:
 
 def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[str]:
     rows = {PERSISTENT: expected.persistent, EVENTS: expected.events.get(moment, ())}
-    return [name for name, told in rows.items() if name in item and item[name] != list(told)]
+    return [name for name, expected in rows.items() if name in item and item[name] != list(expected)]
 
 
 def _is_wrong_image(tensor: Any, episode: ExportEpisode, camera: ExportCamera, moment: int) -> bool:

@@ -39,7 +39,7 @@ def train(
         ConfigError: The limit is negative, the file of --config_path is missing, or the encoder is not taught.
         TrainingError: lerobot-train ended with an error.
         MissingDependencyError: LeRobot, or what it needs for training, is not installed.
-        SystemExit: lerobot-train refused its arguments (2), and said why, or told its help (0).
+        SystemExit: lerobot-train refused its arguments (2), and said why, or printed its help (0).
     """
     if frame_cache_bytes < 0:
         raise ConfigError(f"frame-cache-mb is {frame_cache_bytes / (1 << 20):g}, at least 0 is needed.")

@@ -27,7 +27,7 @@ CODED = ("h264", "video", "image/compressed", "depth", "segmentation")
 _SEAL = "crc32"
 """Follows from the other values of a metadata record."""
 _VERSIONS = "info.versions"
-"""Told by themselves, before all else."""
+"""Reported by themselves, before all else."""
 
 Messages = Mapping[str, Mapping[int, list[bytes]]]
 """Topic -> time in ns -> messages."""

@@ -133,7 +133,7 @@ def _colours(
             yield frame, f"cannot be decoded ({error})"
             return  # a decoder that has lost the thread
         if image is None:
-            return  # missing images are told as missing messages
+            return  # missing images are reported as missing messages
         words = _beyond_coding(image, own, true)
         if words:
             yield frame, words

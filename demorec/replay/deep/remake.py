@@ -80,13 +80,13 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     with EpisodeWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
-            told = recording.outcome
+            recorded = recording.outcome
             outcome = replace(
                 outcome,
-                failure_phase=told.failure_phase,
-                failure_reason=told.failure_reason,
-                num_retries=told.num_retries,
-                success=all(check.passed for check in outcome.checks) and not told.failure_reason,
+                failure_phase=recorded.failure_phase,
+                failure_reason=recorded.failure_reason,
+                num_retries=recorded.num_retries,
+                success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
             )
         writer.finish(outcome)
 
