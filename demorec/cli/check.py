@@ -54,18 +54,18 @@ class Check:
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
     mapping: Path | None = None
-    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
-    that leaves nothing to decide)."""
+    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
+    writes, if it leaves nothing to decide)."""
     images: bool = True
-    """Decode all images; without, a recording is checked at about 50 times real time."""
+    """Decode all images; without it, a recording is checked at about 50 times real time."""
     only: tuple[str, ...] = ()
     """Names of the checks to run; default: all."""
     urdf: Path | None = None
     """The robot's description, for recordings and datasets that lack one: its joints are the state's elements by
     their names, or by their order."""
     motor_units: MotorUnits | None = None
-    """Of datasets that LeRobot recorded of an SO-101 (shoulder_pan.pos to gripper.pos): the joints are in degrees, its
-    default, or from -100 to 100 of their ranges. It does not say so itself."""
+    """For datasets that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether the joints are in
+    degrees, LeRobot's default, or scaled to -100..100 of their ranges. The dataset itself does not say so."""
     calibration: Path | None = None
     """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
     says)."""

@@ -53,8 +53,9 @@ class Dataset:
 
     Commands: select and drop episodes (--where, --episodes); trim them (--head, --tail, --idle); split (--shares);
     merge datasets (--mapping); rename OLD=NEW...; drop-features NAME...; set-task; reorder (--by, --order); shuffle.
-    diff A B says in what two datasets differ, wherever their episodes lie (exit code 0: nothing, 1: something).
-    score gives every episode a number from 0 to 1 by what most of its task do, with reasons (--json, --out FILE).
+    diff A B names every difference between two datasets, whatever the order of their episodes (exit code 0: none, 1:
+    some).
+    score rates every episode from 0 to 1 against the others of its task, with reasons (--json, --out FILE).
 
     A condition compares columns of the table of episodes or of demorec's sidecar, and episode_index, num_frames,
     duration_s, task, score: success and num_frames < 300; "cube" in task; score > 0.8.
@@ -66,7 +67,7 @@ class Dataset:
       demorec dataset split cups --shares train=0.8 val=0.2 --by task --out parts
       demorec dataset merge monday tuesday --out both
       demorec dataset rename cups observation.image=observation.images.top --out new
-      demorec dataset set-task cups --task 'pick up the cup' --out told
+      demorec dataset set-task cups --task 'pick up the cup' --out relabelled
       demorec dataset reorder cups --by num_frames --out sorted
       demorec dataset diff cups sorted
       demorec dataset score cups --out scores.json
@@ -76,8 +77,8 @@ class Dataset:
     command: Annotated[Positional[str], arg(metavar="COMMAND")]
     """What to do."""
     words: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET")]
-    """The dataset, or the run whose dataset it is; of merge two or more, of diff two; behind it the features of rename
-    (OLD=NEW) and drop-features."""
+    """The dataset, or a run that has one; two or more for merge, two for diff; then the features for rename (OLD=NEW)
+    and drop-features."""
     out: Path | None = None
     """Folder of the new dataset; of split the folder in which each part gets one; of score a JSON file."""
     where: str = ""
@@ -91,7 +92,7 @@ class Dataset:
     idle: bool = False
     """Cut off what is before the first and after the last motion (trim)."""
     idle_feature: str = "observation.state"
-    """In which motion shows (trim)."""
+    """Feature whose changes count as motion (trim)."""
     idle_threshold: float = 0.01
     """Motion is a change by more than this share of the feature's range (trim)."""
     idle_margin: int = 3
@@ -99,21 +100,21 @@ class Dataset:
     shares: tuple[str, ...] = ()
     """Names and shares of the parts, train=0.8 val=0.2 (split)."""
     by: str = ""
-    """Column to sort by (reorder), or whose values are shared out alike (split)."""
+    """Column to sort by (reorder), or to stratify by (split)."""
     descending: bool = False
     """Largest first (reorder)."""
     order: str = ""
     """Numbers of all episodes in their new order, 2,0,1 (reorder)."""
     seed: int = 0
-    """Of the order or the parts (shuffle, split)."""
+    """Seed of the order or the parts (shuffle, split)."""
     task: str = ""
     """The new instruction (set-task)."""
     mapping: Path | None = None
-    """What becomes what where datasets differ (merge)."""
+    """Mapping file (TOML) for datasets that differ (merge)."""
     decode: bool = False
     """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""
     scores: Path | None = None
-    """What score --out kept, for conditions and orders by score; else the dataset is scored."""
+    """File of score --out, for conditions and orders by score (auto: the dataset is scored)."""
     images: bool = True
     """Look at some images of each episode (score)."""
     workers: int | None = None

@@ -41,8 +41,8 @@ class Export:
     out: Path
     """Folder (LeRobot) or file (HDF5) to create."""
     mapping: Path | None = None
-    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
-    that leaves nothing to decide)."""
+    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
+    writes, if it leaves nothing to decide)."""
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
     """How to export."""
 

@@ -27,11 +27,11 @@ class Import:
 
     A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
     holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
-    episode, as the mapping says. Encoded images pass through. The same command again goes on. A folder without
+    episode, as the mapping says. Encoded images pass through. Run the same command again to continue. A folder without
     metadata.yaml stands for the bags in it.
 
     A LeRobot dataset (v3.0, v2.1 or v2.0, whoever wrote it) needs no mapping: its features keep their names, its
-    numbers every bit, and its video packets pass through where each episode begins with a keyframe.
+    numbers stay bit-exact, and its video packets pass through where each episode begins with a keyframe.
 
     HDF5 files in robomimic's or ALOHA's layout take a mapping as well: which datasets become which features. Their
     numbers keep every bit, JPEG files pass through.
@@ -49,9 +49,9 @@ class Import:
     """Bags; each is an episode, or several, as the mapping says. Or the word lerobot and a dataset, or the word hdf5
     and HDF5 files."""
     mapping: Path | None = None
-    """What of the bags or HDF5 files becomes what; their import needs it."""
+    """Mapping file (TOML): which topics or datasets become which features; required for bags and HDF5 files."""
     out: Path | None = None
-    """The run to make or to continue; an import needs it."""
+    """Folder of the run, new or to be continued; required unless --suggest is given."""
     skip_bad: bool = False
     """Leave out bags that cannot be read, or do not fit the mapping or the other bags, list them at the end and exit
     with 1. Else the first of them ends the import, before anything of it is written."""
@@ -60,8 +60,9 @@ class Import:
     suggest: bool = False
     """Write a mapping for the first bag or HDF5 file to standard output instead of importing."""
     motor_units: MotorUnits | None = None
-    """Of a dataset that LeRobot recorded of an SO-101 (shoulder_pan.pos to gripper.pos): the joints are in degrees, its
-    default, or from -100 to 100 of their ranges. Its recordings then have the arm's URDF and joints."""
+    """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
+    degrees, LeRobot's default, or scaled to -100..100 of their ranges. Its recordings then have the arm's URDF and
+    joints."""
     calibration: Path | None = None
     """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
     says)."""

@@ -28,7 +28,7 @@ _SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 @dataclass(frozen=True, kw_only=True)
 class Info:
-    """Say what recordings, runs, datasets, HDF5 files and bags hold.
+    """Show what recordings, runs, datasets, HDF5 files and bags hold.
 
     Examples:
       demorec info recordings/cubes
@@ -39,8 +39,8 @@ class Info:
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
     mapping: Path | None = None
-    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
-    that leaves nothing to decide)."""
+    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
+    writes, if it leaves nothing to decide)."""
     json: bool = False
     """Print JSON: one object, or a list for several paths."""
 

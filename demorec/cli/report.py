@@ -37,8 +37,8 @@ class Report:
     against: Path | None = None
     """A LeRobot dataset that the dataset is compared with, as by demorec dataset diff."""
     mapping: Path | None = None
-    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
-    that leaves nothing to decide)."""
+    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
+    writes, if it leaves nothing to decide)."""
     out: Path
     """The page (.html)."""
     camera: str = ""
@@ -50,7 +50,7 @@ class Report:
     workers: int = 1
     """Processes that read and check recordings."""
     allow: Allow = ()
-    """A module or package of your own beside which the models of robots and objects may be read."""
+    """A module or package of your own; models of robots and objects beside it may be read."""
     overwrite: bool = False
     """Replace an existing report."""
 

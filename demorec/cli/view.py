@@ -45,8 +45,8 @@ class View:
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, LeRobot datasets, HDF5 files, bags, folders of recordings or of bags, or .rrd files."""
     mapping: Path | None = None
-    """What of bags and HDF5 files becomes what, as of demorec import (auto: what demorec import --suggest writes, where
-    that leaves nothing to decide)."""
+    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
+    writes, if it leaves nothing to decide)."""
     compare: bool = False
     """Overlay two episodes: the same streams in the same views, and the distance between them."""
     episodes: str = ""
@@ -68,7 +68,7 @@ class View:
     port: int | None = None
     """Port of the web viewer (auto: a free one)."""
     allow: Allow = ()
-    """A module or package of your own beside which the models of robots and objects may be read."""
+    """A module or package of your own; models of robots and objects beside it may be read."""
     overwrite: bool = False
     """Replace an existing file of --save or --screenshot."""
 

@@ -94,7 +94,7 @@ class GenerateConfig:
     variation: Preset = "mild"
     """How much episodes vary besides their layout: none; mild (action noise with clean labels); full (everything)."""
     ranges: Ranges = field(default_factory=Ranges)
-    """Single ranges that override those of --variation (auto: as --variation has them)."""
+    """Single ranges that override those of --variation (auto: those of --variation)."""
     objects: tuple[str, ...] = ()
     """Shelves that things are drawn from: names from `demorec list objects`, my_package.my_module:MY_SHELF, or a folder
     of .obj and .stl files in metres, with a slash: ./my_meshes (auto: those of the task, if it draws from shelves)."""

@@ -22,8 +22,8 @@ class CommonOptions:
     episodes: str = ""
     """Which episodes of each run, by their number: 0:100, ::2, 3,5,8:10; all by default."""
     corrected_only: bool = False
-    """Of episodes that a policy began, export those alone that the expert corrected (demorec correct); demonstrations
-    are exported all."""
+    """Of the episodes that a policy began, export only those that the expert corrected (demorec correct);
+    demonstrations are all exported."""
     include_failures: bool = False
     """Export failed episodes too; the dataset says of each whether it succeeded."""
     action: ActionKind = "joint"
@@ -32,9 +32,9 @@ class CommonOptions:
     privileged: bool = False
     """Add observation.environment_state: poses and sizes that no sensor of a real robot gives."""
     features: tuple[str, ...] = ()
-    """Names of the features to have, the others are left out; all by default. observation.state, action and what the
-    format itself needs (times, indices) stay whatever is named. Fewer features make training faster. Only when named,
-    of simulated episodes: command, and what is sensed, as observation.effort (docs/dataset-format.md lists it)."""
+    """Features to export, all by default; observation.state, action and what the format itself needs (times, indices)
+    are always there. Fewer features make training faster. Simulated episodes have more that must be named: command, and
+    sensed values such as observation.effort (docs/dataset-format.md)."""
     depth: bool = False
     """Add depth images of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
     fps: int | None = None
@@ -43,7 +43,7 @@ class CommonOptions:
     """Of external episodes: seconds for which a frame without an image of a camera shows the camera's last one, as a
     policy would see it; 0: such a frame is an error."""
     overwrite: bool = False
-    """Replace the dataset that is there already; anything else than a dataset, or with anything else in it, is not."""
+    """Replace an existing dataset; what is no dataset, or holds anything else, is never replaced."""
 
     def takes(self, feature: str) -> bool:
         """Whether the dataset shall have a feature, if the recordings give it."""

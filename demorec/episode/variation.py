@@ -61,7 +61,7 @@ class Ranges:
     table_height: Range | None = _within(-0.08, 0.0, none=(0.0, 0.0), full=(-0.03, 0.0))
     """Table top relative to the robot's base, m."""
     distractors: tuple[int, int] | None = _within(0, 6, none=(0, 0), full=(0, 3))
-    """How many small bodies of no concern lie about."""
+    """How many distractor objects lie on the table."""
 
     speed: Range | None = _within(0.2, 2.0, none=(1.0, 1.0), full=(0.6, 1.5))
     """Factor on the expert's speeds."""
@@ -76,7 +76,7 @@ class Ranges:
     action_noise: Range | None = _within(0.0, 0.06, none=(0.0, 0.0), mild=(0.02, 0.02), full=(0.01, 0.025))
     """Standard deviation of the noise on executed joint targets, rad; labels stay clean."""
     miss_probability: float | None = _within(0.0, 1.0, none=0.0, full=0.1)
-    """Of a deliberate first miss with recovery."""
+    """Probability that the expert deliberately misses first, and recovers."""
     miss_distance: Range | None = _within(0.02, 0.08, none=(0.03, 0.05))
     """How far a deliberate miss is off, m; farther where the fingers would touch the object."""
     # No perception error even in "full": the label would point where nothing is seen.
@@ -99,7 +99,7 @@ class Ranges:
     light_turn: Range | None = _within(-7.0, 7.0, none=(0.0, 0.0), full=(-3.1416, 3.1416))
     """Turn of the light about the vertical, rad."""
     light_elevation: Range | None = _within(0.2, 1.57, none=(1.0, 1.0), full=(0.7, 1.4))
-    """Of the light above the horizon, rad."""
+    """Elevation of the light above the horizon, rad."""
     light_ambient: Range | None = _within(0.0, 1.0, none=(0.5, 0.5), full=(0.35, 0.6))
     """Ambient coefficient."""
     light_diffuse: Range | None = _within(0.0, 1.0, none=(0.55, 0.55), full=(0.4, 0.7))
@@ -115,7 +115,7 @@ class Ranges:
     surface_color: float | None = _within(0.0, 1.0, none=0.0, full=1.0)
     """How far table and floor may be from their own colour, 0..1."""
     texture_probability: float | None = _within(0.0, 1.0, none=0.0, full=0.6)
-    """That table or floor has a procedural texture."""
+    """Probability that table or floor has a procedural texture."""
 
     def range(self, name: str) -> Range:
         """The (low, high) of a resolved field."""

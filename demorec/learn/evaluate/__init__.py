@@ -12,18 +12,18 @@ class TakeOver:
     """When the expert takes over: at the first of these moments, and at the time limit always."""
 
     stuck_seconds: float = 2.0
-    """The hand has kept still for so long; 0 for never."""
+    """Take over once the hand has kept still this long; 0: never."""
     after_seconds: float = 0.0
-    """The policy has acted for so long without success; 0 for the time limit alone."""
+    """Take over once the policy has acted this long without success; 0: only at the time limit."""
     random_share: float = 0.0
     """Share of the episodes in which the expert takes over at a random moment, whatever the policy does."""
     stray_metres: float = 0.05
-    """The TCP that the policy commands is so far from the expert's path in the same scene, or an object from where
-    the expert would have it; 0 for never."""
+    """Take over once the TCP that the policy commands is this far from the expert's path in the same scene, or an
+    object this far from where the expert would have it; 0: never."""
     stray_radians: float = 0.5
-    """The same of the hand's direction; 0 for never."""
+    """The same for the hand's direction; 0: never."""
     stray_seconds: float = 0.2
-    """How long the TCP must be so far off without a break."""
+    """How long the TCP must be that far off without a break."""
     noise: bool = True
     """Let the expert send its commands with the exploration noise of demonstrations, beside clean labels."""
     hand_back: bool = False
