@@ -385,25 +385,6 @@ def test_cut_episodes_are_recognised(
     assert len(found["differences"]) == len(lines) == len(LENGTHS)  # the images of these frames are equal
 
 
-@pytest.mark.parametrize("kind", ["video", "images"])
-def test_round_trips_leave_no_difference(
-    kind: str, bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Statistics, too, between datasets of one writer: LeRobot estimates quantiles."""
-    copy = tmp_path / "copy"
-    assert run("reorder", bases[kind], "--order", "0,1,2,3", "--out", copy) == 0
-    assert {one[0] for one in named(compared(bases[kind], copy, capsys))} <= {"statistics"}
-    assert run("split", copy, "--shares", "a=0.5", "b=0.5", "--seed", 1, "--out", tmp_path / "parts") == 0
-    assert run("merge", tmp_path / "parts/b", tmp_path / "parts/a", "--out", tmp_path / "merged") == 0
-    assert run("shuffle", copy, "--seed", 4, "--out", tmp_path / "shuffled") == 0
-    assert run("rename", copy, "action=a", "--out", tmp_path / "n") == 0
-    assert run("rename", tmp_path / "n", "a=action", "--out", tmp_path / "named") == 0
-    for name in ("merged", "shuffled", "named"):
-        found = compared(copy, tmp_path / name, capsys)
-        assert found["differences"] == [], name
-        assert found["reordered"] == (name != "named")
-
-
 def test_our_own_datasets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     export(make_run(tmp_path / "run", (20, 15, 17)), tmp_path / "d")
     export(make_run(tmp_path / "again", (20, 15, 17)), tmp_path / "e")

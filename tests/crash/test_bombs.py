@@ -22,7 +22,7 @@ from support.recording import write_episode
 
 from demorec.core.errors import ConfigError, ExportError, RecordingError
 from demorec.datasets.lerobot.files import check_video
-from demorec.mcap import Recording, recover
+from demorec.mcap import Recording
 from demorec.robots.urdf import check_primitives
 
 
@@ -178,18 +178,6 @@ def test_frames_that_only_the_index_has(good: Path, tmp_path: Path) -> None:
     path.write_bytes(rewritten(good, counts=lambda topic, count: 2**60))
     with pytest.raises(RecordingError, match="records, too many for a file of its size"):
         Recording(path)
-
-
-def test_a_fifo_is_no_recording(commands: Commands, tmp_path: Path) -> None:
-    path = tmp_path / "episode.mcap"
-    os.mkfifo(path)
-    with pytest.raises(RecordingError, match="it is a FIFO"):
-        Recording(path)
-    with pytest.raises(RecordingError, match="it is a FIFO"):
-        recover(path, tmp_path / "kept.mcap")
-    for name in ("info", "check"):
-        commands.refused(name, tmp_path)
-        commands.refused(name, path)
 
 
 def test_files_without_checksums_are_read(good: Path, tmp_path: Path) -> None:
