@@ -75,13 +75,6 @@ def test_mcap_files(notes: bags.Notes, is_ros1: bool, compression: str, is_bare:
     _assert_same(notes, found)
 
 
-def test_protobuf(tmp_path: Path) -> None:
-    notes = bags.in_order(bags.trossen(1.0))
-    found, problems = _read(open_bag(bags.write_trossen(notes, tmp_path / "bag.mcap")))
-    assert not problems
-    _assert_same(notes, found)
-
-
 def test_protobuf_of_another_writer(tmp_path: Path) -> None:
     from google.protobuf.timestamp_pb2 import Timestamp
     from mcap_protobuf.writer import Writer as ProtobufWriter

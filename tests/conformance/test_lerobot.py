@@ -90,16 +90,6 @@ def test_lerobot_reads_every_frame_as_it_was_recorded(run: Path, dataset: Path, 
             row += 1
 
 
-def test_some_episodes_only(run: Path, dataset: Path) -> None:
-    found = open_dataset(dataset, episodes=[4, 1])
-    assert found.num_frames == 31 + 15
-    # LeRobot keeps the order of the files.
-    for row, (episode, t) in ((0, (1, 0)), (14, (1, 14)), (15, (4, 0)), (45, (4, 30))):
-        item = found[row]
-        assert (int(item["episode_index"]), int(item["frame_index"])) == (episode, t)
-        assert np.array_equal(image(item, "wrist"), recorded_images(run, episode)["wrist"][t])
-
-
 def test_windows_in_time_stop_at_the_ends_of_an_episode(run: Path, dataset: Path) -> None:
     steps = [-0.1, 0.0, 1 / 30, 0.2]
     found = open_dataset(dataset, delta_timestamps={"action": steps, "observation.images.front": steps})
@@ -115,15 +105,6 @@ def test_windows_in_time_stop_at_the_ends_of_an_episode(run: Path, dataset: Path
             assert np.array_equal(item["action"][k].numpy(), found.hf_dataset[held]["action"].numpy())
             image = item["observation.images.front"][k].numpy().transpose(1, 2, 0)
             assert np.array_equal(image, images[held - first])
-
-
-@pytest.mark.slow
-def test_a_loader_with_worker_processes_sees_every_frame_once(dataset: Path) -> None:
-    import torch
-
-    loader = torch.utils.data.DataLoader(open_dataset(dataset), batch_size=16, shuffle=True, num_workers=2)
-    seen = [index for batch in loader for index in batch["index"].tolist()]
-    assert sorted(seen) == list(range(sum(LENGTHS)))
 
 
 def test_statistics_equal_those_of_the_decoded_data(dataset: Path) -> None:

@@ -27,7 +27,7 @@ from demorec.mcap import Recording, recover
 from demorec.mcap.metadata import EPISODE, OUTCOME
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.replay.deep import DeepReport, deep_check, deep_checks
-from demorec.replay.deep.contents import CODED, Contents, content_differences
+from demorec.replay.deep.contents import Contents, content_differences
 from demorec.replay.rerender import RerenderOptions, rerender
 from demorec.runs.run_file import load_run_file
 
@@ -312,26 +312,6 @@ def test_a_few_images_among_many(filmed: Path, tmp_path: Path, simulators: Simul
     (of_depth,) = (d for d in report.differences if d.stream == "/camera/front/depth")
     assert "1 of 9216 pixels" in of_depth.recorded
     assert all(d.is_coding or d.field == "image" or d.stream.endswith("/histogram") for d in report.differences)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stream", [stream for stream in CODED if "image" not in stream])
-def test_a_coded_image_of_another_frame(stream: str, filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
-    """The stamp is right, the bytes are whole, the image is that of five frames before."""
-    topic, images = f"/camera/front/{stream}", []
-
-    def spoil(name: str, data: bytes) -> bytes:
-        if name != topic:
-            return data
-        images.append(data)
-        return data[:12] + images[10][12:] if len(images) == 25 else data
-
-    spoilt = tmp_path / "spoilt.mcap"
-    spoilt.write_bytes(rewritten(filmed, messages=spoil))
-    report = deep_check(spoilt, simulators)
-    assert report.level == "fail"
-    (difference,) = (d for d in report.differences if d.field == "image")
-    assert (difference.stream, difference.frames[0]) == (topic, 24)
 
 
 # ---------------------------------------------------------------------------------------------------- the command

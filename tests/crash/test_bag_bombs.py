@@ -280,6 +280,13 @@ def _joints(folder: Path, moments: Sequence[int] | None = None, names: Sequence[
 _NO_CAMERA = MAPPING[: MAPPING.index("[cameras")]
 MAPPINGS: dict[str, tuple[str, str]] = {
     "a key of 200,000 parts": ("[" + "a." * 200_000 + "a]\n", "a key has more than 16 parts"),
+    "a key of 200,000 quoted parts": ("[" + ".".join(['"#"'] * 200_000) + "]\n", "a key has more than 16 parts"),
+    "a key of 200,000 parts in a table": (
+        "x = {" + ".".join(["a"] * 200_000) + " = 1}\n", "a key has more than 16 parts"
+    ),
+    "a key of 500,000 characters": ("x" * 500_000 + " = 1\n", "a text has 500,000 characters"),
+    "50,000 values": ("".join(f"k{n} = 1\n" for n in range(50_000)), "values, at most 50,000"),
+    "lists in lists": ("x = " + "[" * 100_000 + "]" * 100_000 + "\n", "nested too deeply"),
     "12,000 features": (
         _NO_CAMERA + "".join(f'[[features.f{k}]]\ntopic = "/joints"\n' for k in range(12_000)), "at most 1,000 are read"
     ),

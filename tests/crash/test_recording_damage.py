@@ -277,13 +277,6 @@ def test_a_foreign_mcap_file(tmp_path: Path) -> None:
         Recording(path)
 
 
-def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="it is a folder, not a regular file"):
-        Recording(tmp_path)
-    with pytest.raises(RecordingError, match="No such file"):
-        Recording(tmp_path / "nothing.mcap")
-
-
 def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
     from dataclasses import replace
 
