@@ -12,16 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from av.video.stream import VideoStream
 from PIL import Image
 from support.commands import exit_code
 from support.datasets import TOP, items, write_with_lerobot
-from support.export import data_table, export, files_of, make_run
+from support.export import data_table, export, files_of, make_run, recode
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
@@ -99,27 +97,13 @@ def both(*changes: Callable[[Path], None]) -> Callable[[Path], None]:
     return edited
 
 
-def recode(root: Path, change: Callable[[list[Any]], object]) -> None:
-    """The video anew, each image by itself and without loss."""
-    with av.open(str(root / VIDEO)) as container:
-        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    change(images)
-    with av.open(str(root / VIDEO), "w") as out:
-        stream = out.add_stream("libx264rgb", rate=10, options={"qp": "0", "g": "1", "bf": "0"})
-        assert isinstance(stream, VideoStream)
-        stream.height, stream.width, stream.pix_fmt = 64, 96, "rgb24"
-        for image in images:
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        out.mux(stream.encode(None))
-
-
 def paint(episode: int, frame: int, change: Callable[[Any], Any]) -> Callable[[Path], None]:
     """Another image in a video."""
 
     def changed(images: list[Any]) -> None:
         images[row(episode, frame)] = change(images[row(episode, frame)].copy())
 
-    return lambda root: recode(root, changed)
+    return lambda root: recode(root / VIDEO, changed)
 
 
 def paint_row(episode: int, frame: int, change: Callable[[Any], Any]) -> Callable[[Path], None]:
@@ -190,7 +174,7 @@ def rewrite(root: Path) -> None:
     for path in (INFO, STATS):
         edit_json(path, lambda data: None)(root)
     if (root / VIDEO).exists():
-        recode(root, lambda images: None)
+        recode(root / VIDEO)
 
 
 def state(name: str) -> Callable[[dict[str, Any]], Any]:
