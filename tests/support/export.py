@@ -142,7 +142,8 @@ def recode(video: Path, change: Callable[[list[Any]], object] = lambda images: N
     with av.open(str(video), "w") as out:
         stream = out.add_stream("libx264rgb", rate=rate, options={"qp": "0", "g": "1", "bf": "0"})
         assert isinstance(stream, VideoStream)
-        stream.height, stream.width, stream.pix_fmt = *images[0].shape[:2], "rgb24"
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "rgb24"
         for image in images:
             out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         out.mux(stream.encode(None))
