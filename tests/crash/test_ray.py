@@ -190,7 +190,7 @@ def test_the_real_job_is_the_same_in_every_way(tmp_path: Path, cluster: object) 
 
 def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path: Path) -> None:
     """A node ends with its agent (of the dashboard), which is among the first that a lack of memory takes."""
-    number = 16
+    number = 40
     one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=number, workers=2))
     out, entry = tmp_path / "ray", "from demorec.cli import generate_dataset_main as main; main()"
     arguments = ["--out", str(out), "--num-episodes", str(number), "--seed", "5", "--no-export", "--no-check"]
