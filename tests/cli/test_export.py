@@ -70,16 +70,6 @@ def test_a_mistake_is_told_in_one_sentence(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_dataset_in_the_way(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "d").mkdir()
-    (tmp_path / "d" / "thesis.txt").write_text("years of work")
-    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify") == 2
-    assert "--overwrite" not in capsys.readouterr().err  # it would not help
-    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--overwrite") == 2
-    assert "it is not a LeRobot dataset" in capsys.readouterr().err
-    assert (tmp_path / "d" / "thesis.txt").read_text() == "years of work"
-
-
 def test_uploading_without_a_token_keeps_the_dataset(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

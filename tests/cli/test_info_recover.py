@@ -153,68 +153,6 @@ def test_info_says_what_a_dataset_lacks(
     assert len(json.loads(capsys.readouterr().out)["problems"]) == 1
 
 
-@pytest.mark.parametrize(
-    ("version", "words"),
-    [
-        ("v1.6", "The dataset has format v1.6, those that are read are v2.0, v2.1 and v3.0"),
-        ("v2.1", "meta/episodes.jsonl"),  # which one of v3.0 does not have
-    ],
-)
-def test_info_of_a_dataset_of_another_format_says_so(
-    version: str, words: str, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(dataset, tmp_path / "d")
-    info = tmp_path / "d" / "meta" / "info.json"
-    info.write_text(info.read_text().replace("v3.0", version))
-    assert run("info", tmp_path / "d") == 0
-    (problem,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("problem ")]
-    assert words in problem
-
-
-@pytest.mark.parametrize(
-    ("make", "code", "message"),
-    [
-        (lambda folder: folder / "nothing", 2, "There is no such file or folder"),
-        (
-            lambda folder: folder,
-            2,
-            "The folder holds no recording (*.mcap), run (run.json) or dataset (meta/info.json)",
-        ),
-        (lambda folder: folder / "text.mcap", 1, "no MCAP file"),
-        (lambda folder: folder / "x.mcap.part", 2, "found an unfinished recording (.part); demorec recover"),
-    ],
-)
-def test_info_of_something_else(
-    tmp_path: Path, make: Callable[[Path], Path], code: int, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = make(tmp_path)
-    if path.suffix:
-        path.write_text("just words, more than eight")
-    assert run("info", path) == code
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("command", "inside"),
-    [
-        *(("info", inside) for inside in ("", "a.mcap.part", "run/episodes/a.mcap")),
-        *(("view", inside) for inside in ("", "a.mcap.part", "run/episodes/a.mcap", "failed/a.mcap")),
-    ],
-)
-def test_an_unfit_folder_is_told_in_one_sentence(
-    tmp_path: Path, command: str, inside: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if inside:
-        (tmp_path / inside).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / inside).touch()
-    assert run(command, tmp_path) == 2
-    said = capsys.readouterr().err
-    assert said.endswith(f": {tmp_path}\n")
-    assert ". " not in said.removesuffix(f"{tmp_path}\n")
-
-
 def test_an_empty_path_is_not_the_current_folder(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["info", ""])

@@ -101,24 +101,6 @@ def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path, capsys: pytest.
     assert "allowed are 0 to 1.467 s" in capsys.readouterr().err
 
 
-def test_damage_is_one_sentence_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_episode(tmp_path / "e.mcap", num_frames=5)
-    path.write_bytes(path.read_bytes()[:-2000])
-    assert view(path, "--save", tmp_path / "x.rrd") == 1
-    assert len(capsys.readouterr().err.strip().splitlines()) == 1
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["e.mcap"]
-
-
-def test_saving_never_replaces_a_file_unasked(run_folder: Path, tmp_path: Path) -> None:
-    target = tmp_path / "x.rrd"
-    assert view(run_folder, "--episodes", "0", "--save", target) == 0
-    before = target.stat().st_mtime_ns
-    assert view(run_folder, "--episodes", "1", "--save", target) == 2
-    assert target.stat().st_mtime_ns == before
-    assert view(run_folder, "--episodes", "1", "--save", target, "--overwrite") == 0
-    assert target.stat().st_mtime_ns > before
-
-
 @pytest.mark.viewer
 def test_episodes_are_listed_in_the_order_given(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()

@@ -12,7 +12,7 @@ import pytest
 from support.check import checked
 from support.commands import exit_code
 from support.datasets import TOP, items, same, write_with_lerobot
-from support.export import data_table, export, info, make_run
+from support.export import data_table
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 KINDS: dict[str, dict[str, Any]] = {
@@ -126,19 +126,6 @@ def test_all_differences_are_named_and_a_mapping_solves_them(
     state, was = found[7][6]["observation.state"], before[2][6]["observation.state"]
     assert state == pytest.approx([np.deg2rad(was[2]), 7, np.deg2rad(was[0])])
     assert np.array_equal(found[7][6]["action"], before[2][6]["action"])
-
-
-@pytest.mark.slow  # test_dataset_edits_beside.py has the quick ones
-def test_our_own_datasets_keep_what_stands_beside(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", (20, 15, 17))
-    export(run, tmp_path / "d")
-    assert edit("drop", tmp_path / "d", "--episodes", 1, "--out", tmp_path / "dropped") == 0
-    assert edit("trim", tmp_path / "d", "--head", 3, "--out", tmp_path / "trimmed") == 0
-    for name, lengths in {"dropped": [20, 17], "trimmed": [17, 12, 14]}.items():
-        assert [len(episode) for episode in items(tmp_path / name)] == lengths
-        results = {result.check: result.level for result in checked(tmp_path / name, "dataset").results}
-        assert results["dataset_sidecar"] == results["dataset_counts"] == results["dataset_videos"] == "pass"
-    assert info(tmp_path / "dropped")["features"] == info(tmp_path / "d")["features"]
 
 
 @pytest.mark.parametrize(

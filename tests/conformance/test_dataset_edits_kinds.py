@@ -78,7 +78,7 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return root, items(root)
 
 
-@pytest.mark.parametrize(("head", "tail"), [(3, 2), (0, 1), (5, 4), (1, 0)])
+@pytest.mark.parametrize(("head", "tail"), [(3, 2), (1, 0)])
 def test_trimmed(made: tuple[Path, Any], tmp_path: Path, head: int, tail: int) -> None:
     root, before = made
     edit("trim", root, "--head", head, "--tail", tail, "--out", tmp_path / "t")
@@ -98,9 +98,10 @@ def test_in_another_order_and_in_parts(made: tuple[Path, Any], tmp_path: Path) -
     assert all(same(found[len(was)], was) for was in before if len(was) != 14)
 
 
-def test_statistics_of_arrays_are_those_of_their_last_dimension(tmp_path: Path) -> None:
+@pytest.mark.parametrize("made", ["all types"], indirect=True)
+def test_statistics_of_arrays_are_those_of_their_last_dimension(made: tuple[Path, Any], tmp_path: Path) -> None:
     """As LeRobot has them, whose own dataset is the model; with depth, whose mean is that of what LeRobot decodes."""
-    root = of_all_types(tmp_path / "d")
+    root, _ = made
     edit("trim", root, "--head", 1, "--out", tmp_path / "t")
     shapes = [
         {name: [np.shape(value) for value in entry.values()] for name, entry in statistics(path).items()}

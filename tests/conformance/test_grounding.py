@@ -13,12 +13,10 @@ from support.check import simulate_run
 from support.export import export, make_run
 from support.language import NOUNS, language_of, meant, phrases
 
-from demorec.annotate.grounding import run_lengths
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import rotation_from_quat
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot import ExportOptions, dataset_digest
-from demorec.datasets.lerobot.boxes import coco_string
 from demorec.datasets.lerobot.prepare import prepare_episode
 from demorec.mcap import Recording
 
@@ -189,27 +187,9 @@ def test_traces_are_where_the_tcp_will_be(dataset: Path, truth: Truth) -> None:
         assert np.abs(np.array(answer["points"]) + 0.5 - np.array(expected[:length])).max() <= 0.5
 
 
-def decoded(text: str, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask of COCO's compressed run lengths, by the description of the format."""
-    counts: list[int] = []
-    position = 0
-    while position < len(text):
-        value = shift = 0
-        while True:
-            bits = ord(text[position]) - 48
-            position += 1
-            value |= (bits & 0x1F) << shift
-            shift += 5
-            if not bits & 0x20:
-                break
-        if bits & 0x10:
-            value -= 1 << shift
-        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
-    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
-    return flat.reshape(size[::-1]).T
-
-
+@pytest.mark.filterwarnings("ignore:__array__ implementation")
 def test_a_thousand_boxes_are_those_of_the_segmentation(dataset: Path, truth: Truth) -> None:
+    masks = pytest.importorskip("pycocotools.mask")
     count = 0
     for camera in ("front", "wrist"):
         told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}{camera}.json").read_text())
@@ -229,7 +209,8 @@ def test_a_thousand_boxes_are_those_of_the_segmentation(dataset: Path, truth: Tr
                 x, y = columns.min(), rows.min()
                 assert item["bbox"] == [x, y, columns.max() + 1 - x, rows.max() + 1 - y]
                 assert item["area"] == mask.sum()
-                assert np.array_equal(decoded(item["segmentation"]["counts"], (128, 128)), mask)
+                stored = {"size": [128, 128], "counts": item["segmentation"]["counts"]}
+                assert np.array_equal(masks.decode(stored), mask)
                 assert NOUNS[nouns[item["category_id"]]](body)
                 assert item["color"] == body.color_name
                 count += 1
@@ -246,15 +227,6 @@ def test_pycocotools_reads_them(dataset: Path) -> None:
         for item in found.dataset["annotations"]:
             assert found.annToMask(item).sum() == item["area"]
             assert masks.toBbox(found.annToRLE(item)).tolist() == item["bbox"]
-
-
-def test_run_lengths_go_column_by_column() -> None:
-    mask = np.array([[1, 0, 0], [1, 1, 0]], dtype=np.bool_)
-    assert run_lengths(np.flatnonzero(mask.T), mask.size) == (0, 2, 1, 1, 2)
-    rng = np.random.default_rng(0)
-    for share in (0.0, 0.001, 0.5, 1.0):
-        mask = rng.random((70, 90)) < share
-        assert np.array_equal(decoded(coco_string(run_lengths(np.flatnonzero(mask.T), mask.size)), (70, 90)), mask)
 
 
 def test_without_segmentation_there_are_traces_and_no_questions(tmp_path: Path) -> None:

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from support import bag_mappings, bags
 from support.commands import exit_code
-from support.export import export
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.mcap import Recording
 from demorec.mcap.lossless import encode_millimetres
-from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.sources import find_episodes
 
 COLOR = "/camera/wrist/color/image_raw"
@@ -176,28 +174,6 @@ def test_the_commands_take_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         assert list(episode.depth) == ["wrist_depth"]
     assert exit_code("export", "lerobot", run, "--out", tmp_path / "plain", "--no-verify") == 0
     assert "left out unless --depth asks for them: camera wrist_depth" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("kind", ["16UC1", "32FC1"])
-def test_exports_have_it_where_it_is_asked_for(kind: str, tmp_path: Path) -> None:
-    import h5py
-
-    run, moments = imported(kind, tmp_path)
-    export(run, tmp_path / "d.hdf5", "hdf5", depth=True)
-    with Recording(recording_of(run)) as recording, h5py.File(tmp_path / "d.hdf5") as file:
-        numbers = recording.columns().images["wrist_depth"]
-        stamps = held(recording, moments)
-        stored = file["data/demo_0/obs/wrist_depth"][..., 0]
-    for number, image in zip(numbers.tolist(), stored, strict=True):
-        expected = metres(stamps[number]) if kind == "32FC1" else millimetres(stamps[number]) / np.float32(1000)
-        np.testing.assert_array_equal(image, expected)
-    report = export(run, tmp_path / "dataset", depth=True)
-    assert report.depth_left_out == ()
-    with open_dataset_episode(tmp_path / "dataset", 0) as episode:
-        assert episode.info.simulation is None
-        times, shown = zip(*episode.depth["wrist_depth"](), strict=True)
-    assert list(times) == episode.time_ns.tolist()
-    np.testing.assert_allclose(shown, np.nan_to_num(stored, posinf=0).clip(max=10), atol=2e-3)
 
 
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {

@@ -150,34 +150,6 @@ def test_images_that_no_row_has_are_told(tmp_path: Path, capsys: pytest.CaptureF
     assert "/front/image_raw/compressed: 1.67 % of its images are in no row: rows follow camera side" in told
 
 
-OFF_NS = np.random.default_rng(3).integers(-12_000_000, 12_000_000, 90).tolist()
-FAULTS: dict[str, tuple[str, str, Callable[[int, bags.Note], bags.Note | None]]] = {
-    "images dropped": ("drops", FRONT, lambda k, note: None if k % 9 == 5 else note),
-    "a few images dropped": ("drops", FRONT, lambda k, note: None if k in (20, 50) else note),
-    "joints dropped": ("drops", STATE, lambda k, note: None if k % 9 == 5 else note),
-    "jitter": (
-        "jitter", FRONT, lambda k, note: replace(note, header_ns=note.header_ns + OFF_NS[k]),
-    ),
-    "drift": (
-        "clock_drift", FRONT, lambda k, note: replace(note, header_ns=note.header_ns + round(k * 0.0015 * bags.NS)),
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", sorted(FAULTS))
-def test_what_is_wrong_is_found(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    kind, topic, change = FAULTS[name]
-    notes = bags.changed(bag({FRONT: ticks(30, 90), SIDE: ticks(30, 90, phase=0.4)}), topic, change)
-    told, shown = imported(WRITERS["mcap"](notes, tmp_path), MAPPING, tmp_path, capsys)
-    assert f"  {kind}: " in told
-    assert "Nothing odd" not in told
-    assert f"({kind}" in told.splitlines()[-1] or f", {kind}" in told.splitlines()[-1]
-    assert CHECKS.load("import_times").run(CheckedRun(tmp_path / "run")).level == "warn"
-    if name == "images dropped":  # of the whole camera none is lost, and rows stay a thirtieth of a second apart
-        times = [note.header_ns for note in bags.of_topic(notes, SIDE)]
-        assert set(times[1:-1]) <= set(shown["side"])
-
-
 @pytest.mark.parametrize(("fps", "slow"), [(30, 15), (15, 15), (25, 25)])
 def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What repeats, or is in no row, by design is a note: rows go by the camera that has fps images a second."""

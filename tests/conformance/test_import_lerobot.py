@@ -113,21 +113,6 @@ def _opened(data: bytes) -> Any:
     return Image.open(io.BytesIO(data)).convert("RGB")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("imported", ["video"], indirect=True)
-def test_the_packets_are_those_of_the_video(imported: tuple[str, Path, Path]) -> None:
-    _, dataset, run = imported
-    packets = []
-    for file in sorted((dataset / "videos" / CAMERA).rglob("*.mp4")):
-        with av.open(str(file)) as container:
-            packets += [bytes(packet) for packet in container.demux(video=0) if packet.size]
-    found = []
-    for path in recordings(run):
-        with Recording(path) as recording:
-            found += [packet.data.removeprefix(b"\x12\x00") for packet in recording.packets(NAME)]
-    assert found == packets
-
-
 def test_exported_again_it_has_equal_numbers(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
     kind, dataset, run = imported
     report = export(run, tmp_path / "again")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -72,18 +71,6 @@ def test_mcap_files(notes: bags.Notes, is_ros1: bool, compression: str, is_bare:
         notes, tmp_path / "bag.mcap", is_ros1=is_ros1, compression=compression, **(bare if is_bare else {})
     )
     found, problems = _read(open_bag(path))
-    assert not problems
-    _assert_same(notes, found)
-
-
-def test_poses_and_calibrations(tmp_path: Path) -> None:
-    notes = bags.in_order(bags.franka(0.3))
-    _assert_same(notes, _read(open_bag(bags.write_rosbag2(notes, tmp_path / "bag")))[0])
-
-
-def test_protobuf(tmp_path: Path) -> None:
-    notes = bags.in_order(bags.trossen(1.0))
-    found, problems = _read(open_bag(bags.write_trossen(notes, tmp_path / "bag.mcap")))
     assert not problems
     _assert_same(notes, found)
 
@@ -188,19 +175,3 @@ def test_no_message_fills_the_memory() -> None:
     for data in (many, bytes(4) + many, bytes(8) + many, b""):
         with pytest.raises(ValueError, match="end"):
             decode(b"\x00\x01\x00\x00" + data)
-
-
-def test_mutated_messages_are_refused_or_read(notes: bags.Notes, tmp_path: Path) -> None:
-    bag = open_bag(bags.write_mcap(notes, tmp_path / "bag.mcap"))
-    decoder, outcomes = BagDecoder(), Counter[str]()
-    generator = np.random.default_rng(0)
-    for message in bag.messages([]):
-        data = bytearray(message.data)
-        for place in generator.integers(0, min(len(data), 80), 3):
-            data[place] = int(generator.integers(256))
-        try:
-            decoder.values(message._replace(data=bytes(data)))
-            outcomes["read"] += 1
-        except ValueError:
-            outcomes["refused"] += 1
-    assert min(outcomes["read"], outcomes["refused"]) > 10

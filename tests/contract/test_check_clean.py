@@ -9,22 +9,21 @@ from typing import Any
 import pytest
 from support.check import checked, simulate
 from support.commands import exit_code
-from support.tasks import tasks_with_slow_ones
+from support.tasks import QUICK_TASKS
 
 from demorec.core.config import VideoConfig
 from demorec.core.tables import ROBOTS, TASKS
 
 
-@pytest.mark.parametrize("task", tasks_with_slow_ones())
-def test_every_task(task: str, tmp_path: Path) -> None:
-    report = checked(simulate(tmp_path / "e.mcap", task=task, seed=21))
-    assert [r for r in report.results if r.level in ("warn", "fail")] == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS.names())
-def test_every_task_with_images(task: str, tmp_path: Path) -> None:
-    path = simulate(tmp_path / "e.mcap", task=task, seed=22, cameras=("front", "wrist"), width=128, height=128)
+@pytest.mark.parametrize(
+    ("task", "cameras"),
+    [
+        *((task, ()) for task in QUICK_TASKS),
+        *(pytest.param(task, ("front", "wrist"), marks=pytest.mark.slow) for task in TASKS.names()),
+    ],
+)
+def test_every_task(task: str, cameras: tuple[str, ...], tmp_path: Path) -> None:
+    path = simulate(tmp_path / "e.mcap", task=task, seed=22, cameras=cameras, width=128, height=128)
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 

@@ -154,28 +154,12 @@ def wrench(change: Callable[[Rows], Rows]) -> Fault:
     return lambda c: c.with_columns(sensed={"wrench": change(c.columns.sensed["wrench"])})
 
 
-def phases(change: Callable[[list[str]], list[str]]) -> Fault:
-    return lambda c: c.with_columns(phase=tuple(change(list(c.columns.phase))))
-
-
 def info(**fields: Any) -> Fault:
     return lambda c: c.with_info(**fields)
 
 
 def outcome(**fields: Any) -> Fault:
     return lambda c: c.with_outcome(**fields)
-
-
-def scene(change: Callable[[Any], Any]) -> Fault:
-    return lambda c: c.with_info(scene=change(c.info.scene))
-
-
-def config(**fields: Any) -> Fault:
-    return lambda c: c.with_info(config={**c.info.config, **fields})
-
-
-def robot(**fields: Any) -> Fault:
-    return lambda c: c.with_info(robot=replace(c.info.robot, **fields))
 
 
 def condition(name: str, **fields: Any) -> Fault:
@@ -188,18 +172,10 @@ def condition(name: str, **fields: Any) -> Fault:
     return fault
 
 
-def behaviour(**values: float) -> Fault:
-    return lambda c: c.with_info(behaviour={**c.info.behaviour, **values})
-
-
 def both_grippers(change: Callable[[Rows], Rows]) -> Fault:
     return lambda c: c.with_columns(
         action_gripper=change(c.columns.action_gripper), command_gripper=change(c.columns.command_gripper)
     )
-
-
-def exchanged(a: str, b: str) -> Callable[[list[str]], list[str]]:
-    return lambda rows: [{a: b, b: a}.get(phase, phase) for phase in rows]
 
 
 def stuck(first: int, last: int) -> Callable[[Rows], Rows]:

@@ -22,7 +22,6 @@ from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.generate.worker import make_episode
 from demorec.mcap import Recording
-from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.robots.assets import asset_path
 from demorec.runs.run_file import load_run_file
 
@@ -91,20 +90,6 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     assert "holds another run (the source of my_robots has changed)" in capsys.readouterr().err
     assert exit_code("replay", recording, "--allow", "my_robots") == 0
     assert "Note: the source of my_robots has changed since this was recorded." in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_robot_does_a_task_and_replays(folder: Path, tmp_path: Path) -> None:
-    path = simulate(
-        tmp_path / "e.mcap", robot=XARM6, cameras=("my_robots:CORNER",), renderer="tiny", width=32, height=32
-    )
-    with Recording(path) as opened:
-        assert opened.cameras == ("corner",)
-        assert opened.outcome is not None
-        assert opened.outcome.success
-    options = ReplayOptions(allowed=("my_robots",))
-    ((report, _),) = replay_all([open_file(path, options)], options)
-    assert report.is_identical
 
 
 def test_check_says_what_it_skips_for_lack_of_the_model_and_names_the_flag(

@@ -158,7 +158,7 @@ def test_a_bystander_in_the_hand_is_put_back() -> None:
 
 
 @pytest.mark.slow  # every task is simulated twice; pick_place above is quick
-@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+@pytest.mark.parametrize("share", [0.5, *(pytest.param(share, marks=pytest.mark.long) for share in (0.25, 0.75))])
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_every_task_goes_on_from_the_middle_of_its_script(task: str, share: float) -> None:
     prepared = episode(1, task=task, variation="mild")

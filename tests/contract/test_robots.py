@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from support.present import present
-from support.sim import episode, run
+from support.sim import episode
 
 from demorec.core.errors import SceneError
 from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Action
-from demorec.loop import make_world
 from demorec.robots.assets import asset_path, mesh_path
 from demorec.robots.inertials import with_massless_frames
 from demorec.robots.robot import RobotSpec
@@ -113,19 +112,6 @@ def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> 
         pytest.raises(SceneError, match=f"hand_link '{name}'; its links"),
     ):
         world.reset(scene)
-
-
-def test_it_picks_and_places(spec: RobotSpec) -> None:
-    prepared = episode(1, robot=spec.name)
-    frames, outcome = run(prepared)
-    assert outcome.success
-    commands = np.array([frame.command.joint_target for frame in frames])
-    assert (np.abs(np.diff(commands, axis=0)) * 30 <= np.array(spec.velocity_limit) * (1 + 1e-9)).all()
-    with make_world(prepared.info) as world:
-        world.reset(prepared.info.scene)
-        for frame in frames:
-            world.apply(frame.command)
-        assert world.state_digest() == outcome.final_state_digest
 
 
 def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec: RobotSpec) -> None:

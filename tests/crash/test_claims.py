@@ -201,33 +201,6 @@ def test_an_hdf5_file_claims_very_much(
     assert said in _told(commands, "import", "hdf5", path, "--mapping", mapping, "--out", tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("a" + ".a" * 200_000 + " = 1\n", "a key has more than 16 parts"),
-        ("[" + ".".join(['"#"'] * 200_000) + "]\n", "a key has more than 16 parts"),
-        ("x = {" + ".".join(["a"] * 200_000) + " = 1}\n", "a key has more than 16 parts"),
-        ("".join(f'[[features.f{n}]]\nnext = "actoin"\n' for n in range(12_000)), "12,008 tables, at most 1,000"),
-        ("".join(f'[cameras."f {n}"]\ndataset = "x"\n' for n in range(12_000)), "12,009 tables, at most 1,000"),
-        ("".join(f"k{n} = 1\n" for n in range(50_000)), "100,029 values, at most 50,000"),
-        ("x" * 500_000 + " = 1\n", "a text has 500,000 characters"),
-        ("x = " + "1" * 5000 + "\n", "more digits than are read"),
-        ("x = " + "[" * 100_000 + "]" * 100_000 + "\n", "nested too deeply"),
-        ('[robot]\nname = "r"\nurdf = "a\\u0000b"\n', "its name holds a zero byte"),
-    ],
-    ids=range(10),
-)
-def test_a_mapping_claims_very_much(text: str, said: str, commands: LimitedCommands, tmp_path: Path) -> None:
-    path, mapping = tmp_path / "file.hdf5", tmp_path / "mapping.toml"
-    with h5py.File(path, "w") as file:
-        _episode(file)
-    whole = MAPPING.replace('[robot]\nname = "r"', "") if text.startswith("[robot]") else MAPPING
-    mapping.write_text(whole + text if text.startswith(("[[", "[cameras")) else text + whole)
-    told = _told(commands, "import", "hdf5", path, "--mapping", mapping, "--out", tmp_path / "run")
-    assert said in told
-    assert len(told.splitlines()) == 1
-
-
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
 @pytest.mark.parametrize("codec", ["none", "snappy", "zstd", "gzip", "brotli", "lz4"])
 def test_the_longest_row_is_that_of_the_table(codec: str, version: Any, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from demorec.runs.run_file import load_run_file
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 NUM_EPISODES = 60
 REAL = GenerateConfig(seed=5, cameras=("wrist",), width=32, height=32)
-NUM_REAL = 20
+NUM_REAL = 12
 
 
 def run_on_ray(out: Path, *, maker: str, progress: RunObserver | None = None, **options: Any) -> RunResult:
@@ -174,21 +174,18 @@ def test_killed_workers_are_made_up_for(tmp_path: Path, cluster: object, referen
 
 
 def test_the_real_job_is_the_same_in_every_way(tmp_path: Path, cluster: object) -> None:
-    """One worker in order, two in reversed order, and Ray on two nodes with workers and a third node killed."""
+    """One worker, and Ray on two nodes with workers and a third node killed."""
     one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=NUM_REAL, workers=1))
-    backwards = list(reversed(range(NUM_REAL)))
-    two = generate(REAL, RunOptions(out=tmp_path / "two", num_episodes=NUM_REAL, workers=2), episodes=backwards)
     killer = Killer(tmp_path / "ray")
-    killer.node_at(6, cluster, add_node(cluster))
-    killer.worker_at(3, 9, 13)
+    killer.node_at(4, cluster, add_node(cluster))
+    killer.worker_at(2, 5, 8)
     ray = generate(REAL, RunOptions(out=tmp_path / "ray", num_episodes=NUM_REAL, executor="ray"))
     killer.join()
     assert killer.nodes == 1
     assert len(killer.workers) >= 2
     assert len(one.run.successes) == NUM_REAL
-    assert {one.run.digest, two.run.digest, ray.run.digest} == {one.run.digest}
-    for other in (two, ray):
-        assert [a.sha256 for a in other.run.attempts] == [a.sha256 for a in one.run.attempts]
+    assert ray.run.digest == one.run.digest
+    assert [a.sha256 for a in ray.run.attempts] == [a.sha256 for a in one.run.attempts]
 
 
 def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Damaged files: whatever is done to a recording, reading it gives one sentence or the very data that were written.
 
-The fast run damages some hundred files, the slow one more than two thousand (`-m slow`); both print what came out.
+The fast run damages some hundred files, the long one more than two thousand (`-m long`); both print what came out.
 """
 
 from __future__ import annotations
@@ -216,6 +216,7 @@ def test_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_two_thousand_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fuzz = Fuzz(tmp_path)
@@ -226,6 +227,7 @@ def test_two_thousand_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_a_flipped_bit_all_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fuzz = Fuzz(tmp_path)
@@ -273,13 +275,6 @@ def test_a_foreign_mcap_file(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(RecordingError, match="no demorec recording"):
         Recording(path)
-
-
-def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="it is a folder, not a regular file"):
-        Recording(tmp_path)
-    with pytest.raises(RecordingError, match="No such file"):
-        Recording(tmp_path / "nothing.mcap")
 
 
 def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:

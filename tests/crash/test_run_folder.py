@@ -141,16 +141,6 @@ def test_other_files_among_the_recordings_stay_where_they_are(tmp_path: Path, re
     assert (out / "episodes/notes.txt").read_text() == "mine"
 
 
-def test_a_folder_of_somebodys_episodes_is_no_run(tmp_path: Path) -> None:
-    (tmp_path / "episodes").mkdir()
-    (tmp_path / "episodes/s01e01.mkv").write_text("mine")
-    (tmp_path / "notes.txt").write_text("mine")
-    before = content_of(tmp_path)
-    with pytest.raises(ConfigError, match=r"of no run \(notes.txt\)"):
-        run_fake(tmp_path)
-    assert content_of(tmp_path) == before
-
-
 @pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_socket, lambda path: path.symlink_to("run.json")])
 def test_a_lock_that_is_no_file_is_told(tmp_path: Path, reference: RunResult, make: Callable[[Path], object]) -> None:
     out = tmp_path / "run"

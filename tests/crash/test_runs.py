@@ -139,13 +139,6 @@ def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path: Path
     assert result.run.digest == run_fake(tmp_path / "alone", num_episodes=3).run.digest
 
 
-def test_another_config_is_refused_and_nothing_is_touched(finished: Path) -> None:
-    before = {p: p.read_bytes() for p in finished.rglob("*") if p.is_file() and p.name != ".lock"}
-    with pytest.raises(ConfigError, match=r"holds another run \(seed is 0 there and 1 here\).*--overwrite"):
-        run_fake(finished, seed=1)
-    assert before == {p: p.read_bytes() for p in before}
-
-
 def test_overwrite_begins_anew_and_leaves_the_files_of_others(tmp_path: Path) -> None:
     run_fake(tmp_path / "run")
     (tmp_path / "run/notes.txt").write_text("mine")
@@ -153,14 +146,6 @@ def test_overwrite_begins_anew_and_leaves_the_files_of_others(tmp_path: Path) ->
     assert attempts_of(result) == expected_attempts(2, seed=1)
     assert num_finished(tmp_path / "run") == sum(expected_attempts(2, seed=1).values())
     assert (tmp_path / "run/notes.txt").read_text() == "mine"
-
-
-def test_a_folder_with_other_files_is_refused_even_with_overwrite(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("mine")
-    for overwrite in (False, True):
-        with pytest.raises(ConfigError, match=r"of no run \(thesis.tex\)"):
-            run_fake(tmp_path, overwrite=overwrite)
-    assert (tmp_path / "thesis.tex").read_text() == "mine"
 
 
 def test_a_dataset_of_somebody_else_is_refused_before_any_episode_is_made(tmp_path: Path) -> None:
@@ -193,14 +178,6 @@ def test_damaged_recordings_are_set_aside_and_made_again(finished: Path, referen
     assert victim.read_bytes() == good
     assert (finished / "unfinished" / victim.name).read_bytes() == bad
     assert any(victim.name in said for said in heard.said)
-
-
-def test_missing_recordings_are_made_again(finished: Path, reference: RunResult) -> None:
-    (finished / reference.run.failures[0].file).unlink()
-    (finished / reference.run.successes[0].file).unlink()
-    again = run_fake(finished)
-    assert len(again.made) == 2
-    assert again.run.digest == reference.run.digest
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff\x00\xff", None])

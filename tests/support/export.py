@@ -130,6 +130,25 @@ def count_calls(run: Path, out: Path, options: dict[str, Any]) -> int:
     return calls[0]
 
 
+def recode(video: Path, change: Callable[[list[Any]], object] = lambda images: None) -> None:
+    """A video anew, each image by itself and without loss; `change` edits the list of its images."""
+    import av
+    from av.video.stream import VideoStream
+
+    with av.open(str(video)) as container:
+        rate = container.streams.video[0].average_rate
+        images: list[Any] = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    change(images)
+    with av.open(str(video), "w") as out:
+        stream = out.add_stream("libx264rgb", rate=rate, options={"qp": "0", "g": "1", "bf": "0"})
+        assert isinstance(stream, VideoStream)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "rgb24"
+        for image in images:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        out.mux(stream.encode(None))
+
+
 def rewrite_video(dataset: Path, key: str, change: Callable[[list[Any]], list[Any]]) -> None:
     """The images of a camera's only file, changed and coded anew at 10 a second."""
     import av

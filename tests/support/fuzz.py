@@ -22,22 +22,29 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 from demorec.cli import COMMANDS, main
 from demorec.cli.shared.flags import parse
 from demorec.core.errors import DemorecError
 from demorec.core.text import printable
 
-if __name__ != "__main__":
-    from support.commands import MOST_BYTES, Told
-
+MOST_BYTES = 500_000_000
 MOST_SECONDS = 10.0
 """Of CPU time, for an input of less than a megabyte."""
 _KILLED_SECONDS = 20
 """After which a command is ended; more than allowed, so that what it took is told."""
 _MORE_ADDRESS_BYTES = 3 << 30
 """Beyond what the loaded libraries take: a command that fills more gets a MemoryError before the machine suffers."""
+
+
+class Told(NamedTuple):
+    """What a command answered: exit code (None if a signal or an exception ended it), outputs, memory, CPU seconds."""
+
+    code: int | None
+    text: str
+    peak_bytes: int
+    seconds: float
 
 
 class LimitedCommands:
@@ -71,6 +78,13 @@ class LimitedCommands:
         line = self._process.stdout.readline()
         assert line, "the process that runs commands has ended"
         return Told(*json.loads(line))
+
+    def refused(self, *arguments: str | Path) -> str:
+        """What a command says that must refuse: a sentence, within the bounds."""
+        told = self.run(*arguments)
+        assert told.code in (1, 2), told
+        assert problem_of(told) == "", told
+        return told.text
 
 
 def problem_of(told: Told) -> str:

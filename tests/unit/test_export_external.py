@@ -14,11 +14,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from support.export import data_table, export
-from support.external import FORCE, STATE, TOP, URDF, Episode, make_external, write_external
+from support.external import FORCE, STATE, TOP, Episode, make_external, write_external
 from support.recording import write_episode
 
 from demorec.core.errors import ConfigError, ExportError
-from demorec.mcap import Recording
 
 
 def run_of(folder: Path, *episodes: Episode) -> Path:
@@ -65,17 +64,6 @@ def test_numbers_that_float32_does_not_hold_are_refused_where_it_is_written(tmp_
     export(run, tmp_path / "d.hdf5", "hdf5")
     with h5py.File(tmp_path / "d.hdf5") as file:
         assert file["data/demo_0/obs/force"][2, 1] == 1e300
-
-
-def test_packets_go_into_the_dataset_as_they_are(tmp_path: Path) -> None:
-    run = run_of(tmp_path / "run", complete())
-    export(run, tmp_path / "d")
-    with Recording(run / "episodes" / "episode_000000.mcap") as recording:
-        recorded = list(recording.images("top"))
-    with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
-        shown = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
-    assert len(shown) == len(recorded) == 45
-    assert all(np.array_equal(a, b) for a, b in zip(shown, recorded, strict=True))
 
 
 def test_a_missing_image_is_an_error_unless_the_last_may_be_held(tmp_path: Path) -> None:
@@ -185,26 +173,6 @@ def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     assert np.abs(np.array(shown) - 9 * np.arange(12)).max() < 6
 
 
-def test_an_hdf5_file_has_numbers_and_images_of_the_recordings(tmp_path: Path) -> None:
-    run = run_of(tmp_path / "run", *of_outcomes(True, None))
-    report = export(run, tmp_path / "d.hdf5", "hdf5")
-    assert (report.num_episodes, report.num_frames) == (2, 40)
-    with h5py.File(tmp_path / "d.hdf5") as file:
-        for index in range(2):
-            given, demo = make_external(cameras=(TOP,), num_frames=20, episode_index=index), file[f"data/demo_{index}"]
-            vectors = {"obs/state": STATE.name, "obs/force": FORCE.name, "actions": "action"}
-            for place, name in vectors.items():
-                expected = np.array([frame.samples[name].vector for frame in given.frames])
-                assert demo[place].dtype == expected.dtype
-                np.testing.assert_array_equal(demo[place][:], expected)
-            assert json.loads(demo["obs/force"].attrs["names"]) == ["x", "y", "z"]
-            with Recording(run / "episodes" / f"episode_{index:06d}.mcap") as recording:
-                np.testing.assert_array_equal(demo["obs/top_image"][:], np.array(list(recording.images("top"))))
-            assert demo["dones"][:].tolist() == [0] * 19 + [1]
-            assert (demo.attrs["instruction"], demo.attrs["model_file"]) == ("stack the cups", URDF)
-            assert set(demo["obs"]) == {"state", "force", "top_image"}
-
-
 def test_an_hdf5_file_has_nothing_that_nobody_knows(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", *of_outcomes(True, False, None))
     export(run, tmp_path / "d.hdf5", "hdf5", include_failures=True)
@@ -216,16 +184,6 @@ def test_an_hdf5_file_has_nothing_that_nobody_knows(tmp_path: Path) -> None:
         assert "success" not in unknown.attrs
         assert all("states" not in demo for demo in (good, bad, unknown))
         assert json.loads(file["data"].attrs["env_args"])["env_name"] == "demorec/collected"
-
-
-def test_it_is_replaced_only_as_it_was_written(tmp_path: Path) -> None:
-    run, out = run_of(tmp_path / "run", *of_outcomes(True)), tmp_path / "d.hdf5"
-    export(run, out, "hdf5")
-    export(run, out, "hdf5", overwrite=True)
-    with h5py.File(out, "a") as file:
-        file["data/demo_0/obs/mine"] = 1
-    with pytest.raises(ConfigError, match="data/demo_0/obs/mine"):
-        export(run, out, "hdf5", overwrite=True)
 
 
 def test_streams_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -250,11 +208,3 @@ def test_an_episode_without_actions_is_refused(tmp_path: Path) -> None:
     path = write_external(tmp_path / "a.mcap", replace(given, info=info, frames=frames))
     with pytest.raises(ConfigError, match="needs actions"):
         export(path, tmp_path / "d.hdf5", "hdf5")
-
-
-@pytest.mark.slow
-def test_lerobot_reads_the_dataset_as_it_was_recorded(tmp_path: Path) -> None:
-    (tmp_path / "run" / "episodes").mkdir(parents=True)
-    write_external(tmp_path / "run" / "episodes" / "episode_000000.mcap", make_external(cameras=(TOP,)))
-    report = export(tmp_path / "run", tmp_path / "d", verify=True)
-    assert (report.num_frames, report.verified_frames, report.not_verified) == (45, 2, "")

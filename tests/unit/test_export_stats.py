@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from demorec.datasets.lerobot.layout import DatasetFeature, data_schema
 from demorec.datasets.lerobot.stats import (
     QUANTILES,
-    PixelHistogram,
     Statistics,
-    colour_levels,
     data_statistics,
 )
 
@@ -78,19 +76,3 @@ def test_statistics_of_files_equal_those_of_numpy(tmp_path: Path, count: int) ->
     assert set(found) == set(data)
     for name, column in data.items():
         check(found[name], column)
-
-
-def test_statistics_of_images_equal_those_of_numpy() -> None:
-    rng = np.random.default_rng(1)
-    images = rng.integers(0, 256, (5, 20, 30, 3)).astype(np.uint8)
-    images[..., 1] //= 9
-    counts = np.stack([np.bincount(images[..., c].ravel(), minlength=256) for c in range(3)])
-    found = PixelHistogram(counts=counts, level_values=colour_levels(), num_images=5).statistics()
-    expected = images.reshape(-1, 3) / 255
-    for name, q in QUANTILES.items():
-        assert np.allclose(found.values[name], np.quantile(expected, q, axis=0), atol=1e-15)
-    assert np.allclose(found.values["mean"], expected.mean(axis=0), rtol=1e-12)
-    assert np.allclose(found.values["std"], expected.std(axis=0), rtol=1e-12)
-    assert found.to_json()["count"] == [5]
-    assert np.asarray(found.to_json()["mean"]).shape == (3, 1, 1)
-    assert Statistics.from_json(found.to_json()) is not None

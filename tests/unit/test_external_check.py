@@ -15,7 +15,6 @@ from support.external import FORCE, TOP, Episode, make_external, write_external
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.cli import main
 from demorec.episode.episode import Sample, SampledFrame
-from demorec.mcap import recover
 from demorec.runs.external import episode_path, open_external_run
 
 CAMERAS = (TOP, replace(TOP, name="side"))
@@ -169,22 +168,6 @@ def test_a_fault_is_named_by_its_check_alone(tmp_path: Path, fault: str) -> None
     change, check, level = FAULTS[fault]
     found = levels(write_external(tmp_path / "a.mcap", change(steady())))
     assert {name: found for name, found in found.items() if found not in ("pass", "skip")} == {check: level}
-
-
-def test_a_damaged_file_is_a_failure(tmp_path: Path) -> None:
-    path = write_external(tmp_path / "a.mcap", steady())
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 255
-    path.write_bytes(data)
-    assert "fail" in levels(path).values()
-
-
-def test_a_recovered_file_is_a_warning(tmp_path: Path) -> None:
-    data = write_external(tmp_path / "a.mcap", steady(num_frames=100)).read_bytes()
-    (tmp_path / "b.mcap").write_bytes(data[: len(data) * 3 // 4])
-    recover(tmp_path / "b.mcap", tmp_path / "c.mcap")
-    found = levels(tmp_path / "c.mcap")
-    assert {name: level for name, level in found.items() if level not in ("pass", "skip")} == {"complete": "warn"}
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, str]:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
-import av
 import numpy as np
 import pytest
 from support.external import (
@@ -19,13 +17,11 @@ from support.external import (
     WRIST,
     make_external,
     write_external,
-    write_images_and_frames,
 )
 
-from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_IMAGE, Sample, SampledFrame
-from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
+from demorec.episode.info import Camera, EpisodeInfo
 from demorec.mcap import EpisodeWriter, Recording, recover
 
 
@@ -56,59 +52,6 @@ def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
         assert columns.images["wrist"][:3].tolist() == [NO_IMAGE, 0, 0]
         assert columns.age_ns("observation.state").tolist() == [1_000_000] * num_frames
         assert columns.image_age_ns("top").tolist() == [7_000_000] * num_frames
-
-
-@pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
-def test_pixels_are_coded_once_and_found_by_their_frame(tmp_path: Path, codec: Literal["h264", "av1", "jpeg"]) -> None:
-    episode = make_external()
-    path = write_external(tmp_path / "a.mcap", episode, video=VideoConfig(codec=codec))
-    with Recording(path) as recording:
-        images = list(recording.images("top"))
-        assert len(images) == 45
-        for image, (_, pixels) in zip(images, episode.images["top"], strict=True):
-            assert np.abs(image.astype(int) - pixels).mean() < 8
-        assert recording.image("wrist", 0) is None
-        third, last = recording.image("wrist", 2), recording.image("wrist", -1)
-        assert third is not None
-        assert last is not None
-        assert abs(int(third[4, 4, 1]) - 5 * 1) < 8  # the image of frame 1
-        assert abs(int(last[4, 4, 1]) - 5 * 43) < 8
-        assert recording.pixel_statistics("top").num_images == 23  # every other one
-
-
-def _packets(codec: str, count: int) -> list[bytes]:
-    context = cast(av.VideoCodecContext, av.CodecContext.create({"h264": "libx264", "h265": "libx265"}[codec], "w"))
-    context.width, context.height, context.pix_fmt = 64, 48, "yuv420p"
-    context.time_base = Fraction(1, 30)
-    context.gop_size = 10
-    context.options = {"tune": "zerolatency", "x265-params": "log-level=none:bframes=0"}
-    packets = []
-    for index in range(count):
-        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 4 * index, dtype=np.uint8), format="rgb24")
-        frame.pts = index
-        packets += [bytes(packet) for packet in context.encode(frame)]
-    return packets + [bytes(packet) for packet in context.encode(None)]
-
-
-@pytest.mark.parametrize("codec", ["h264", "h265"])
-def test_packets_that_came_coded_stay_byte_for_byte(tmp_path: Path, codec: Literal["h264", "h265"]) -> None:
-    packets = _packets(codec, 25)
-    assert len(packets) == 25
-    camera = replace(TOP, kept=codec)
-    episode = make_external(num_frames=25, cameras=(camera,))
-    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        for frame, packet in zip(episode.frames, packets, strict=True):
-            writer.image("top", frame.time_ns, packet)
-            writer.write(frame)
-        writer.finish(episode.outcome)
-    with Recording(tmp_path / "a.mcap") as recording:
-        assert [packet.data for packet in recording.packets("top")] == packets
-        assert bytes(recording.coded_images(["top"])["top"].joined()) == b"".join(packets)
-        assert [packet.frame_index for packet in recording.packets("top") if packet.is_keyframe] == [0, 10, 20]
-        images = list(recording.images("top"))
-        assert recording.video_settings("top").codec == codec
-        assert recording.pixel_statistics("top").num_images == 13
-    assert all(abs(int(image.mean()) - 4 * index) < 6 for index, image in enumerate(images))
 
 
 def _frame(**changes: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
@@ -188,26 +131,6 @@ def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str,
     assert not list(tmp_path.iterdir())
 
 
-def test_what_a_crash_left_is_recovered_up_to_the_last_second(tmp_path: Path) -> None:
-    episode = make_external(num_frames=100)
-    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        write_images_and_frames(writer, episode)
-        data = (tmp_path / "a.mcap.part").read_bytes()
-    (tmp_path / "b.mcap.part").write_bytes(data)
-    with pytest.raises(DemorecError, match="cut off"):
-        Recording(tmp_path / "b.mcap.part")
-    result = recover(tmp_path / "b.mcap.part", tmp_path / "b.mcap")
-    assert not result.is_complete
-    assert 100 - 31 <= result.num_frames < 100
-    with Recording(tmp_path / "b.mcap") as recording:
-        assert recording.is_recovered
-        assert recording.outcome is None
-        columns = recording.columns()
-        assert columns.time_ns.tolist() == [frame.time_ns for frame in episode.frames[: result.num_frames]]
-        assert int(columns.images["top"].max()) == result.num_frames - 1
-        assert len(list(recording.images("top"))) >= result.num_frames
-
-
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.999])
 def test_a_file_that_was_cut_anywhere_gives_whole_frames(tmp_path: Path, share: float) -> None:
     episode = make_external(num_frames=100)
@@ -219,17 +142,3 @@ def test_a_file_that_was_cut_anywhere_gives_whole_frames(tmp_path: Path, share: 
     assert 0 < columns.num_frames == result.num_frames <= 100
     for index in range(result.num_frames):
         assert columns.features["action"][index].tolist() == episode.frames[index].samples["action"].vector.tolist()
-
-
-def test_what_a_killed_import_left_is_made_again(tmp_path: Path) -> None:
-    origin = Origin(kind="import", files=(SourceFile(name="a.mcap", sha256="00"),))
-    episode = make_external(num_frames=3)
-    imported = replace(episode, info=replace(episode.info, origin=origin))
-    with EpisodeWriter(tmp_path / "a.mcap", imported.info) as writer:
-        write_images_and_frames(writer, imported)
-    write_external(tmp_path / "a.mcap", imported)
-    (tmp_path / "a.mcap").unlink()
-    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
-        write_images_and_frames(writer, episode)
-    with pytest.raises(ConfigError, match="unfinished recording"):  # of the Recorder: nobody can make it again
-        write_external(tmp_path / "a.mcap", episode)

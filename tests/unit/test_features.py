@@ -72,28 +72,6 @@ def make_rows(rng: np.random.Generator, scene: Scene, count: int) -> Observation
     )
 
 
-def one_row(rows: ObservationRows, t: int) -> ObservationRows:
-    return ObservationRows(
-        joint_position=rows.joint_position[t : t + 1].copy(),
-        joint_velocity=rows.joint_velocity[t : t + 1].copy(),
-        gripper_width=rows.gripper_width[t : t + 1].copy(),
-        base_from_tcp=rows.base_from_tcp[t : t + 1].copy(),
-        object_poses={name: poses[t : t + 1].copy() for name, poses in rows.object_poses.items()},
-        sensed={},
-    )
-
-
-def test_one_frame_has_the_same_bits_as_many() -> None:
-    rng = np.random.default_rng(1)
-    scene = make_scene(rng)
-    rows = make_rows(rng, scene, 37)
-    many = observation_vectors(rows, PANDA, scene, privileged=True)
-    for t in range(37):
-        one = observation_vectors(one_row(rows, t), PANDA, scene, privileged=True)
-        for name in many:
-            assert one[name].tobytes() == many[name][t].tobytes(), (name, t)
-
-
 def test_environment_state_against_scipy() -> None:
     rng = np.random.default_rng(2)
     scene = make_scene(rng)

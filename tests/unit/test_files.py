@@ -3,54 +3,11 @@
 from __future__ import annotations
 
 import os
-import socket
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from demorec.core.files import open_regular, read_json_limited, read_text_limited
-
-
-def make_fifo(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def make_socket(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as made:
-        made.bind(os.path.relpath(path))  # an address of a socket may have 107 bytes
-
-
-def make_link_to_fifo(path: Path) -> None:
-    os.mkfifo(path.with_name("fifo"))
-    path.symlink_to("fifo")
-
-
-def make_link_to_device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (make_fifo, "it is a FIFO"),
-        (make_link_to_fifo, "it is a FIFO"),
-        (make_socket, "it is a socket"),
-        (make_link_to_device, "it is a device"),
-        (lambda path: path.mkdir(), "it is a folder"),
-        (lambda path: None, "No such file"),
-        (lambda path: path.symlink_to("nowhere"), "No such file"),
-        (lambda path: path.symlink_to(path.name), "Too many levels"),
-    ],
-)
-def test_whatever_else_is_there_is_refused_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], object], words: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "file"
-    make(path)
-    with pytest.raises(OSError, match=words):
-        open_regular(path)
 
 
 def open_files() -> list[int]:

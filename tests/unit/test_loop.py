@@ -14,9 +14,8 @@ import pytest
 from support.sim import episode, run
 
 import demorec.loop
-from demorec.core.plain import from_json, to_json
+from demorec.core.plain import to_json
 from demorec.episode.episode import Frame, Outcome
-from demorec.episode.info import EpisodeInfo
 from demorec.loop import Episode, ScriptAgent, Session, make_world
 
 
@@ -50,20 +49,6 @@ def test_observation_comes_before_the_action(ran: tuple[Episode, list[Frame], Ou
     assert follows < 0.5 * equal
 
 
-def test_replaying_the_commands_gives_the_same_bits(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    prepared, frames, outcome = ran
-    info = from_json(to_json(prepared.info), EpisodeInfo)  # as a recording would hold it
-    with make_world(info) as world:
-        world.reset(info.scene)
-        for frame in frames:
-            seen = world.observe()
-            assert np.array_equal(seen.joint_position, frame.observation.joint_position)
-            assert np.array_equal(seen.joint_effort, frame.observation.joint_effort)
-            assert seen.object_poses["red_cube"] == frame.observation.object_poses["red_cube"]
-            world.apply(frame.command)
-        assert world.state_digest() == outcome.final_state_digest
-
-
 def test_noise_is_on_the_command_only_and_only_in_free_motion(ran: tuple[Episode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
     noise: dict[str, list[float]] = {phase: [] for phase in {frame.phase for frame in frames}}
@@ -85,17 +70,6 @@ def test_no_frame_is_idle(ran: tuple[Episode, list[Frame], Outcome]) -> None:
         s for s, frame in zip(still, frames, strict=False) if frame.phase not in ("close", "release")
     ]
     assert sum(outside_of_gripping) <= 0.06 * len(frames)
-
-
-def test_an_episode_depends_on_its_plan_alone() -> None:
-    """Alone, after others, in reverse order: the same digest."""
-    plans = [episode(index) for index in (0, 1)]
-    alone = [run(prepared)[1].final_state_digest for prepared in plans]
-    with make_world(plans[0].info) as world:
-        in_order = [run(prepared, world)[1].final_state_digest for prepared in plans]
-        reverse = [run(prepared, world)[1].final_state_digest for prepared in reversed(plans)]
-    assert alone == in_order == reverse[::-1]
-    assert len(set(alone)) == 2
 
 
 def test_images_do_not_disturb_the_physics() -> None:

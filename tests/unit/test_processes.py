@@ -90,34 +90,6 @@ def test_ctrl_c_in_a_callback_is_heard_and_not_printed(tmp_path: Path) -> None:
     assert (done.stdout.split(), done.stderr) == (["130"], "")
 
 
-PARENT = """
-import time
-from concurrent.futures import ProcessPoolExecutor
-
-from demorec.core.processes import SPAWN
-
-with ProcessPoolExecutor(max_workers=2, mp_context=SPAWN) as pool:
-    busy = [pool.submit(time.sleep, 600), pool.submit(time.sleep, 0)]
-    busy[1].result()
-    print("ready", flush=True)
-    time.sleep(600)
-"""
-
-
-def test_workers_of_a_pool_end_with_their_parent_busy_or_idle(tmp_path: Path) -> None:
-    (tmp_path / "script.py").write_text(PARENT)
-    parent = subprocess.Popen([sys.executable, "script.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    assert parent.stdout.readline() == "ready\n"
-    descendants = psutil.Process(parent.pid).children(recursive=True)
-    workers = [process for process in descendants if "spawn_main" in " ".join(process.cmdline())]
-    assert len(workers) == 2
-    parent.kill()
-    parent.wait()
-    _, alive = psutil.wait_procs(descendants, timeout=120)
-    assert not alive
-
-
 STARTS = """
 import sys
 from demorec.core.processes import start_program

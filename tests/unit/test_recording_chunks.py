@@ -4,37 +4,13 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from support.recording import write_episode
 
 from demorec.mcap.chunks import blocks_of
-from demorec.mcap.container import Container
 from demorec.mcap.limits import Limits
 from demorec.mcap.messages import ImageMessages, coded_images
-
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_episode(tmp_path_factory.mktemp("chunks") / "e.mcap", num_frames=70)
-
-
-def test_blocks_are_what_the_mcap_library_reads(path: Path) -> None:
-    expected: dict[str, list[tuple[int, bytes]]] = {}
-    with path.open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
-            expected.setdefault(channel.topic, []).append((message.log_time, message.data))
-    container = Container(path)
-    blocks = container.blocks([*expected, "/nothing"])
-    container.close()
-    assert len(blocks.pop("/nothing")) == 0
-    assert len(expected["/joint_states"]) >= 70
-    for topic, block in blocks.items():
-        assert list(zip(block.time_ns.tolist(), block.messages(), strict=True)) == expected[topic], topic
-
 
 LIMITS = Limits.of_file(1000)
 

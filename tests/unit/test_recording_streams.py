@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,8 +14,6 @@ from demorec.episode.info import FORMAT_VERSION, EpisodeInfo
 from demorec.mcap import EpisodeWriter, Recording, recover
 from demorec.mcap.streams import frame_streams
 
-LATER = {stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since > 1}
-"""Topics that the first version did not have."""
 NEWEST = [stream.topic for stream in frame_streams(make_episode(num_frames=1)[0]) if stream.since == FORMAT_VERSION]
 
 
@@ -26,34 +23,6 @@ def record(path: Path, info: EpisodeInfo, frames: list[Frame], outcome: Outcome)
             writer.write(frame)
         writer.finish(outcome)
     return path
-
-
-def without_wrench(frames: list[Frame]) -> list[Frame]:
-    return [replace(frame, observation=replace(frame.observation, sensed={})) for frame in frames]
-
-
-def test_a_recording_of_version_1_has_no_wrench(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=5, cameras=())
-    old = replace(info, format_version=1)
-    path = record(tmp_path / "old.mcap", old, without_wrench(frames), outcome)
-    with (
-        Recording(path) as recording,
-        Recording(write_episode(tmp_path / "new.mcap", num_frames=5, cameras=())) as new,
-    ):
-        assert set(new.topics) - set(recording.topics) == LATER
-        assert not recording.columns().sensed
-        assert not recording[2].observation.sensed
-        assert not [name for name in recording.to_pandas() if name.startswith("wrench")]
-        assert recording.digest() != new.digest()
-        digest = recording.digest()
-    # What a frame knows beyond the version is not written: the recording is the same to the byte.
-    again = record(tmp_path / "again.mcap", old, frames, outcome)
-    assert again.read_bytes() == path.read_bytes()
-    assert level_of(path, "topics") == "pass"
-    # A crash loses nothing either.
-    rescued = recover(path, tmp_path / "rescued.mcap").path
-    with Recording(rescued) as recording:
-        assert recording.digest() == digest
 
 
 @pytest.mark.parametrize("topic", NEWEST)

@@ -13,7 +13,7 @@ from support.recording import make_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import Frame, Outcome
-from demorec.mcap import EpisodeWriter, Recording, part_file, recover
+from demorec.mcap import EpisodeWriter, Recording, recover
 
 
 def names(folder: Path) -> list[str]:
@@ -74,16 +74,6 @@ def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
             assert stats.video_bytes[camera] == sum(len(packet.data) for packet in recording.packets(camera))
 
 
-def test_leaving_without_finish_leaves_a_part_that_can_be_recovered(tmp_path: Path) -> None:
-    info, frames, _ = make_episode(num_frames=70)
-    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
-        write_all(writer, frames)
-    assert names(tmp_path) == ["a.mcap.part"]
-    with pytest.raises(RecordingError, match="never finished"):
-        Recording(tmp_path / "a.mcap.part")
-    assert recover(tmp_path / "a.mcap.part", tmp_path / "a.mcap").num_frames >= 40
-
-
 def test_frames_come_in_order(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=3, cameras=())
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
@@ -120,18 +110,6 @@ def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:
     ):
         writer.write(frames[0])
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    info, frames, _ = make_episode(num_frames=31, cameras=())
-    disk = part_file._Disk
-    monkeypatch.setattr(part_file, "_Disk", lambda part: disk(Path("/dev/full")))
-    writer = EpisodeWriter(tmp_path / "a.mcap", info, overwrite=True)
-    with pytest.raises(RecordingError, match="cannot be written") as caught:
-        write_all(writer, frames)
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "a.mcap").exists()
 
 
 def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
-from demorec.core.errors import ConfigError, NotAllowedError
+from demorec.core.errors import ConfigError
 from demorec.core.registry import Registry
 
 SHAPES: Registry[type] = Registry(
@@ -36,17 +35,6 @@ def test_of_many_names_the_refusal_names_the_command_that_lists_them() -> None:
     assert "Did you mean 'law_3" in str(refused.value)
     with pytest.raises(ConfigError, match=r"Allowed: ordered, counter, or"):
         SHAPES.load("law")
-
-
-@pytest.mark.parametrize("allowed", [("fractions",), ("decimal", "fractions")])
-def test_somebody_elses_object_loads_when_its_module_is_allowed(allowed: tuple[str, ...]) -> None:
-    assert SHAPES.load("fractions:Fraction", allowed) is Fraction
-
-
-@pytest.mark.parametrize("allowed", [(), ("fraction",), ("fractions.sub",), ("decimal",)])
-def test_somebody_elses_object_is_refused_when_nobody_allowed_its_module(allowed: tuple[str, ...]) -> None:
-    with pytest.raises(NotAllowedError, match=r"if you trust that module, add --allow fractions\."):
-        SHAPES.load("fractions:Fraction", allowed)
 
 
 @pytest.mark.parametrize("name", ["no_such_package.task:Mine", "decimal:NoSuchThing"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import pytest
 from support.generate import expected_attempts
 
 from demorec.core.config import GenerateConfig
-from demorec.core.errors import ConfigError, ResourceError
+from demorec.core.errors import ConfigError
 from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
@@ -54,13 +53,6 @@ def a_run() -> RunFile:
         ),
         sessions=(RunSession(started="2026-01-01T00:00:00+00:00", machine={"host": "somewhere"}),),
     ).with_attempts(attempts)
-
-
-def test_a_run_survives_the_file(tmp_path: Path) -> None:
-    run = a_run()
-    save_run_file(run, tmp_path)
-    assert load_run_file(tmp_path) == run
-    assert [p.name for p in tmp_path.iterdir()] == ["run.json"]
 
 
 def test_there_is_one_line_an_attempt_and_one_for_each_episode_to_come(tmp_path: Path) -> None:
@@ -131,42 +123,6 @@ def test_numbers_that_no_run_has_are_damage(tmp_path: Path, change: Callable[[An
     assert words in str(error.value)
 
 
-def make_nested(path: Path) -> None:
-    path.write_text("[" * 100_000)
-
-
-def make_huge(path: Path) -> None:
-    with path.open("wb") as file:
-        file.truncate(1 << 40)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (make_nested, "nested too deeply"),
-        (make_huge, "larger than"),
-        (os.mkfifo, "a FIFO"),
-        (lambda path: path.mkdir(), "a folder"),
-    ],
-)
-def test_whatever_lies_in_its_place_is_told_at_once(tmp_path: Path, make: Callable[[Path], object], words: str) -> None:
-    make(tmp_path / "run.json")
-    with pytest.raises(DamagedRunFileError, match=words):
-        load_run_file(tmp_path)
-
-
-@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.ENOMEM])
-def test_what_the_machine_lacks_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    save_run_file(a_run(), tmp_path)
-
-    def fail(*_: object) -> str:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(os, "open", fail)
-    with pytest.raises(ResourceError, match="whether the file is sound is not known"):
-        load_run_file(tmp_path)
-
-
 def test_it_is_never_written_through_what_lies_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "run.json.part").symlink_to("mine")
@@ -175,21 +131,6 @@ def test_it_is_never_written_through_what_lies_in_the_way(tmp_path: Path) -> Non
     os.mkfifo(tmp_path / "run.json.part")
     save_run_file(a_run(), tmp_path)
     assert load_run_file(tmp_path) == a_run()
-
-
-def test_fewer_episodes_are_the_run_that_they_would_have_been_alone(tmp_path: Path) -> None:
-    run = a_run()
-    fewer = run.with_generation(num_episodes=2).with_attempts(run.known)
-    alone = replace(
-        run.with_generation(num_episodes=2), attempts=tuple(line for line in run.attempts if line.episode_index < 2)
-    )
-    assert (fewer.digest, fewer.successes, fewer.given_up) == (alone.digest, alone.successes, alone.given_up)
-    assert fewer.is_complete
-    assert fewer.digest != run.digest
-    assert fewer.beyond == tuple(line for line in run.attempts if line.episode_index >= 2) != ()
-    save_run_file(fewer, tmp_path)
-    assert load_run_file(tmp_path) == fewer
-    assert fewer.with_generation(num_episodes=8).with_attempts(fewer.known) == run
 
 
 def test_a_newer_format_is_no_damage(tmp_path: Path) -> None:

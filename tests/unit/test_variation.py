@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -197,17 +196,3 @@ def test_textures_are_functions_of_their_fields(
     if pattern == "checker":
         assert [tuple(pixels[8, 8]), tuple(pixels[8, 24])] == [(51, 26, 0), (204, 230, 255)]
         assert np.array_equal(pixels[:16, :16], pixels[16:32, 16:32])
-
-
-def test_a_texture_reaches_the_image() -> None:
-    prepared = episode(7, cameras=("front",), width=64, height=64, renderer="tiny")
-    texture = Texture(pattern="checker", colors=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), scale=8)
-    bodies = tuple(
-        replace(body, texture=texture, rgba=(1.0, 1.0, 1.0, 1.0)) if body.name == "table" else body
-        for body in prepared.info.scene.bodies
-    )
-    scene = replace(prepared.info.scene, bodies=bodies)
-    frame = first_frame(replace(prepared, info=prepared.info.with_simulation(scene=scene)))
-    table = frame.images["front"].color[45:60].max(axis=2)
-    assert table.min() < 40
-    assert table.max() > 150
