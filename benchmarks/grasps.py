@@ -186,7 +186,9 @@ def _pieces(body: Body) -> list[Convex]:
         path = asset_path(shape.file)
         return [p for link in read_links(path.read_text(), scale=shape.scale) for p in _parts(link, path.parent)]
     if shape.kind == "mesh":
-        hulls = _parts_of(shape.mesh, shape.scale) if shape.mesh else [_hull(asset_path(shape.file), (shape.scale,) * 3)]
+        hulls = (
+            _parts_of(shape.mesh, shape.scale) if shape.mesh else [_hull(asset_path(shape.file), (shape.scale,) * 3)]
+        )
         return [hull.moved(shape.body_from_mesh.matrix()) for hull in hulls]
     return [Convex.of_shape(shape)]
 
@@ -283,6 +285,7 @@ def main() -> None:
     configs = [
         GenerateConfig(task=task, robot=robot, variation=variation, seed=args.seed, split=args.split, cameras=())
         for task, robot, variation in itertools.product(tasks, robots, args.variations)
+        if not TASKS.load(task).refusal(ROBOTS.load(robot))
     ]
     rows = [Row(**json.loads(line)) for line in args.out.open()] if args.out and args.out.exists() else []
     known = {(row.task, row.robot, row.variation, row.seed, row.split, row.index) for row in rows}

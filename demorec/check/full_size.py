@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.cells import CellGrid
 from demorec.core.config import VideoConfig
 from demorec.core.geometry import Array
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, make_encoder
@@ -50,6 +51,7 @@ class FullSize:
         color_frame: Where that is.
         errors: (N,) the image's error, of its worst block or of nine tenths of them, in units of the encoder's own;
             later ones weigh less.
+        encoded: By how much the encoder makes the cells of an image unlike the drawn ones, root mean square, of 255.
     """
 
     frames: NDArray[np.int64]
@@ -58,6 +60,7 @@ class FullSize:
     color: float
     color_frame: int
     errors: Array
+    encoded: float
 
 
 def frames_to_compare(keyframes: NDArray[np.int64], count: int, detail: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -135,6 +138,8 @@ def compare_full_size(
     off, own = np.zeros((count, height // BLOCK, width // BLOCK)), np.zeros((count, height // BLOCK, width // BLOCK))
     kernels.block_errors(seen, expected, drawn, BLOCK, off, own)
     color, frame = _worst_color(colors)
+    grid = CellGrid(width, height)
+    cells = [[grid.read("color", image).cells for image in images] for images in (expected, drawn)]
     return FullSize(
         frames=frames,
         displacement=float(np.hypot(*moved[:2]) + np.abs(moved[2:6]).max() * min(height, width) / 4),
@@ -143,6 +148,7 @@ def compare_full_size(
         color_frame=int(frames[frame]),
         errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)])
         * np.where(frames < frames[0] + _PAIR, 1.0, _LATER_WEIGHT),
+        encoded=float(np.sqrt(np.mean(np.subtract(*cells) ** 2))),
     )
 
 
