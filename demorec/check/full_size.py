@@ -157,18 +157,25 @@ def _worst_color(sums: Array) -> tuple[float, int]:
 
     Over all images, and in each at half its weight: there the encoder's quality may be a little another one.
     """
-    each = _ratio(sums) / 2
+    each = _ratio(sums, sums[..., :1]) / 2
     number = int(np.argmax(each))
-    return max(float(_ratio(sums.sum(axis=0)[None])[0]), float(each[number])), number
+    # What stands still is encoded alike in all of them: more images are no more blocks.
+    most = sums[..., :1].max(axis=0, keepdims=True)
+    return max(float(_ratio(sums.sum(axis=0, keepdims=True), most)[0]), float(each[number])), number
 
 
-def _ratio(sums: Array) -> Array:
-    """(N,) of each image the largest of any colour, in units of the encoder's error, one level at least."""
-    pixels = sums[..., :1]
-    mean = np.abs(sums[..., 1:4]) / np.maximum(pixels, 1)
-    own = np.sqrt(sums[..., 4:] / np.maximum(pixels, 1))
+def _ratio(sums: Array, different: Array) -> Array:
+    """(N,) of each image the largest of any colour, in units of the encoder's error, one level at least.
+
+    Args:
+        sums: (N, 64, 7) as of `_worst_color`.
+        different: (N, 64, 1) how many pixels of the colour are not those of another image once more.
+    """
+    pixels = np.maximum(sums[..., :1], 1)
+    mean = np.abs(sums[..., 1:4]) / pixels
+    own = np.sqrt(sums[..., 4:] / pixels)
     # Of a few blocks the encoder's errors do not cancel.
-    weight = np.minimum(np.sqrt(pixels / _MANY_PIXELS), 1.0) * (pixels >= _LEAST_PIXELS)
+    weight = np.minimum(np.sqrt(different / _MANY_PIXELS), 1.0) * (different >= _LEAST_PIXELS)
     return np.asarray((mean / np.maximum(own, 1.0) * weight).max(axis=(1, 2)))
 
 

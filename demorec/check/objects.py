@@ -19,6 +19,8 @@ COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""
 _GAP = 0.005
 """Metres above a support from which on it bears nothing."""
+_CARRIED = 0.01
+"""Metres above its start from which on a hand may carry something."""
 _PRESSED, _IN_HAND = 0.002, 0.05
 """Metres by which a hand presses what it lowers into a support at most, and of what it holds from its TCP."""
 SOLID = ("box", "sphere", "cylinder", "capsule")
@@ -262,6 +264,22 @@ def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
             yield Measurement(value=int(wrong.sum()), frame=frame + 1, detail=detail)
         else:
             yield Measurement(value=0, detail=f"{body.name} travels {int(travelling.sum())} frames")
+
+
+@physics_check(
+    measures="how far an object moves in the hand while nothing else bears it",
+    unit="m",
+)
+def slips(episode: CheckedEpisode) -> Iterator[Found]:
+    """What fingers press on in the air stays where it is in the hand, from one frame of it to any other."""
+    c, hand = episode.columns, inverse(episode.world_from_tcp)
+    for body in episode.info.scene.movable:
+        pose = episode.world_from_object(body.name)
+        held = episode.is_carried(body.name, _CARRIED) & (c.contact_force > 0) & ~_is_borne(episode, body, pose)
+        length, start = longest_run(held)
+        place = (hand @ pose)[start : start + length, :3, 3]
+        off = np.linalg.norm(place - np.median(place, axis=0), axis=1) if length else np.zeros(0)
+        yield worst_frame(off, body.name, first=start)
 
 
 @physics_check(

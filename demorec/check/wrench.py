@@ -32,6 +32,8 @@ that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as
 _LEAST_TORQUE = 0.012
 """N m below which nothing is said: motors of wrists that bear less differ from the wrench by up to 0.0063 N m (of 145
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
+_LOST_SHARE = 0.5
+"""Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
 _MOST_LAG = 3
 """Frames up to which wrench and motors are shifted against each other."""
 
@@ -159,12 +161,15 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     "carried, in units of what is borne",
 )
 def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
-    """No single frame is far from both of its neighbours: catches lost bits and glitches of an amplifier.
+    """No single frame is far from both of its neighbours, or empty: catches lost values and glitches of an amplifier.
 
     Where the hand is free and moves smoothly, what an impact adds shows in wrench and motors alike; of the motors,
     those count that bear weight. The force on what is carried is that of the gripper's motors in each frame.
     """
     yield _peak_of_grip(episode)
+    for name, table in (("wrench", episode.columns.sensed.get("wrench")), ("efforts", episode.columns.joint_effort)):
+        if table is not None and (lost := (table == 0).all(axis=1)).mean() < _LOST_SHARE:  # weight is always there
+            yield worst_frame(lost.astype(np.float64), f"{name} of zero")
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
         yield hand
