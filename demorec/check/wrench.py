@@ -34,9 +34,9 @@ _LEAST_TORQUE = 0.012
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
 _LOST_SHARE = 0.5
 """Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
-_MOST_LAG, _CLEAR = 3, 0.6
-"""Frames up to which wrench and motors are shifted against each other; how far below the usual shift's error the best
-shift's must be."""
+_MOST_LAG, _CLEAR, _CHANGES = 3, 0.5, 0.01
+"""Frames up to which wrench and motors are shifted against each other; below which share of the usual shift's squares
+the best shift's must be; which share of its torque a motor's must change by."""
 
 
 def _motors(episode: CheckedEpisode) -> list[str]:
@@ -145,10 +145,11 @@ def wrench_turns_the_wrist(episode: CheckedEpisode) -> Found:
     measures="frames by which the wrench is off the torque of the wrist's motors",
 )
 def wrench_lag(episode: CheckedEpisode) -> Found:
-    """Wrench and efforts are of one instant: of all shifts against each other none fits the last motors best.
+    """Wrench and efforts are of one instant: of all shifts against each other none fits the last motors best. Where no
+    shift fits clearly, one of the two was filtered, or they do not belong together.
 
-    Of the last two, the one that tells the shift more clearly: at few frames a second noise moves what is between it
-    and the hand in a way that frames do not show.
+    Of the last two motors the one that tells the shift more clearly: at few frames a second noise moves what is between
+    it and the hand in a way that frames do not show.
     """
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
@@ -162,10 +163,14 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     for name in _motors(episode)[-2:]:
         needed, effort = _of_joint(episode, hand, name)
         off = np.array([float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags])
-        found.append((float(off.min() / max(np.median(off), 1e-12)), lags[int(np.argmin(off))], name))
+        usual = float(np.median(off))
+        if usual > (_CHANGES * float(np.sqrt((effort**2).mean()))) ** 2:
+            found.append((float(off.min()) / usual, lags[int(np.argmin(off))], name))
+    if not found:
+        return NotMeasured(why="the wrist's motors bear the same all the time")
     share, lag, name = min(found)
     if share > _CLEAR:
-        return NotMeasured(why="the wrist's motors bear too much the same all the time")
+        return Measurement(value=_MOST_LAG + 1, detail=f"no shift fits {name} clearly")
     return Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}")
 
 
