@@ -154,7 +154,8 @@ def starts_as_scene_says(episode: CheckedEpisode) -> Iterator[Found]:
 def penetration(episode: CheckedEpisode) -> Iterator[Found]:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules).
 
-    A hand that lowers something feels the support a frame late, and presses by what it went down since, or less.
+    A hand that lowers something feels the support a frame late, and presses it, and what is below, by what it went down
+    since, or less.
     """
     scene, c = episode.info.scene, episode.columns
     tcp = episode.world_from_tcp[:, :3, 3]
@@ -175,7 +176,8 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
             if other.movable or _is_at_surface(pose[near, :3, 3], body, other):
                 theirs = _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near])
                 depth = np.maximum(depth, theirs)
-            held = np.linalg.norm(pose[near, :3, 3] - tcp[near], axis=1) < _IN_HAND
+            across, above = pose[near, :2, 3] - tcp[near, :2], pose[near, 2, 3] - tcp[near, 2]
+            held = (np.linalg.norm(across, axis=1) < _IN_HAND) & (above < _IN_HAND)
             yield worst_frame(depth - held * pressed[near], f"{body.name} in {other.name}", frames=near)
     if movable:
         yield Measurement(value=0.0, detail="nothing comes near anything")

@@ -148,8 +148,8 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     """Wrench and efforts are of one instant: of all shifts against each other none fits the last motors best. Where no
     shift fits clearly, one of the two was filtered, or they do not belong together.
 
-    Of the last two motors the one that tells the shift more clearly: at few frames a second noise moves what is between
-    it and the hand in a way that frames do not show.
+    Of the last two motors those count that tell the shift clearly: at few frames a second noise moves what is between
+    them and the hand in a way that frames do not show.
     """
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
@@ -168,9 +168,11 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
             found.append((float(off.min()) / usual, lags[int(np.argmin(off))], name))
     if not found:
         return NotMeasured(why="the wrist's motors bear the same all the time")
-    share, lag, name = min(found)
+    share, _, name = min(found)
     if share > _CLEAR:
         return Measurement(value=_MOST_LAG + 1, detail=f"no shift fits {name} clearly")
+    told = [one for one in found if one[0] <= max(share, _CLEAR / 2)]
+    _, lag, name = max(told, key=lambda one: abs(one[1]))
     return Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}")
 
 

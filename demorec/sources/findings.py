@@ -28,6 +28,8 @@ FROZEN = 5
 """Images in a row with the same bytes: no camera without noise."""
 _SPIKE = 25.0
 """Times the usual step of an element."""
+_GOES_ON = 0.2
+"""Share of a step that the next one, or the one before, has in the same direction where something moves."""
 _EARLY_S = 0.05
 """By which a header may be later than its recording, in which it was no more: clocks that NTP sets differ by less."""
 LOST = 1.6
@@ -161,8 +163,12 @@ def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     for start in stream.layout.quaternions:
         signs |= dict.fromkeys(range(start, start + 4), _signs(elements.quaternion(start)))
     for column, (name, element) in enumerate(zip(names, elements, strict=True)):
-        steps = np.abs(np.diff(element * signs[column] if column in signs else element))
+        change = np.diff(element * signs[column] if column in signs else element)
+        steps = np.abs(change)
         usual = float(np.percentile(steps, 90))
+        # What begins to move after a long rest goes on, as an opening gripper does.
+        goes_on = change[1:] * change[:-1] > _GOES_ON * np.maximum(steps[1:], steps[:-1]) ** 2
+        steps[np.append(goes_on, False) | np.insert(goes_on, 0, False)] = 0.0
         largest = int(steps.argmax())
         if usual > 0 and steps[largest] > _SPIKE * usual:
             at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS
