@@ -194,7 +194,8 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     if not isinstance(hand, _Hand):
         yield hand
         return
-    free = hand.dynamics.is_judged
+    free = hand.dynamics.is_judged.copy()
+    free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
     weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
     off = np.hstack([hand.force - hand.loads_force, (hand.torque - hand.loads_torque) / _LEVER]) / weight
     of_wrench = _peaks(off).max(axis=1)
