@@ -33,7 +33,9 @@ OF_NUMBERS: dict[str, Callable[[Changed], Any]] = {
     "wrench two frames late": lambda c: c.columns.sensed["wrench"][:, 4],
     "efforts of two light joints exchanged": lambda c: c.columns.joint_effort[:, 4],
     "contact force four frames late": lambda c: c.columns.contact_force,
-    "an object slips by 15 mm": lambda c: c.columns.object_poses[faults.goal_object(c)][:, 2],
+    "an object slips by 15 mm": lambda c: (
+        c.columns.object_poses[faults.goal_object(c)][:, 2] - c.columns.base_from_tcp[:, 2]
+    ),
     "ten frames cut out": lambda c: c.columns.joint_position[:, 1],
 }
 """Fault of benchmarks/faults.py -> what is plotted of it."""
@@ -44,8 +46,8 @@ OF_IMAGES = (
 )
 """Faults of benchmarks/image_faults.py."""
 RED, GREY = "#c62828", "#9e9e9e"
-CROP = 72
-"""Pixels a side that are shown."""
+HIGH, WIDE = 64, 80
+"""Pixels of an image that are shown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +98,7 @@ def tiles_of_numbers(path: Path) -> list[Tile]:
 
 
 def tiles_of_images(path: Path) -> list[Tile]:
-    """Of the images: a part of a good one, and of the other."""
+    """Of the images: a part of a good one, and of the other; of depth, one column of pixels."""
     tiles = []
     with CheckedEpisode(path) as episode:
         good = {("front", "color"): image_faults.drawn_images(episode)["front"]}
@@ -105,29 +107,32 @@ def tiles_of_images(path: Path) -> list[Tile]:
         known = image_faults.COLOR if kind == "color" else image_faults.DEPTH
         rows = good["front", kind]
         spoilt = known[name](rows)
-        found = {result.check: result for result in image_faults.judge(path, {("front", kind): spoilt})}
-        result = worst(found)
-        pair = [part(images, spoilt, rows) for images in (rows, spoilt)]
+        result = worst({result.check: result for result in image_faults.judge(path, {("front", kind): spoilt})})
+        where = part(spoilt, rows)
 
-        def draw(axes: Axes, pair: Any = pair) -> None:
-            axes.imshow(np.hstack([pair[0], np.full((CROP, 2, 3), 255, np.uint8), pair[1]]), interpolation="nearest")
+        def draw(axes: Axes, kind: str = kind, where: Any = where, rows: Any = rows, spoilt: Any = spoilt) -> None:
+            if kind == "depth":
+                middle = rows.shape[2] // 2
+                axes.plot(rows[0, -60:, middle], color=GREY, linewidth=2.5)
+                axes.plot(spoilt[0, -60:, middle], color=RED, linewidth=1)
+                axes.tick_params(labelsize=6, colors="#757575")
+                return
+            gap = np.full((HIGH, 2, 3), 255, np.uint8)
+            axes.imshow(np.hstack([rows[where], gap, spoilt[where]]), interpolation="nearest")
             axes.set_axis_off()
 
-        tiles.append(Tile(name=f"{kind}: {name}" if kind == "depth" else name, result=result, draw=draw))
+        tiles.append(Tile(name=f"depth {name}" if kind == "depth" else name, result=result, draw=draw))
     return tiles
 
 
-def part(images: Any, spoilt: Any, good: Any) -> Any:
-    """(CROP, CROP, 3) of the image that differs most, around where it does."""
+def part(spoilt: Any, good: Any) -> Any:
+    """Frame, rows and columns of the image that differs most, around where it does."""
     off = np.abs(spoilt.astype(np.float32) - good).reshape(*good.shape[:3], -1).sum(axis=3)
     frame = int(np.argmax(off.sum(axis=(1, 2))))
     y, x = np.unravel_index(int(np.argmax(off[frame])), off[frame].shape)
     height, width = off[frame].shape
-    top, left = (int(np.clip(at - CROP // 2, 0, size - CROP)) for at, size in ((y, height), (x, width)))
-    image = images[frame][top : top + CROP, left : left + CROP]
-    if image.ndim == 2:  # depth in bands of 10 cm, so that 2 cm show
-        image = np.repeat((image % 0.1 * 2550).astype(np.uint8)[..., None], 3, axis=2)
-    return image
+    top, left = int(np.clip(y - HIGH // 2, 0, height - HIGH)), int(np.clip(x - WIDE // 2, 0, width - WIDE))
+    return frame, slice(top, top + HIGH), slice(left, left + WIDE)
 
 
 def main() -> None:
@@ -139,13 +144,13 @@ def main() -> None:
         path = Path(folder) / "good.mcap"
         assert record(GOOD, 0, path)
         tiles = [*tiles_of_images(path), *tiles_of_numbers(path)]
-    figure = Figure(figsize=(12, 8.4), dpi=100)
+    figure = Figure(figsize=(13, 7.2), dpi=100)
     for axes, tile in zip(figure.subplots(3, 4).flat, tiles, strict=True):
         tile.draw(axes)
         axes.set_title(tile.name, fontsize=9, loc="left")
         value, allowed, where = measured(tile.result)
         text = f"{tile.result.level}  {tile.result.check}: {value} (allowed {allowed})"
-        lines = [text, *textwrap.wrap(where, 48)[:1]]
+        lines = [text, *textwrap.wrap(where, 52)[:1]]
         axes.text(0, -0.14, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="top", color=RED)
         print(f"{tile.name}: {text}; {where}")
     figure.tight_layout(h_pad=2.5)

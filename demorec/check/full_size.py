@@ -7,8 +7,8 @@ frames before, which are taken from the recording. Depth and labels are stored w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -100,7 +100,7 @@ def encoded_again(
     Raises:
         ConfigError: This build of FFmpeg lacks the encoder.
     """
-    config = VideoConfig(
+    recorded = VideoConfig(
         codec=settings.codec,  # type: ignore[arg-type]
         gop=max(settings.gop, 1),
         crf=settings.crf,
@@ -110,16 +110,36 @@ def encoded_again(
     images: list[Rgb] = []
     for part in np.split(np.arange(len(frames)), np.flatnonzero(np.diff(frames) > 1) + 1):
         first = int(frames[part[0]])
-        lead = LEAD // config.gop * config.gop  # so that the first of them is a keyframe as it was
+        lead = LEAD // recorded.gop * recorded.gop  # so that the first of them is a keyframe as it was
         before = [seen[frame] for frame in range(max(first - lead, 0), first)]
-        encoder = make_encoder(config, settings.width, settings.height, settings.fps)
-        data = [packet for image in (*before, *(drawn[n] for n in part)) for packet in encoder.encode(image)]
-        packets = [
-            VideoPacket(frame_index=n, time_ns=0, data=packet, is_keyframe=n == 0)
-            for n, packet in enumerate([*data, *encoder.finish()])
-        ]
-        images += list(decode(settings, packets))[len(before) :]
+        true = np.stack([seen[int(frame)] for frame in frames[part]])
+        best, least = true, np.inf
+        for config in _qualities(recorded):
+            found = _encoded(settings, config, [*before, *(drawn[n] for n in part)])[len(before) :]
+            if (off := float(np.square(found.astype(np.float32) - true).sum())) < least:
+                best, least = found, off
+            if not off:
+                break
+        images += list(best)
     return np.stack(images)
+
+
+def _qualities(config: VideoConfig) -> Iterator[VideoConfig]:
+    """The quality that was asked for and those beside it: what an encoder makes of it depends on all images before."""
+    yield config
+    if config.crf is not None:
+        yield from (replace(config, crf=config.crf + step) for step in (-1, 1) if config.crf + step >= 0)
+
+
+def _encoded(settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb]) -> NDArray[np.uint8]:
+    """(N, H, W, 3) what an encoder makes of N images."""
+    encoder = make_encoder(config, settings.width, settings.height, settings.fps)
+    data = [packet for image in images for packet in encoder.encode(image)]
+    packets = [
+        VideoPacket(frame_index=n, time_ns=0, data=packet, is_keyframe=n == 0)
+        for n, packet in enumerate([*data, *encoder.finish()])
+    ]
+    return np.stack(list(decode(settings, packets)))
 
 
 def compare_full_size(

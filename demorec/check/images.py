@@ -31,6 +31,8 @@ MIN_MOTION = 2.5
 STALE_SHARE, STALE_EXCESS = 0.3, 2.5
 """An image is stale that shows less than this share of the motion, and is more unlike the drawn one than the usual
 image by more than this, of 255: a predicted image may leave a small motion to the next keyframe."""
+_VARIES = 0.3
+"""Share of the encoder's error by which that of a single image may be above the usual one."""
 _PREDICTED_WEIGHT = 0.25
 """Of the difference of a predicted image of AV1, which leaves whole motions to the next keyframe (15 levels seen)."""
 
@@ -138,7 +140,9 @@ def image_errors(camera: SceneCamera, compared: FullSize) -> Found:
 @of_each_camera
 def odd_images(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
     """No single image is another one, torn, blurred, shifted or off in colour."""
-    excess = _excess(compared)
+    full = episode.full_size(camera)
+    excess = _excess(compared) - (_VARIES * full.encoded if isinstance(full, FullSize) else 0.0)
+    excess = np.maximum(excess, 0.0)
     excess[~_is_exact(episode, camera)[: len(excess)]] *= _PREDICTED_WEIGHT
     return worst_frame(excess, f"camera {camera.name}")
 
