@@ -45,6 +45,10 @@ Rows = NDArray[Any]
 NS = 1_000_000_000
 JITTER_NS, LATENCY_NS, IMAGE_LATENCY_NS = 300_000, 500_000, 15_000_000
 """Of stamps, messages and images."""
+AHEAD_NS = 2_000_000
+"""By which a command is before the image that it stands beside."""
+NOISE = 1e-5
+"""Of encoders, rad, m."""
 IMAGE = "/camera/image_raw/compressed"
 
 
@@ -83,16 +87,17 @@ def read_episode(path: Path) -> Episode:
         rows = [*columns.joint_position, *(sample.joint_position for sample in samples)]
         order = np.unique(moments, return_index=True)[1][::2]
         camera = next(camera.name for camera in info.scene.cameras)
+        rng = np.random.default_rng(0)
         return Episode(
             names=info.robot.joint_names,
             state_ns=np.array(moments)[order],
-            state=np.array(rows)[order],
+            state=np.array(rows)[order] + rng.normal(0, NOISE, (len(order), columns.joint_position.shape[1])),
             time_ns=columns.time_ns,
-            frames=columns.joint_position,
+            frames=columns.joint_position + rng.normal(0, NOISE, columns.joint_position.shape),
             action=columns.command_joint_target,
             pose=columns.base_from_tcp,
             target=columns.command_base_from_tcp,
-            width=columns.gripper_width,
+            width=columns.gripper_width + rng.normal(0, NOISE, columns.num_frames),
             images=np.stack(list(recording.images(camera))),
             fps=info.fps,
         )
@@ -117,13 +122,15 @@ def joint_states(e: Episode, topic: str = "/joint_states") -> Notes:
 
 def joint_commands(e: Episode, topic: str = "/joint_command") -> Notes:
     names = list(e.names[: e.action.shape[1]])
-    return notes_of(topic, "sensor_msgs/msg/JointState", e.time_ns, lambda n: {"name": names, "position": e.action[n]})
+    return notes_of(
+        topic, "sensor_msgs/msg/JointState", e.time_ns - AHEAD_NS, lambda n: {"name": names, "position": e.action[n]}
+    )
 
 
 def trajectories(e: Episode) -> Notes:
     names = list(e.names[: e.action.shape[1]])
     return notes_of(
-        "/leader/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", e.time_ns,
+        "/leader/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", e.time_ns - AHEAD_NS,
         lambda n: {"joint_names": names, "points": [{"positions": e.action[n]}]},
     )  # fmt: skip
 
@@ -137,7 +144,8 @@ def poses(topic: str, e: Episode, rows: Rows) -> Notes:
         place, turn = dict(zip("xyz", rows[n, :3], strict=True)), dict(zip("xyzw", rows[n, 3:], strict=True))
         return {"pose": {"position": place, "orientation": turn}}
 
-    return notes_of(topic, "geometry_msgs/msg/PoseStamped", e.time_ns, body)
+    moments = e.time_ns - AHEAD_NS if rows is e.target else e.time_ns
+    return notes_of(topic, "geometry_msgs/msg/PoseStamped", moments, body)
 
 
 def compressed(e: Episode) -> Notes:
@@ -224,12 +232,12 @@ LAYOUTS: dict[str, Callable[[Episode, Path], Path]] = {
     ),
     "trajectories": lambda e, f: ros2([*joint_states(e), *trajectories(e), *compressed(e)], f),
     "a controller's commands": lambda e, f: ros2(
-        [*joint_states(e), *arrays("/forward_position_controller/commands", e.time_ns, e.action), *raw(e)], f
+        [*joint_states(e), *arrays("/forward_position_controller/commands", e.time_ns - AHEAD_NS, e.action), *raw(e)], f
     ),
     "topics of numbers": lambda e, f: sqlite(
         [
             *arrays("/robot_state/joint_positions", e.state_ns, e.state[:, : e.action.shape[1]]),
-            *arrays("/action/joint_position", e.time_ns, e.action),
+            *arrays("/action/joint_position", e.time_ns - AHEAD_NS, e.action),
             *raw(e),
         ],
         f,

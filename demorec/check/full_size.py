@@ -7,7 +7,7 @@ frames before, which are taken from the recording. Depth and labels are stored w
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,10 @@ BLOCK = 8
 """Pixels a side of the parts of an image that are judged by themselves: those of a transform in H.264."""
 LEAD = 6
 """Frames before those that are compared, by which the encoder finds its quality: its memory halves with each."""
+_STEPS = (0.0, 0.25, 0.5, -0.25, 0.75, -0.5, 1.0, -0.75, 1.25, -1.0)
+"""By which the quality of an image may be another one than was asked for, the likely ones first (units of CRF)."""
+_SAME = 0.05
+"""Of 255, mean square: images that differ by less are of one quality."""
 _PAIR = 2
 """Frames that are compared from a keyframe on: one of each kind."""
 _NEAR = 10
@@ -113,22 +117,33 @@ def encoded_again(
         lead = LEAD // recorded.gop * recorded.gop  # so that the first of them is a keyframe as it was
         before = [seen[frame] for frame in range(max(first - lead, 0), first)]
         true = np.stack([seen[int(frame)] for frame in frames[part]])
-        best, least = true, np.inf
-        for config in _qualities(recorded):
-            found = _encoded(settings, config, [*before, *(drawn[n] for n in part)])[len(before) :]
-            if (off := float(np.square(found.astype(np.float32) - true).sum())) < least:
-                best, least = found, off
-            if not off:
-                break
-        images += list(best)
+        images += list(_most_alike(settings, recorded, [*before, *(drawn[n] for n in part)], true))
     return np.stack(images)
 
 
-def _qualities(config: VideoConfig) -> Iterator[VideoConfig]:
-    """The quality that was asked for and those beside it: what an encoder makes of it depends on all images before."""
-    yield config
-    if config.crf is not None:
-        yield from (replace(config, crf=config.crf + step) for step in (-1, 1) if config.crf + step >= 0)
+def _most_alike(
+    settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb], recorded: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """What an encoder makes of the last of some images, at the quality that was asked for or one near it.
+
+    Which it takes depends on all images before: x264 remembers how much they showed.
+
+    Args:
+        settings, config: Of the encoder.
+        images: What it gets.
+        recorded: (N, H, W, 3) what it made of the last N of them.
+    """
+    best, least = recorded, np.inf
+    for step in _STEPS if config.codec == "h264" and config.crf is not None else _STEPS[:1]:
+        # A whole number to the user; x264 knows parts of it.
+        other = replace(config, crf=config.crf + step) if step and config.crf else config  # type: ignore[arg-type]
+        found = _encoded(settings, other, images)[-len(recorded) :]
+        off = float(np.square(found.astype(np.float32) - recorded).mean())
+        if off < least:
+            best, least = found, off
+        if least < _SAME:
+            break
+    return best
 
 
 def _encoded(settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb]) -> NDArray[np.uint8]:

@@ -164,7 +164,7 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     for name in _motors(episode)[-2:]:
         needed, effort = _of_joint(episode, hand, name)
         off = np.array([float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags])
-        size, usual = math.sqrt(max(float((rows**2).mean()) for rows in (needed, effort))), float(np.median(off))
+        size, usual = float(np.sqrt((effort**2).mean())), float(np.median(off))
         share, lag = float(off.min()) / max(usual, 1e-12), lags[int(np.argmin(off))]
         if share < _CLEAR:
             told.append(Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}"))
