@@ -1,16 +1,14 @@
-"""Calibrates the limits of `demorec check`: the largest value that each check finds in good recordings.
+"""Measures `demorec check` on good recordings: how many it wrongly reports, and the largest value of each check.
 
-    python benchmarks/check_limits.py                      # every task, robot and variation once
-    python benchmarks/check_limits.py --rounds 5 --anew    # five times, in other sizes, rates and codecs each time
-    python benchmarks/check_limits.py --part 2/5           # every fifth setting, from the second on
-    python benchmarks/check_limits.py --clean --rounds 2   # how many of other good episodes are told of, no more
-    python benchmarks/check_limits.py --numbers            # without cameras, ten times as fast; so with --clean
+    python benchmarks/check_limits.py --episodes 12 --out clean.jsonl    # of each task, robot and variation
+    python benchmarks/check_limits.py --episodes 12 --out clean.jsonl --numbers    # others without cameras: far faster
+    python benchmarks/check_limits.py --out clean.jsonl --episodes 0 --write    # into demorec/check/limits.toml
 
-Settings run over all tasks, robots and variations, and with each through sizes, frame rates, codecs and qualities,
-depth and segmentation. Successful episodes only; warnings and failures that they get are listed. What is found is
-merged into demorec/check/limits.toml (the larger value stays; `--anew` forgets what is there), whose limits this
-program leaves alone: it lists those that are too near. `--clean` measures the checks instead: default coding and rate,
-128 and 224 pixels, episodes of another seed; it writes nothing.
+Sizes, frame rates, codecs and their quality, cameras, depth and segmentation are drawn for each episode, small images
+more often. Episodes that stand in `--out` are not made again: the same command goes on after `--minutes` or Ctrl-C.
+Each successful episode that gets a warning or a failure is printed, then a table with a line a cell. `--write` merges
+the largest values into the table of limits (the larger one stays; `--anew` forgets what is there), whose limits stay as
+they are: those too near are listed.
 """
 
 from __future__ import annotations
@@ -18,13 +16,15 @@ from __future__ import annotations
 import argparse
 import datetime
 import itertools
+import json
+import random
 import tempfile
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from demorec.check.base import Result
 from demorec.check.limits import TABLE, LimitCalibration, LimitTable, read_table
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
@@ -32,60 +32,87 @@ from demorec.core.errors import SceneError
 from demorec.core.tables import ROBOTS, TASKS
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.mcap import EpisodeWriter
+from demorec.replay.deep import deep_check
 
-SIZES = ((128, 128), (224, 224), (96, 96), (64, 64), (320, 240), (640, 480))
-RATES = (30, 30, 60, 10, 20)
+SIZES = {
+    (64, 48): 8, (96, 72): 8, (96, 96): 6, (128, 96): 6, (128, 128): 4, (160, 120): 3, (224, 224): 2, (320, 240): 1,
+    (640, 480): 0.4,
+}  # fmt: skip
+RATES = {10: 6, 12: 2, 15: 3, 20: 4, 24: 1, 30: 4, 48: 1, 60: 1}
 VIDEOS = (
-    VideoConfig(),
-    VideoConfig(codec="av1"),
-    VideoConfig(codec="jpeg"),
-    VideoConfig(crf=30),
-    VideoConfig(codec="av1", crf=35),
-    VideoConfig(gop=30),
-    VideoConfig(codec="jpeg", jpeg_quality=60),
+    *(VideoConfig(), VideoConfig(), VideoConfig(crf=30), VideoConfig(crf=18), VideoConfig(gop=30)),
+    *(VideoConfig(codec="jpeg"), VideoConfig(codec="jpeg", jpeg_quality=60)),
+    *(VideoConfig(codec="av1"), VideoConfig(codec="av1", crf=35)),
 )
+CAMERAS = (("front", "wrist"), ("front", "wrist"), ("front",), ("wrist",), ("top", "wrist"), ("workspace",))
 VARIATIONS = ("none", "mild", "full")
+Cell = tuple[str, str, str]
 
 
-def settings(seed: int, turn: int) -> Iterator[GenerateConfig]:
-    """Every task, robot and variation; the lists above turn beside them at rates of their own, from `turn` on."""
-    every = itertools.product(VARIATIONS, ROBOTS.names(), TASKS.names())
-    for number, (variation, robot, task) in enumerate(every, start=turn):
-        width, height = SIZES[number % len(SIZES)]
-        extra = number % 4 == 3
-        yield GenerateConfig(
-            task=task,
-            robot=robot,
-            variation=variation,  # type: ignore[arg-type]
-            seed=seed,
-            fps=RATES[number % len(RATES)],
-            width=width,
-            height=height,
-            video=VIDEOS[number % len(VIDEOS)],
-            depth=extra,
-            segmentation=extra,
-        )
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One episode.
+
+    Attributes:
+        seed, index, numbers: Which one; `numbers` is one without cameras.
+        settings: In words.
+        success: Whether the task was.
+        alarms: Of each check that did not pass: level, name, value, frame, detail.
+        values: Check -> what it found.
+        deep: Of `check --deep`, "" where that was not run.
+    """
+
+    task: str
+    robot: str
+    variation: str
+    seed: int
+    index: int
+    numbers: bool
+    settings: str = ""
+    success: bool = False
+    alarms: Sequence[Sequence[object]] = ()
+    values: Mapping[str, float]
+    deep: str = ""
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Which episode it is."""
+        return self.task, self.robot, self.variation, self.seed, self.index, self.numbers
+
+    @property
+    def level(self) -> str:
+        """The worst."""
+        levels = {alarm[0] for alarm in self.alarms} | {self.deep}
+        return "fail" if "fail" in levels else "warn" if "warn" in levels else "pass"
 
 
-def clean_settings(seed: int) -> Iterator[GenerateConfig]:
-    """Every task, robot and variation in two sizes, all else as `generate-dataset` has it."""
-    for variation, robot, task, size in itertools.product(VARIATIONS, ROBOTS.names(), TASKS.names(), (128, 224)):
-        yield GenerateConfig(
-            task=task,
-            robot=robot,
-            variation=variation,  # type: ignore[arg-type]
-            seed=seed,
-            width=size,
-            height=size,
-        )
+def drawn_config(cell: Cell, seed: int, index: int, *, numbers: bool) -> GenerateConfig:
+    """What is chosen beside task, robot and variation."""
+    rng = random.Random(f"{cell} {seed} {index}")
+    width, height = rng.choices(list(SIZES), list(SIZES.values()))[0]
+    extra = rng.random() < 0.2
+    config = GenerateConfig(
+        task=cell[0],
+        robot=cell[1],
+        variation=cell[2],  # type: ignore[arg-type]
+        seed=seed,
+        fps=rng.choices(list(RATES), list(RATES.values()))[0],
+        width=width,
+        height=height,
+        video=rng.choice(VIDEOS),
+        cameras=rng.choice(CAMERAS),
+        depth=extra,
+        segmentation=extra,
+    )
+    return replace(config, cameras=(), depth=False, segmentation=False) if numbers else config
 
 
-def record(config: GenerateConfig, index: int, path: Path) -> bool:
-    """Make one episode; whether it succeeded."""
+def record(config: GenerateConfig, index: int, path: Path) -> bool | None:
+    """Make one episode; whether it succeeded, None where the layout does not fit."""
     try:
         episode = prepare(EpisodePlan(config=config, episode_index=index))
     except SceneError:
-        return False
+        return None
     with (
         make_world(episode.info) as world,
         make_renderer(episode.info) as renderer,
@@ -98,9 +125,90 @@ def record(config: GenerateConfig, index: int, path: Path) -> bool:
     return bool(session.outcome.success)
 
 
-def written(table: LimitTable) -> str:
+def measured(config: GenerateConfig, index: int, path: Path, *, deep: bool) -> Row:
+    """Make and check one episode."""
+    row = Row(
+        task=config.task,
+        robot=config.robot,
+        variation=config.variation,
+        seed=config.seed,
+        index=index,
+        numbers=not config.cameras,
+        values={},
+    )
+    success = record(config, index, path)
+    if success is None:
+        return row
+    video = config.video
+    quality = video.jpeg_quality if video.codec == "jpeg" else video.crf
+    found = check_subject(Subject(path=path, kind="recording"), CheckOptions()).results
+    return replace(
+        row,
+        settings=f"{config.width}x{config.height} {'+'.join(config.cameras)} {config.fps} fps {video.codec} {quality} "
+        f"gop {video.gop}{' depth' * config.depth}",
+        success=success,
+        alarms=[(r.level, r.check, r.value, r.frame, r.detail) for r in found if r.level in ("warn", "fail")],
+        values={r.check: r.value for r in found if r.value is not None},
+        deep=deep_check(path).level if deep else "",
+    )
+
+
+def rows_to_make(options: argparse.Namespace, known: set[tuple[object, ...]]) -> Iterator[Row]:
+    """Rows of the episodes that are missing, until the time is over."""
+    end = time.monotonic() + 60 * options.minutes
+    robots = ROBOTS.names() if options.robots == ["all"] else options.robots
+    tasks = TASKS.names() if options.tasks == ["all"] else options.tasks
+    pairs = [(t, r) for t in tasks for r in robots if not TASKS.load(t).refusal(ROBOTS.load(r))]
+    cells = [(task, robot, variation) for (task, robot), variation in itertools.product(pairs, VARIATIONS)]
+    with tempfile.TemporaryDirectory() as folder:
+        # Cell after cell within each index, so that one can stop at any time.
+        for number, (index, cell) in enumerate(itertools.product(range(options.episodes), cells)):
+            config = drawn_config(cell, options.seed, index, numbers=options.numbers)
+            if (*cell, options.seed, index, options.numbers) not in known and time.monotonic() < end:
+                yield measured(config, index, Path(folder) / "episode.mcap", deep=number % options.deep_every == 1)
+
+
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    """A line a cell, and one for all."""
+    cells: dict[Cell, list[Row]] = defaultdict(list)
+    for row in rows:
+        cells[row.task, row.robot, row.variation].append(row)
+    yield "| task | robot | variation | episodes | successes | warned of | failed | made again: the same |"
+    yield "|---|---|---|---|---|---|---|---|"
+    for name, members in [*cells.items(), (("all", "", ""), list(rows))]:
+        levels = [row.level for row in members if row.success]
+        again = [row.deep for row in members if row.deep]
+        made, warned, failed = sum(bool(row.values) for row in members), levels.count("warn"), levels.count("fail")
+        yield (
+            f"| {' | '.join(name)} | {made} | {len(levels)} | {warned} | {failed} "
+            f"| {again.count('pass')} of {len(again)} |"
+        )
+
+
+def write_limits(rows: Sequence[Row], options: argparse.Namespace) -> None:
+    """Merge the largest values into the table and list limits that are too near."""
+    before = read_table()
+    good = [row for row in rows if row.success]
+    checks = {}
+    for name, limit in before.checks.items():
+        values = [row.values[name] for row in good if name in row.values]
+        largest = max([0.0 if options.anew else limit.largest, *values])
+        checks[name] = replace(limit, largest=round(largest, 6))
+        if largest * before.calibration.margin > limit.warn:
+            print(f"too near: {name} warns above {limit.warn:g}, the largest value is {largest:g}")
+    calibration = LimitCalibration(
+        seed=options.seed,
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        episodes=len(good) + (0 if options.anew else before.calibration.episodes),
+        settings="all tasks, robots and variations; sizes, rates, codecs and qualities are drawn for each episode",
+        margin=before.calibration.margin,
+    )
+    TABLE.write_text(written(LimitTable(calibration=calibration, checks=checks)))
+
+
+def written(limits: LimitTable) -> str:
     """The table as TOML."""
-    c = table.calibration
+    c = limits.calibration
     lines = [
         "# Written by benchmarks/check_limits.py but for the limits, which are set by hand (demorec/check/limits.py).",
         "",
@@ -111,96 +219,36 @@ def written(table: LimitTable) -> str:
         f'settings = "{c.settings}"',
         f"margin = {c.margin}",
     ]
-    for name, limit in table.checks.items():
+    for name, limit in limits.checks.items():
         lines += ["", f"[checks.{name}]", f"warn = {limit.warn}", f"fail = {limit.fail}", f"largest = {limit.largest}"]
     return "\n".join(lines) + "\n"
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, tell, write."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    """Make what is missing, print all, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=2026)
-    parser.add_argument("--part", default="1/1", help="K/N: every N-th setting from the K-th on")
-    parser.add_argument("--rounds", type=int, default=1, help="over all tasks, robots and variations")
-    parser.add_argument("--first", type=int, default=0, help="the first round, which is the index of its episodes")
-    parser.add_argument("--anew", action="store_true", help="forget the values in the table")
+    parser.add_argument("--episodes", type=int, default=1, help="of each cell (task, robot, variation)")
+    parser.add_argument("--tasks", nargs="+", default=["all"], help="names, or all")
+    parser.add_argument("--robots", nargs="+", default=["all"], help="names, or all")
     parser.add_argument("--numbers", action="store_true", help="no cameras: only what checks see in numbers")
-    parser.add_argument("--clean", action="store_true", help="count episodes that are told of; write nothing")
+    parser.add_argument("--deep-every", type=int, default=30, help="one of so many is also made again")
+    parser.add_argument("--minutes", type=float, default=1e6, help="start no episode after so long")
+    parser.add_argument("--out", type=Path, help="a line of JSON for each episode; what stands there is not made again")
+    parser.add_argument("--write", action="store_true", help="merge the largest values into the table of limits")
+    parser.add_argument("--anew", action="store_true", help="and forget those that are there")
     options = parser.parse_args(argv)
-    first, step = (int(word) for word in options.part.split("/"))
-    if options.clean:
-        found = clean_settings(options.seed + 1)
-        if options.numbers:  # another size says nothing of numbers, another rate does
-            found = (replace(c, cameras=(), fps=RATES[k % len(RATES)]) for k, c in enumerate(found))
-        count_clean(itertools.islice(found, first - 1, None, step), options)
-        return
-    before = read_table()
-    largest = {name: 0.0 if options.anew else limit.largest for name, limit in before.checks.items()}
-    count = 0 if options.anew else before.calibration.episodes
-    with tempfile.TemporaryDirectory() as folder:
-        for index in range(options.first, options.first + options.rounds):
-            for config in itertools.islice(settings(options.seed, index), first - 1, None, step):
-                config = replace(config, cameras=()) if options.numbers else config
-                count += measure(config, index, Path(folder) / "episode.mcap", largest)
-                # After each episode, so that one can stop at any time.
-                write_table(largest, seed=options.seed, episodes=count)
-    print(f"{count} episodes in all; limits that are too near:")
-    for name, limit in read_table().checks.items():
-        if largest.get(name, 0.0) * before.calibration.margin > limit.warn:
-            print(f"  {name}: warns above {limit.warn:g}, the largest value is {largest.get(name, 0.0):g}")
-
-
-def count_clean(found: Iterator[GenerateConfig], options: argparse.Namespace) -> None:
-    """Check good episodes, tell how many of them got a warning or failed."""
-    levels: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "episode.mcap"
-        for number, config in enumerate(found, start=1):
-            for index in range(options.first, options.first + options.rounds):
-                if record(config, index, path):
-                    said = {result.level for result in results(config, index, path)}
-                    levels["fail" if "fail" in said else "warn" if "warn" in said else "pass"] += 1
-            if number % 10 == 0:
-                print(f"{number} settings: {dict(levels)}")
-    print(f"{levels.total()} good episodes: {levels['warn']} with warnings, {levels['fail']} failed")
-
-
-def write_table(largest: Mapping[str, float], *, seed: int, episodes: int) -> None:
-    """The limits as they are now, with what was measured."""
-    before = read_table()
-    calibration = LimitCalibration(
-        seed=seed,
-        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
-        episodes=episodes,
-        settings="rounds over all tasks, robots and variations; sizes, rates, codecs and qualities turn beside them",
-        margin=before.calibration.margin,
-    )
-    checks = {
-        name: replace(limit, largest=round(largest.get(name, limit.largest), 6))
-        for name, limit in before.checks.items()
-    }
-    TABLE.write_text(written(LimitTable(calibration=calibration, checks=checks)))
-
-
-def measure(config: GenerateConfig, index: int, path: Path, largest: dict[str, float]) -> int:
-    """Check one good episode, keep the largest values; how many episodes that were (a failed one is none)."""
-    if not record(config, index, path):
-        return 0
-    for result in results(config, index, path):
-        if result.check in largest and result.value is not None:
-            largest[result.check] = max(largest[result.check], result.value)
-    return 1
-
-
-def results(config: GenerateConfig, index: int, path: Path) -> tuple[Result, ...]:
-    """Of all checks of an episode; those that it does not pass are told."""
-    said = config.task, config.robot, config.variation, f"{config.width}x{config.height}", f"{config.fps} fps"
-    found = check_subject(Subject(path=path, kind="recording"), CheckOptions()).results
-    for result in found:
-        if result.level in ("warn", "fail"):
-            coded = f"{config.video.codec} crf {config.video.crf}"
-            print(*said, coded, index, result.level, result.check, result.value, result.frame, result.detail)
-    return found
+    rows = [Row(**json.loads(line)) for line in options.out.open()] if options.out and options.out.exists() else []
+    for row in rows_to_make(options, {row.key for row in rows}):
+        rows.append(row)
+        if options.out:
+            with options.out.open("a") as file:
+                file.write(json.dumps(asdict(row)) + "\n")
+        if row.level != "pass" and row.success:
+            print(json.dumps(asdict(replace(row, values={}))), flush=True)
+    print("\n".join(table(rows)))
+    if options.write:
+        write_limits(rows, options)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
 from demorec.core.tables import ROBOTS, TASKS
 from demorec.episode.episode import Frame
+from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.loop.prepare import Episode
@@ -179,13 +180,16 @@ def _poses(frames: Sequence[Frame], body: Body) -> Array:
 
 
 def _pieces(body: Body) -> list[Convex]:
-    """What PyBullet makes of a body: a mesh becomes its convex hull."""
+    """What PyBullet makes of a body: a mesh from a file becomes its convex hull, one in the scene has its parts."""
     shape = body.shape
     if shape.kind == "urdf":
         path = asset_path(shape.file)
         return [p for link in read_links(path.read_text(), scale=shape.scale) for p in _parts(link, path.parent)]
     if shape.kind == "mesh":
-        return [_hull(asset_path(shape.file), (shape.scale,) * 3).moved(shape.body_from_mesh.matrix())]
+        hulls = (
+            _parts_of(shape.mesh, shape.scale) if shape.mesh else [_hull(asset_path(shape.file), (shape.scale,) * 3)]
+        )
+        return [hull.moved(shape.body_from_mesh.matrix()) for hull in hulls]
     return [Convex.of_shape(shape)]
 
 
@@ -203,7 +207,19 @@ def _hull(path: Path, scale: tuple[float, ...]) -> Convex:
     import trimesh
 
     mesh = trimesh.load(path, force="mesh", process=False)
-    hull = trimesh.convex.convex_hull(np.asarray(mesh.vertices) * np.array(scale))
+    return _hull_of(np.asarray(mesh.vertices) * np.array(scale))
+
+
+@functools.lru_cache(maxsize=64)
+def _parts_of(text: str, scale: float) -> list[Convex]:
+    mesh = decode_mesh(text)
+    return [_hull_of(scale * mesh.points[rows]) for rows in mesh.parts]
+
+
+def _hull_of(points: Array) -> Convex:
+    import trimesh
+
+    hull = trimesh.convex.convex_hull(points)
     return Convex(points=np.asarray(hull.vertices), axes=np.unique(hull.face_normals.round(6), axis=0).T)
 
 
@@ -269,6 +285,7 @@ def main() -> None:
     configs = [
         GenerateConfig(task=task, robot=robot, variation=variation, seed=args.seed, split=args.split, cameras=())
         for task, robot, variation in itertools.product(tasks, robots, args.variations)
+        if not TASKS.load(task).refusal(ROBOTS.load(robot))
     ]
     rows = [Row(**json.loads(line)) for line in args.out.open()] if args.out and args.out.exists() else []
     known = {(row.task, row.robot, row.variation, row.seed, row.split, row.index) for row in rows}

@@ -8,12 +8,13 @@ frames before, which are taken from the recording. Depth and labels are stored w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.cells import CellGrid
 from demorec.core.config import VideoConfig
 from demorec.core.geometry import Array
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, make_encoder
@@ -22,6 +23,10 @@ BLOCK = 8
 """Pixels a side of the parts of an image that are judged by themselves: those of a transform in H.264."""
 LEAD = 6
 """Frames before those that are compared, by which the encoder finds its quality: its memory halves with each."""
+_STEPS = (0.0, 0.25, 0.5, -0.25, 0.75, -0.5, 1.0, -0.75, 1.25, -1.0)
+"""By which the quality of an image may be another one than was asked for, the likely ones first (units of CRF)."""
+_SAME = 0.05
+"""Of 255, mean square: images that differ by less are of one quality."""
 _PAIR = 2
 """Frames that are compared from a keyframe on: one of each kind."""
 _NEAR = 10
@@ -50,6 +55,7 @@ class FullSize:
         color_frame: Where that is.
         errors: (N,) the image's error, of its worst block or of nine tenths of them, in units of the encoder's own;
             later ones weigh less.
+        encoded: By how much the encoder makes the cells of an image unlike the drawn ones, root mean square, of 255.
     """
 
     frames: NDArray[np.int64]
@@ -58,6 +64,7 @@ class FullSize:
     color: float
     color_frame: int
     errors: Array
+    encoded: float
 
 
 def frames_to_compare(keyframes: NDArray[np.int64], count: int, detail: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -97,7 +104,7 @@ def encoded_again(
     Raises:
         ConfigError: This build of FFmpeg lacks the encoder.
     """
-    config = VideoConfig(
+    recorded = VideoConfig(
         codec=settings.codec,  # type: ignore[arg-type]
         gop=max(settings.gop, 1),
         crf=settings.crf,
@@ -107,16 +114,47 @@ def encoded_again(
     images: list[Rgb] = []
     for part in np.split(np.arange(len(frames)), np.flatnonzero(np.diff(frames) > 1) + 1):
         first = int(frames[part[0]])
-        lead = LEAD // config.gop * config.gop  # so that the first of them is a keyframe as it was
+        lead = LEAD // recorded.gop * recorded.gop  # so that the first of them is a keyframe as it was
         before = [seen[frame] for frame in range(max(first - lead, 0), first)]
-        encoder = make_encoder(config, settings.width, settings.height, settings.fps)
-        data = [packet for image in (*before, *(drawn[n] for n in part)) for packet in encoder.encode(image)]
-        packets = [
-            VideoPacket(frame_index=n, time_ns=0, data=packet, is_keyframe=n == 0)
-            for n, packet in enumerate([*data, *encoder.finish()])
-        ]
-        images += list(decode(settings, packets))[len(before) :]
+        true = np.stack([seen[int(frame)] for frame in frames[part]])
+        images += list(_most_alike(settings, recorded, [*before, *(drawn[n] for n in part)], true))
     return np.stack(images)
+
+
+def _most_alike(
+    settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb], recorded: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """What an encoder makes of the last of some images, at the quality that was asked for or one near it.
+
+    Which it takes depends on all images before: x264 remembers how much they showed.
+
+    Args:
+        settings, config: Of the encoder.
+        images: What it gets.
+        recorded: (N, H, W, 3) what it made of the last N of them.
+    """
+    best, least = recorded, np.inf
+    for step in _STEPS if config.codec == "h264" and config.crf is not None else _STEPS[:1]:
+        # A whole number to the user; x264 knows parts of it.
+        other = replace(config, crf=config.crf + step) if step and config.crf else config  # type: ignore[arg-type]
+        found = _encoded(settings, other, images)[-len(recorded) :]
+        off = float(np.square(found.astype(np.float32) - recorded).mean())
+        if off < least:
+            best, least = found, off
+        if least < _SAME:
+            break
+    return best
+
+
+def _encoded(settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb]) -> NDArray[np.uint8]:
+    """(N, H, W, 3) what an encoder makes of N images."""
+    encoder = make_encoder(config, settings.width, settings.height, settings.fps)
+    data = [packet for image in images for packet in encoder.encode(image)]
+    packets = [
+        VideoPacket(frame_index=n, time_ns=0, data=packet, is_keyframe=n == 0)
+        for n, packet in enumerate([*data, *encoder.finish()])
+    ]
+    return np.stack(list(decode(settings, packets)))
 
 
 def compare_full_size(
@@ -135,6 +173,8 @@ def compare_full_size(
     off, own = np.zeros((count, height // BLOCK, width // BLOCK)), np.zeros((count, height // BLOCK, width // BLOCK))
     kernels.block_errors(seen, expected, drawn, BLOCK, off, own)
     color, frame = _worst_color(colors)
+    grid = CellGrid(width, height)
+    cells = [[grid.read("color", image).cells for image in images] for images in (expected, drawn)]
     return FullSize(
         frames=frames,
         displacement=float(np.hypot(*moved[:2]) + np.abs(moved[2:6]).max() * min(height, width) / 4),
@@ -143,6 +183,7 @@ def compare_full_size(
         color_frame=int(frames[frame]),
         errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)])
         * np.where(frames < frames[0] + _PAIR, 1.0, _LATER_WEIGHT),
+        encoded=float(np.sqrt(np.mean(np.subtract(*cells) ** 2))),
     )
 
 
@@ -151,18 +192,25 @@ def _worst_color(sums: Array) -> tuple[float, int]:
 
     Over all images, and in each at half its weight: there the encoder's quality may be a little another one.
     """
-    each = _ratio(sums) / 2
+    each = _ratio(sums, sums[..., :1]) / 2
     number = int(np.argmax(each))
-    return max(float(_ratio(sums.sum(axis=0)[None])[0]), float(each[number])), number
+    # What stands still is encoded alike in all of them: more images are no more blocks.
+    most = sums[..., :1].max(axis=0, keepdims=True)
+    return max(float(_ratio(sums.sum(axis=0, keepdims=True), most)[0]), float(each[number])), number
 
 
-def _ratio(sums: Array) -> Array:
-    """(N,) of each image the largest of any colour, in units of the encoder's error, one level at least."""
-    pixels = sums[..., :1]
-    mean = np.abs(sums[..., 1:4]) / np.maximum(pixels, 1)
-    own = np.sqrt(sums[..., 4:] / np.maximum(pixels, 1))
+def _ratio(sums: Array, different: Array) -> Array:
+    """(N,) of each image the largest of any colour, in units of the encoder's error, one level at least.
+
+    Args:
+        sums: (N, 64, 7) as of `_worst_color`.
+        different: (N, 64, 1) how many pixels of the colour are not those of another image once more.
+    """
+    pixels = np.maximum(sums[..., :1], 1)
+    mean = np.abs(sums[..., 1:4]) / pixels
+    own = np.sqrt(sums[..., 4:] / pixels)
     # Of a few blocks the encoder's errors do not cancel.
-    weight = np.minimum(np.sqrt(pixels / _MANY_PIXELS), 1.0) * (pixels >= _LEAST_PIXELS)
+    weight = np.minimum(np.sqrt(different / _MANY_PIXELS), 1.0) * (different >= _LEAST_PIXELS)
     return np.asarray((mean / np.maximum(own, 1.0) * weight).max(axis=(1, 2)))
 
 

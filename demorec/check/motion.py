@@ -157,7 +157,7 @@ def joint_limits(subject: Moving) -> Iterator[Found]:
 @motion_check(
     measures="largest speed of a joint in units of its limit",
     warn=1.2,
-    fail=3,
+    fail=2.5,
     simulated=(1.1, 1.5),
     needs=URDF,
 )

@@ -19,6 +19,8 @@ COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""
 _GAP = 0.005
 """Metres above a support from which on it bears nothing."""
+_CARRIED = 0.01
+"""Metres above its start from which on a hand may carry something."""
 _PRESSED, _IN_HAND = 0.002, 0.05
 """Metres by which a hand presses what it lowers into a support at most, and of what it holds from its TCP."""
 SOLID = ("box", "sphere", "cylinder", "capsule")
@@ -152,7 +154,8 @@ def starts_as_scene_says(episode: CheckedEpisode) -> Iterator[Found]:
 def penetration(episode: CheckedEpisode) -> Iterator[Found]:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules).
 
-    A hand that lowers something feels the support a frame late, and presses by what it went down since, or less.
+    A hand that lowers something feels the support a frame late, and presses it, and what is below, by what it went down
+    since, or less.
     """
     scene, c = episode.info.scene, episode.columns
     tcp = episode.world_from_tcp[:, :3, 3]
@@ -173,7 +176,8 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
             if other.movable or _is_at_surface(pose[near, :3, 3], body, other):
                 theirs = _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near])
                 depth = np.maximum(depth, theirs)
-            held = np.linalg.norm(pose[near, :3, 3] - tcp[near], axis=1) < _IN_HAND
+            across, above = pose[near, :2, 3] - tcp[near, :2], pose[near, 2, 3] - tcp[near, 2]
+            held = (np.linalg.norm(across, axis=1) < _IN_HAND) & (above < _IN_HAND)
             yield worst_frame(depth - held * pressed[near], f"{body.name} in {other.name}", frames=near)
     if movable:
         yield Measurement(value=0.0, detail="nothing comes near anything")
@@ -262,6 +266,22 @@ def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
             yield Measurement(value=int(wrong.sum()), frame=frame + 1, detail=detail)
         else:
             yield Measurement(value=0, detail=f"{body.name} travels {int(travelling.sum())} frames")
+
+
+@physics_check(
+    measures="how far an object moves in the hand while nothing else bears it",
+    unit="m",
+)
+def slips(episode: CheckedEpisode) -> Iterator[Found]:
+    """What fingers press on in the air stays where it is in the hand, from one frame of it to any other."""
+    c, hand = episode.columns, inverse(episode.world_from_tcp)
+    for body in episode.info.scene.movable:
+        pose = episode.world_from_object(body.name)
+        held = episode.is_carried(body.name, _CARRIED) & (c.contact_force > 0) & ~_is_borne(episode, body, pose)
+        length, start = longest_run(held)
+        place = (hand @ pose)[start : start + length, :3, 3]
+        off = np.linalg.norm(place - np.median(place, axis=0), axis=1) if length else np.zeros(0)
+        yield worst_frame(off, body.name, first=start)
 
 
 @physics_check(

@@ -36,7 +36,7 @@ target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
 @target_check(
     measures="frames by which the state is too early for its action, or too late",
     warn=0.75,
-    fail=1.5,
+    fail=0.95,
     group="alignment",
 )
 def state_follows_action(subject: Moving) -> Found:
@@ -146,26 +146,27 @@ def action_is_no_observation(subject: Moving) -> Found:
     measures="how far the action of a joint goes while its state stays at one value, median of all such times",
     unit="rad, m",
     warn=0.008,
-    fail=float("inf"),
+    fail=0.015,
     needs=f"{ACTIONS}, and {URDF}",
 )
 def dead_band(subject: Moving) -> Found:
     """A joint's state changes when its action does: catches play between encoder and joint, and coarse encoders.
 
     An encoder has a thousandth of a turn or finer, 0.006 rad; clean data have 0.004. A joint that waits once, or is
-    blocked, has no dead band.
+    blocked, has no dead band, nor has a state of which all elements stay, being measured less often than frames are.
     """
     if not subject.motions.targets:
         return NotMeasured(why=_NO_TARGETS)
     ways: dict[str, list[float]] = {}
     for motion in subject.motions.all:
         known = np.isfinite(motion.lower) & (np.arange(len(motion.names)) != motion.gripper)
+        measured = np.append(0, np.cumsum((np.abs(np.diff(motion.state, axis=0)) > _STAYS).any(axis=1)))
         for element in np.flatnonzero(known).tolist():
             if motion.action is None or not np.isfinite(action := motion.action[:, element]).all():
                 continue
             changes = np.flatnonzero(np.abs(np.diff(motion.state[:, element])) > _STAYS) + 1
             begins, ends = np.append(0, changes), np.append(changes, len(action)) - 1
-            way = np.abs(action[ends] - action[begins])
+            way = np.abs(action[ends] - action[begins]) * (measured[ends] > measured[begins])
             ways.setdefault(motion.names[element], []).extend(way[way > _GOES].tolist())
     if not ways:
         return Lacking(need=URDF)

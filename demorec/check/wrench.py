@@ -26,11 +26,22 @@ from demorec.core.geometry import Array
 
 _LEVER = 0.2
 """Metres at which a torque counts as much as a force."""
+_GRIP = 0.25
+"""Of the force with which fingers hold something, which counts beside the weight: the wrench is what is left of forces
+that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as force (0.95 N of 40 N)."""
 _LEAST_TORQUE = 0.012
 """N m below which nothing is said: motors of wrists that bear less differ from the wrench by up to 0.0063 N m (of 145
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
-_MOST_LAG = 3
-"""Frames up to which wrench and motors are shifted against each other."""
+_LOST_SHARE = 0.5
+"""Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
+_MOST_LAG, _CLEAR, _UNCLEAR = 3, 0.25, 0.5
+"""Frames up to which wrench and motors are shifted against each other; below which share of the usual shift's squares
+the best shift's is clear, and above which none fits: good recordings have 0.03, of arms of few joints 0.31."""
+
+
+def _motors(episode: CheckedEpisode) -> list[str]:
+    """Joints of the arm, but for one that the hand is on itself: its motor's torque is no load of it."""
+    return [name for name in episode.info.robot.arm_joints if name != _mount(episode)]
 
 
 class _Hand(NamedTuple):
@@ -92,15 +103,18 @@ def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
         free = free & (c.contact_force == 0)  # a constraint that holds an object is no load of the hand's joint
     lifted = {name: free & episode.is_carried(name, LIFTED_HEIGHT) for name in c.object_poses}
     empty = free & ~np.any([*lifted.values(), np.zeros_like(free)], axis=0)
+    grips = {"nothing": empty, **lifted}
     found = [
-        _unborne(hand, rows, what) for what, rows in (("nothing", empty), *lifted.items()) if rows.sum() >= MIN_FRAMES
+        _unborne(hand, rows, c.contact_force[rows], what) for what, rows in grips.items() if rows.sum() >= MIN_FRAMES
     ]
     return worst(*found) or NotMeasured(why=f"the hand is free and moves smoothly in fewer than {MIN_FRAMES} frames")
 
 
-def _unborne(hand: _Hand, rows: NDArray[np.bool_], what: str) -> Measurement:
-    """What force and torque differ by in some frames, in units of the weight that is borne."""
-    weight = float(np.median(np.linalg.norm(hand.loads_force[rows], axis=1)))
+def _unborne(hand: _Hand, rows: NDArray[np.bool_], grip: Array, what: str) -> Measurement:
+    """What force and torque differ by in some frames, in units of the weight that is borne, and of the grip's force."""
+    weight = math.hypot(
+        float(np.median(np.linalg.norm(hand.loads_force[rows], axis=1))), _GRIP * float(np.median(grip))
+    )
     off = np.hstack([hand.force - hand.loads_force, (hand.torque - hand.loads_torque) / _LEVER])[rows]
     along = np.einsum("tji,tkj->tki", hand.rotation[rows], off.reshape(-1, 2, 3))
     force, torque = np.linalg.norm(np.median(along, axis=0), axis=1) / weight
@@ -120,9 +134,7 @@ def wrench_turns_the_wrist(episode: CheckedEpisode) -> Found:
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
         return hand
-    # Where the hand is on the last joint itself, that motor's own torque is no load of the joint.
-    joints = [name for name in episode.info.robot.arm_joints if name != _mount(episode)]
-    needed, effort = _of_joint(episode, hand, joints[-1])
+    needed, effort = _of_joint(episode, hand, _motors(episode)[-1])
     if len(needed) < MIN_FRAMES or max(np.abs(needed).max(), np.abs(effort).max()) < _LEAST_TORQUE:
         return NotMeasured(why="the last motor has nothing to turn")
     size = max(float((effort**2).mean()), _LEAST_TORQUE**2)
@@ -133,7 +145,12 @@ def wrench_turns_the_wrist(episode: CheckedEpisode) -> Found:
     measures="frames by which the wrench is off the torque of the wrist's motors",
 )
 def wrench_lag(episode: CheckedEpisode) -> Found:
-    """Wrench and efforts are of one instant: of all shifts against each other none fits the last motor but one best."""
+    """Wrench and efforts are of one instant: of all shifts against each other none fits the last motors best. Where no
+    shift fits clearly, one of the two was filtered, or they do not belong together.
+
+    Of the last two motors those count that tell the shift clearly: at few frames a second noise moves what is between
+    them and the hand in a way that frames do not show.
+    """
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
         return hand
@@ -141,11 +158,19 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
         return NotMeasured(why="what is carried is held by a constraint")
     if episode.num_arm < 2 or episode.num_frames < MIN_FRAMES + 2 * _MOST_LAG:
         return NotMeasured(why="there are too few joints or frames")
-    needed, effort = _of_joint(episode, hand, episode.info.robot.arm_joints[-2])
-    lags = range(-_MOST_LAG, _MOST_LAG + 1)
-    core = slice(_MOST_LAG, -_MOST_LAG)
-    off = [float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags]
-    return Measurement(value=abs(lags[int(np.argmin(off))]), detail=f"{lags[int(np.argmin(off))]:+d} frames")
+    lags, core = range(-_MOST_LAG, _MOST_LAG + 1), slice(_MOST_LAG, -_MOST_LAG)
+    share = size = 0.0
+    told = []
+    for name in _motors(episode)[-2:]:
+        needed, effort = _of_joint(episode, hand, name)
+        off = np.array([float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags])
+        size, usual = float(np.sqrt((effort**2).mean())), float(np.median(off))
+        share, lag = float(off.min()) / max(usual, 1e-12), lags[int(np.argmin(off))]
+        if share < _CLEAR:
+            told.append(Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}"))
+    if not told and share > _UNCLEAR and size > _LEAST_TORQUE / 2:  # nothing but the hand is beyond the last motor
+        return Measurement(value=_MOST_LAG + 1, detail=f"no shift fits {name}")
+    return worst(*told) or NotMeasured(why="the wrist's motors do not tell one shift from another")
 
 
 @physics_check(
@@ -153,17 +178,21 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     "carried, in units of what is borne",
 )
 def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
-    """No single frame is far from both of its neighbours: catches lost bits and glitches of an amplifier.
+    """No single frame is far from both of its neighbours, or empty: catches lost values and glitches of an amplifier.
 
     Where the hand is free and moves smoothly, what an impact adds shows in wrench and motors alike; of the motors,
     those count that bear weight. The force on what is carried is that of the gripper's motors in each frame.
     """
     yield _peak_of_grip(episode)
+    for name, table in (("wrench", episode.columns.sensed.get("wrench")), ("efforts", episode.columns.joint_effort)):
+        if table is not None and (lost := (table == 0).all(axis=1)).mean() < _LOST_SHARE:  # weight is always there
+            yield worst_frame(lost.astype(np.float64), f"{name} of zero")
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
         yield hand
         return
-    free = hand.dynamics.is_judged
+    free = hand.dynamics.is_judged.copy()
+    free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
     weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
     off = np.hstack([hand.force - hand.loads_force, (hand.torque - hand.loads_torque) / _LEVER]) / weight
     of_wrench = _peaks(off).max(axis=1)

@@ -110,7 +110,7 @@ CHECKS: Registry[Check] = Registry(
         ("gripper", "joint_effort", "gripper_label", "grip_force", "contact_lag", "touches_nothing"),
         ("physics", "idle_frames", "starts_at_rest", "ends_at_rest", "velocity_follows_servo"),
         ("objects", "object_motion", "teleports", "spins", "starts_as_scene_says", "penetration", "carried_by_gripper"),
-        ("objects", "falls_unheld"),
+        ("objects", "slips", "falls_unheld"),
         ("fingers", "finger_depth"),
         ("alignment", "command_lag", "action_lag", "gripper_lag"),
         ("calibration", "intrinsics", "extrinsics", "projection", "image_placement", "depth_matches_scene"),

@@ -102,7 +102,7 @@ def _environment() -> Environment:
     )
     environment.globals.update(charts=charts, levels=LEVELS[::-1], min_values=MIN_VALUES, states=_STATES)
     environment.filters.update(
-        fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, measured=_measured, words=_words
+        fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, measured=measured, words=_words
     )
     return environment
 
@@ -149,7 +149,7 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
     return sorted(groups.items(), key=lambda item: (item[0] in _GOOD, -len(item[1]), item[0]))
 
 
-def _measured(result: Result) -> tuple[str, str, str]:
+def measured(result: Result) -> tuple[str, str, str]:
     """What was found, what is allowed, and where."""
     unit = f"\u00a0{result.unit}" if result.unit else ""
     value = "" if result.value is None else f"{result.value:.4g}{unit}"

@@ -28,6 +28,10 @@ FROZEN = 5
 """Images in a row with the same bytes: no camera without noise."""
 _SPIKE = 25.0
 """Times the usual step of an element."""
+_LEAST_JUMP = 1e-4
+"""rad, m: what no sensor tells from noise."""
+_GOES_ON = 0.2
+"""Share of a step that the next one, or the one before, has in the same direction where something moves."""
 _EARLY_S = 0.05
 """By which a header may be later than its recording, in which it was no more: clocks that NTP sets differ by less."""
 LOST = 1.6
@@ -161,10 +165,14 @@ def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     for start in stream.layout.quaternions:
         signs |= dict.fromkeys(range(start, start + 4), _signs(elements.quaternion(start)))
     for column, (name, element) in enumerate(zip(names, elements, strict=True)):
-        steps = np.abs(np.diff(element * signs[column] if column in signs else element))
+        change = np.diff(element * signs[column] if column in signs else element)
+        steps = np.abs(change)
         usual = float(np.percentile(steps, 90))
+        # What begins to move after a long rest goes on, as an opening gripper does.
+        beside, least = change[1:] * change[:-1], _GOES_ON * change**2
+        steps[np.append(beside > least[:-1], False) | np.insert(beside > least[1:], 0, False)] = 0.0
         largest = int(steps.argmax())
-        if usual > 0 and steps[largest] > _SPIKE * usual:
+        if usual > 0 and steps[largest] > max(_SPIKE * usual, _LEAST_JUMP):
             at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS
             yield "jump", f"{name!r} jumps by {steps[largest]:.3g} at {at:.2f} s, usual are {usual:.2g}"
             break

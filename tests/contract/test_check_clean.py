@@ -34,9 +34,18 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
 
 
-def test_an_arm_that_noise_shakes(tmp_path: Path) -> None:
-    """At 60 frames a second: differences between frames say little about forces then."""
-    path = simulate(tmp_path / "e.mcap", task="pick_from_clutter", robot="iiwa", fps=60, seed=2026, episode_index=3)
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"task": "pick_from_clutter", "robot": "iiwa", "fps": 60, "seed": 2026, "episode_index": 3},
+        {"task": "stack", "fps": 15, "seed": 3603},
+        {"task": "stack", "robot": "iiwa", "variation": "full", "fps": 15, "seed": 3602},
+    ],
+    ids=str,
+)
+def test_an_arm_that_noise_shakes(config: dict[str, Any], tmp_path: Path) -> None:
+    """Differences between frames say little about forces then, and a hand that has turned presses askew."""
+    path = simulate(tmp_path / "e.mcap", **config)
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 
@@ -52,6 +61,13 @@ def test_an_arm_that_noise_shakes(tmp_path: Path) -> None:
         {"video": VideoConfig(codec="jpeg", jpeg_quality=60)},
         {"fps": 60},
         {"fps": 10},
+        {
+            "robot": "iiwa",
+            "variation": "full",
+            "width": 64,
+            "height": 48,
+            "video": VideoConfig(codec="jpeg", jpeg_quality=60),
+        },
     ],
     ids=str,
 )

@@ -122,6 +122,20 @@ def force_late(rows: Rows) -> Rows:
     return np.column_stack([late(late(rows[:, :3])), rows[:, 3:]])
 
 
+def filtered(rows: Rows) -> Rows:
+    """A low-pass filter of the first order."""
+    out = rows.copy()
+    for t in range(1, len(out)):
+        out[t] = 0.8 * out[t - 1] + 0.2 * rows[t]
+    return out
+
+
+def slipping(c: Changed) -> Changed:
+    """By 15 mm, slowly, while it is carried."""
+    rows = held(c)
+    return cube(plus(np.s_[rows, 2], -np.linspace(0.0, 0.015, len(rows))))(c)
+
+
 def rotation_jumps(rows: Rows) -> Rows:
     """For a frame, by 0.35 rad about the vertical, long before anything touches the cube."""
     out = rows.copy()
@@ -221,6 +235,10 @@ CASES: list[tuple[str, Fault, str]] = [
     ("contact force two frames late", column("contact_force", lambda r: late(late(r))), "contact_lag"),
     ("contact force doubled once", once_while_carried("contact_force", 2.0), "force_spikes"),
     ("a sample of the contact force lost", once_while_carried("contact_force", 0.0), "force_spikes"),
+    ("a sample of the wrench lost", once_while_carried("wrench", 0.0), "force_spikes"),
+    ("a sample of the efforts lost", once_while_carried("joint_effort", 0.0), "force_spikes"),
+    ("wrench filtered", wrench(filtered), "wrench_lag"),
+    ("the cube slips in the hand", slipping, "slips"),
     ("colours exchanged", info(instruction="put the green cube on the red target"), "instruction_fits_scene"),
     ("actions late", columns(late, "action_joint_target", "action_gripper", "action_base_from_tcp"), "action_lag"),
     ("commands late", columns(late, "command_joint_target", "command_base_from_tcp"), "command_lag"),

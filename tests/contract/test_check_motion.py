@@ -158,7 +158,13 @@ def test_a_dead_band_is_told_of(strange: Path, fault: str, tmp_path: Path) -> No
     spoilt = copy(strange, tmp_path / "spoilt")
     edit_column(spoilt, STATE, change)
     assert level(strange, "dead_band") == "pass"
-    assert level(spoilt, "dead_band") == "warn"
+    assert level(spoilt, "dead_band") == "fail"
+
+
+def test_a_state_that_is_measured_less_often_than_frames_are_is_no_dead_band(strange: Path, tmp_path: Path) -> None:
+    held = copy(strange, tmp_path / "held")
+    edit_column(held, STATE, lambda rows: rows[np.arange(len(rows)) // 3 * 3])
+    assert level(held, "dead_band") == "pass"
 
 
 def test_a_wrong_rate_is_found(strange: Path, tmp_path: Path) -> None:
@@ -178,7 +184,7 @@ def test_a_state_that_is_its_own_action_is_found(strange: Path, tmp_path: Path) 
         table = pq.read_table(file)
         place = table.schema.get_field_index(ACTION)
         pq.write_table(table.set_column(place, table.schema.field(ACTION), table.column(STATE)), file)
-    assert level(spoilt, "state_follows_action") == "warn"
+    assert level(spoilt, "state_follows_action") == "fail"
 
 
 def test_an_action_that_is_the_next_observation_is_found(strange: Path, tmp_path: Path) -> None:

@@ -89,6 +89,18 @@ def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
     assert _findings(bag, tmp_path) == set()
 
 
+def test_a_gripper_that_opens_after_a_long_rest_does_not_jump(tmp_path: Path) -> None:
+    """It rests for all but four messages; the noise of its encoder is far below the steps of its way."""
+
+    def opening(k: int, note: bags.Note) -> bags.Note:
+        position = note.body["position"].copy()
+        position[-1] = 1e-5 * (k % 3) + 0.2 * np.clip(k - 50, 0, 4)
+        return bags.with_body(note, position=position)
+
+    notes = bags.changed(bags.so101(2.0), "/follower/joint_states", opening)
+    assert "jump" not in _findings(bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap"), tmp_path)
+
+
 def test_images_that_come_unevenly_are_not_lost(notes: bags.Notes, tmp_path: Path) -> None:
     off_s = np.random.default_rng(4).normal(0, 0.012, 100).clip(-0.015, 0.015).tolist()
     uneven = bags.changed(
