@@ -252,9 +252,7 @@ def _tracking(d: Demonstration, off: Mapping[str, Array]) -> dict[str, tuple[flo
     """As of the report."""
     columns = np.abs(np.column_stack([off["joint positions"], off["gripper opening"]])).T
     names = (*d.info.robot.arm_joints, "gripper")
-    return {
-        name: (float(np.median(column)), float(column.max())) for name, column in zip(names, columns, strict=True)
-    }
+    return {name: (float(np.median(column)), float(column.max())) for name, column in zip(names, columns, strict=True)}
 
 
 def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessCheck]) -> str:

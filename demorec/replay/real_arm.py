@@ -52,9 +52,7 @@ def demonstration_of(
         joint_position=tuple(state[0, :count].tolist()),
         gripper_width=float(state[0, count]),
     )
-    physics = Physics(
-        hz=hz, contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD, finger_stiffness=FINGER_STIFFNESS
-    )
+    physics = Physics(hz=hz, contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD, finger_stiffness=FINGER_STIFFNESS)
     info = EpisodeInfo(
         episode_index=episode_index,
         instruction="",

@@ -102,7 +102,7 @@ class JawGripper:
         finger_links: The link of the fixed finger (which may be the hand itself), and that of the jaw.
         opening: Position of the joint, rad, and the opening there, metres, measured at the tips; from closed (what the
             expert closes to) to open (as far as it opens).
-        open_width: How far tasks open it, metres: a jaw that turns farther may rise above what it shall grasp. 0: fully.
+        open_width: How far tasks open it, metres: a jaw that turns on may rise above what it shall grasp; 0: fully.
         force: Torque of the joint's motor, N m.
         finger_depth: How far a finger reaches beyond the TCP, the jaw wherever it turns, metres.
         palm_clearance: From the TCP back to the palm, metres: what fits between the fingers above the grasp.
