@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,8 +102,8 @@ class Replay:
             robot=load_robot(self.robot, allowed) if self.robot else None,
             motors=named_motors(self.motor_units, self.calibration),
         )
-        if options.motors is not None and options.robot is None:
-            raise ConfigError("--motor-units says how a real arm's dataset is to be read: add --robot so101.")
+        if options.robot is not None and (self.out is not None or self.view):
+            raise ConfigError("--robot compares numbers, of a scene nothing is known: leave --out, --view out.")
         options.validate()
         with ExitStack() as stack:
             out = self.out
@@ -129,8 +130,11 @@ class Replay:
 
                 say_json([to_plain(report) for report in reports])
             else:
-                say(_summary(reports, sum(good)))
-                say(_compared(reports))
+                if options.robot is not None:
+                    say("Nothing stood on the table: where the arm held something, the gripper closes farther here.")
+                else:
+                    say(_summary(reports, sum(good)))
+                    say(_compared(reports))
                 if self.out is not None:
                     say(f"Recordings of the replays: {self.out}")
             if self.view:
@@ -200,6 +204,8 @@ def _replayable(path: Path) -> Found:
 
 def told(report: ReplayReport) -> str:
     """One line about a replay."""
+    if report.tracking:
+        return f"{report.name}: {report.num_steps} steps; {_tracked(report.tracking)}"
     if report.is_identical:
         how = "identical"
     else:
@@ -216,6 +222,17 @@ def told(report: ReplayReport) -> str:
         outcome += f" where the recording {'succeeded' if report.recorded_success else 'failed'}"
     lost = f", {report.unreachable} poses out of reach" if report.unreachable else ""
     return f"{report.name}: {how}{outcome}{lost}"
+
+
+def _tracked(tracking: Mapping[str, tuple[float, float]]) -> str:
+    """Median and largest difference of each joint."""
+    parts = [
+        f"{name} {1e3 * median:.1f}, {1e3 * largest:.1f} mm"
+        if name == "gripper"
+        else f"{name} {math.degrees(median):.2f}, {math.degrees(largest):.2f}"
+        for name, (median, largest) in tracking.items()
+    ]
+    return f"off what was measured, median and largest, degrees: {'; '.join(parts)}"
 
 
 def _compared(reports: Sequence[ReplayReport]) -> str:

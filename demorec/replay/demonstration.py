@@ -53,6 +53,10 @@ class ReplayOptions:
         check_option("delay", self.delay, 0, 1000, "steps")
         if self.states and (self.noise or self.delay or self.export_hz):
             raise ConfigError("--states sends no commands: leave out --noise, --delay and --export-hz.")
+        if self.robot is not None and (self.states or self.export_hz):
+            raise ConfigError("--states and --export-hz are for recordings with a scene: leave them out with --robot.")
+        if self.motors is not None and self.robot is None:
+            raise ConfigError("--motor-units says how the dataset of a real arm is to be read: add --robot so101.")
 
     @property
     def is_plain(self) -> bool:
@@ -182,12 +186,12 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
         from demorec.replay.real_arm import demonstration_of
 
         with open_recording(path) as recording:
+            if options.motors is not None:
+                raise ConfigError(f"--motor-units belongs to datasets, recordings say their units: {path}")
             if recording.info.simulation is not None:
                 raise ConfigError(f"The recording has an arm and a scene of its own: leave --robot out: {path}")
-            info, motion = recording.info, motion_of_recording(recording.info, recording.columns(), "")
-        return demonstration_of(
-            motion, options.robot, name=path.name, where=str(path), episode_index=info.episode_index
-        )
+            index, motion = recording.info.episode_index, motion_of_recording(recording.info, recording.columns(), "")
+        return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=index)
     with open_recording(path, simulated=True) as recording:
         return replace(open_demonstration(recording, options), source=path)
 
@@ -218,7 +222,7 @@ def dataset_demonstrations(
 
         for number, motion in _spread([each for each in enumerate(dataset.motions.all) if wanted(each[0])], limit):
             name = f"{path.name}_episode_{number:06d}"
-            yield demonstration_of(motion, options.robot, name=name, where=str(path), episode_index=number)
+            yield demonstration_of(motion, options.robot, name=name, where=path, episode_index=number)
         return
     if not dataset.sidecar:
         raise ConfigError(

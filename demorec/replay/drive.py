@@ -280,9 +280,11 @@ def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: boo
 
     Args:
         report: Of the replay.
-        tolerance: Differences (m, rad) up to which states count as the same.
+        tolerance: Differences (m, rad) up to which states count as the same; of what a real arm did, 0 is no limit.
         bitwise: Whether the states must be the same; otherwise (changed commands) the outcome alone counts.
     """
+    if report.tracking and tolerance:
+        return max(report.joint_error, report.gripper_error) <= tolerance
     if not report.is_bitwise or not bitwise:
         return report.is_outcome_as_recorded
     errors = report.joint_error, report.gripper_error, report.object_error

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import math
+from pathlib import Path
 
 import numpy as np
 
 from demorec.check.evidence import GRIPPER, Motion
+from demorec.core.config import deciding_versions
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array, Pose
+from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Physics, RobotPlacement, Scene
 from demorec.replay.demonstration import Demonstration
@@ -25,7 +28,7 @@ _LEAST_HZ = Physics.hz
 
 
 def demonstration_of(
-    motion: Motion | None, robot: RobotSpec, *, name: str, where: str, episode_index: int = 0
+    motion: Motion | None, robot: RobotSpec, *, name: str, where: Path, episode_index: int
 ) -> Demonstration:
     """What an arm was told to do in an episode, for a simulated one of its kind.
 
@@ -57,6 +60,7 @@ def demonstration_of(
         episode_index=episode_index,
         instruction="",
         fps=fps,
+        versions=deciding_versions(),
         simulation=Simulation(
             root_seed=0,
             task="",
@@ -80,15 +84,15 @@ def demonstration_of(
     )
 
 
-def _of_robot(values: Array, motion: Motion, robot: RobotSpec, where: str) -> Array:
+def _of_robot(values: Array, motion: Motion, robot: RobotSpec, where: Path) -> Array:
     """(T, n_arm + 1) positions of the arm's joints, rad, and opening of the gripper, m, of (T, D) of a motion."""
     fingers = robot.gripper.joints
-    known = [*robot.arm_joints, *(() if GRIPPER in motion.names else fingers)]
-    if missing := [joint for joint in known if joint not in motion.joints]:
+    wanted = [*robot.arm_joints, *(() if GRIPPER in motion.names else fingers)]
+    if missing := [joint for joint in wanted if joint not in motion.joints]:
+        motors = ", or --motor-units is missing" if robot.name in IN_MOTOR_UNITS else ""
         raise ConfigError(
-            f"The joints {', '.join(missing)} of {robot.name} are not known to be in observation.state "
-            f"({', '.join(motion.names)}); of what LeRobot recorded of an SO-101, --motor-units says in which units: "
-            f"{where}"
+            f"The elements of observation.state ({', '.join(motion.names)}) are not known to be the joints "
+            f"{', '.join(missing)} of {robot.name}: it is of another robot{motors}: {where}"
         )
     arm = values[:, [motion.joints.index(joint) for joint in robot.arm_joints]]
     if GRIPPER in motion.names:
