@@ -39,18 +39,18 @@ HAND = ("delta_x", "delta_y", "delta_z")
 CLOSE, OPEN = 0, 2
 """What it says of the gripper, beside 1 for as it is."""
 KEYS: Mapping[str, tuple[str, float]] = {
-    "up": ("delta_x", 1.0),
-    "down": ("delta_x", -1.0),
-    "left": ("delta_y", 1.0),
-    "right": ("delta_y", -1.0),
-    "shift_r": ("delta_z", 1.0),
-    "shift": ("delta_z", -1.0),
+    "w": ("delta_x", 1.0),
+    "s": ("delta_x", -1.0),
+    "a": ("delta_y", 1.0),
+    "d": ("delta_y", -1.0),
+    "r": ("delta_z", 1.0),
+    "f": ("delta_z", -1.0),
     "q": ("turn", 1.0),
     "e": ("turn", -1.0),
-    "ctrl_r": ("gripper", OPEN),
-    "ctrl_l": ("gripper", CLOSE),
+    "o": ("gripper", OPEN),
+    "c": ("gripper", CLOSE),
 }
-"""What a held key does, by pynput's name of it; those of LeRobot's `keyboard_ee`, and two that turn the hand."""
+"""What a held key does."""
 HAND_SPEED, TURN_SPEED = 0.2, 1.0
 """Of the hand, m/s of an arm of task_scale 1, and rad/s."""
 
@@ -145,8 +145,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
             ConfigError: It has no element of this arm.
         """
         if all(value is None for value in action.values()):  # keys, or none
-            held = [KEYS[name] for key in action if (name := getattr(key, "name", key)) in KEYS]
-            action = dict.fromkeys(HAND, 0.0) | dict(held)
+            action = dict.fromkeys(HAND, 0.0) | dict(KEYS[key] for key in action if key in KEYS)
         if set(HAND) <= action.keys():
             action = self._moved(action)
         if not action.keys() & set(self.names):

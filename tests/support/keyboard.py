@@ -13,13 +13,13 @@ from demorec.lerobot_robot import DemorecSO101
 from demorec.tasks.grasping import hand_yaw
 
 Press = Callable[[str, bool], None]
-"""Presses a key (True) or lets it go, by the name that pynput gives it."""
+"""Presses a key (True) or lets it go."""
 
 NEAR, ALIGNED = 0.003, 0.03
 """Metres beside a place, rad beside a direction, at which a key is let go."""
-WAYS = (("up", "down"), ("left", "right"), ("shift_r", "shift"), ("q", "e"))
+WAYS = (("w", "s"), ("a", "d"), ("r", "f"), ("q", "e"))
 """Keys that move the hand along x, y, z and turn it, forth and back."""
-OPEN, CLOSE = "ctrl_r", "ctrl_l"
+OPEN, CLOSE = "o", "c"
 HIGH, LOW = 0.06, 0.012
 """Of the TCP above the table, metres."""
 PATIENCE = 150
