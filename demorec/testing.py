@@ -223,12 +223,12 @@ class RobotContract:
         assert abs(pose.position[1]) < 0.015, f"the hand at home_q is {pose.position[1]:.2f} m to the side"
 
     def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(self) -> None:
-        """Their boxes in the simulator, at full opening."""
+        """Their boxes in the simulator, opened as tasks open them."""
         episode = self._episode()
         robot, gripper = episode.info.robot, episode.info.robot.gripper
         with make_world(episode.info) as world:
             world.reset(episode.info.scene)
-            world.arm.place(np.array(robot.home_q), gripper.max_width)
+            world.arm.place(np.array(robot.home_q), gripper.open_width)
             tcp = world.arm.world_from_tcp()
             tips = []
             for link in world.arm.finger_links:
@@ -238,7 +238,7 @@ class RobotContract:
                 assert abs(centre[0]) < 0.01, "a finger is beside the TCP's y axis"
                 if isinstance(gripper, JawGripper):
                     continue
-                half = gripper.max_width / 2
+                half = gripper.open_width / 2
                 assert half - 0.005 < abs(centre[1]) < half + 0.025, f"a finger is {abs(centre[1]):.3f} m from the TCP"
         depth = tcp.position[2] - min(tips)
         # PyBullet's boxes are some millimetres too large.

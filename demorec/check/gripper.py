@@ -67,7 +67,7 @@ def contact_lag(episode: CheckedEpisode) -> Found:
     where they were sent; of several the middle one.
     """
     c, fps = episode.columns, episode.info.fps
-    span = episode.info.robot.gripper.max_width
+    span = episode.info.robot.gripper.open_width
     if c.num_frames < 4 * _MOST_LAG or not (c.contact_force > 0).any():
         return NotMeasured(why="nothing is taken or let go of")
     presses = c.contact_force > _PRESSES * np.median(c.contact_force[c.contact_force > 0])

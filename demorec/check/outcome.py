@@ -101,7 +101,7 @@ def conditions_as_known(episode: CheckedEpisode) -> Found:
     for condition in outcome.checks:
         side, limit = LIMITS.get(condition.name.partition(":")[0], ("", math.nan))
         if condition.name == OPEN:
-            limit *= episode.info.robot.gripper.max_width
+            limit *= episode.info.robot.gripper.open_width
         if side and not math.isclose(condition.limit, limit, rel_tol=1e-9):
             wrong.append(f"{condition.name} has the limit {condition.limit:g}, not {limit:g}")
         holds = condition.value <= condition.limit if side == "at most" else condition.value >= condition.limit

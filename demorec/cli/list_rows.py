@@ -48,7 +48,8 @@ def _own_summary(registry: Registry[Any], name: str) -> str:
 
 def _robot(registry: Registry[Any], name: str) -> str:
     robot = registry.load(name)
-    return f"{len(robot.arm_joints)} joints, gripper opening {1000 * robot.gripper.max_width:.0f} mm, from {robot.urdf}"
+    opening = 1000 * robot.gripper.open_width
+    return f"{len(robot.arm_joints)} joints, gripper opening {opening:.0f} mm, from {robot.urdf}"
 
 
 def _kinds(registry: Registry[Any], name: str) -> str:

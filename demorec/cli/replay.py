@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,14 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import say, say_json, tell
 from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, OptionError
+from demorec.core.registry import modules_of
+from demorec.core.tables import load_robot
+from demorec.robots.motors import MotorUnits
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -31,12 +36,17 @@ class Replay:
     exploration noise that was executed; for them success and deviations are reported. Exit code 0: as recorded
     (bit-exact; for a dataset or with --noise, --delay or --export-hz: the recorded outcome); 1: not as recorded.
 
+    With --robot a simulated arm does what a real one did, by the actions of its dataset or imported recordings alone,
+    on an empty table, and how far it is from the measured states is reported of each joint. Exit code 1: farther than
+    --tolerance, where that is given.
+
     Examples:
       demorec replay recordings/cubes/episodes/episode_000000.mcap
       demorec replay recordings/cubes --episodes 0:10
       demorec replay datasets/cubes
       demorec replay recordings/cubes --noise 0.01 --delay 2 --export-hz 10
       demorec replay episode.mcap --out replayed --view
+      demorec replay --robot so101 --motor-units degrees datasets/desk
     """
 
     paths: Positional[tuple[Path, ...]]
@@ -55,6 +65,14 @@ class Replay:
     """Seed of the noise."""
     tolerance: float = 0.0
     """Largest difference, in m and rad, that still counts as recorded; for another type of machine."""
+    robot: str = ""
+    """The arm that does what a real one did: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
+    motor_units: MotorUnits | None = None
+    """Of a dataset that LeRobot recorded of an SO-101 (shoulder_pan.pos to gripper.pos): the joints are in degrees, its
+    default, or from -100 to 100 of their ranges."""
+    calibration: Path | None = None
+    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
+    says)."""
     out: Path | None = None
     """Folder for recordings of the replays, images included."""
     view: bool = False
@@ -73,14 +91,19 @@ class Replay:
             raise OptionError("tolerance", f"is {self.tolerance}, it must be 0 or more.")
         from demorec.replay import ReplayOptions, is_as_recorded, replay_all
 
+        allowed = (*allowed_modules(self.allow), *modules_of([self.robot]))
         options = ReplayOptions(
             states=self.states,
             export_hz=self.export_hz,
             noise=self.noise,
             delay=self.delay,
             seed=self.seed,
-            allowed=allowed_modules(self.allow),
+            allowed=allowed,
+            robot=load_robot(self.robot, allowed) if self.robot else None,
+            motors=named_motors(self.motor_units, self.calibration),
         )
+        if options.robot is not None and (self.out is not None or self.view):
+            raise ConfigError("--robot compares numbers, of a scene nothing is known: leave --out, --view out.")
         options.validate()
         with ExitStack() as stack:
             out = self.out
@@ -107,8 +130,11 @@ class Replay:
 
                 say_json([to_plain(report) for report in reports])
             else:
-                say(_summary(reports, sum(good)))
-                say(_compared(reports))
+                if options.robot is not None:
+                    say("Nothing stood on the table: where the arm held something, the gripper closes farther here.")
+                else:
+                    say(_summary(reports, sum(good)))
+                    say(_compared(reports))
                 if self.out is not None:
                     say(f"Recordings of the replays: {self.out}")
             if self.view:
@@ -178,6 +204,8 @@ def _replayable(path: Path) -> Found:
 
 def describe_replay(report: ReplayReport) -> str:
     """One line about a replay."""
+    if report.tracking:
+        return f"{report.name}: {report.num_steps} steps; {_tracked(report.tracking)}"
     if report.is_identical:
         how = "identical"
     else:
@@ -194,6 +222,17 @@ def describe_replay(report: ReplayReport) -> str:
         outcome += f" where the recording {'succeeded' if report.recorded_success else 'failed'}"
     lost = f", {report.unreachable} poses out of reach" if report.unreachable else ""
     return f"{report.name}: {how}{outcome}{lost}"
+
+
+def _tracked(tracking: Mapping[str, tuple[float, float]]) -> str:
+    """Median and largest difference of each joint."""
+    parts = [
+        f"{name} {1e3 * median:.1f}, {1e3 * largest:.1f} mm"
+        if name == "gripper"
+        else f"{name} {math.degrees(median):.2f}, {math.degrees(largest):.2f}"
+        for name, (median, largest) in tracking.items()
+    ]
+    return f"off what was measured, median and largest, degrees: {'; '.join(parts)}"
 
 
 def _compared(reports: Sequence[ReplayReport]) -> str:

@@ -2,12 +2,16 @@
 
     lerobot-teleoperate --robot.type=demorec_so101 --robot.task=stack --fps=30 --teleop.type=so101_leader ...
 
+LeRobot's `keyboard` says which keys are held, its `gamepad` increments of the hand; both move the hand. What
+`lerobot-record` writes is what the teleoperator says: it needs one that says joints.
+
 Each action is one control step of 1/fps s, however long it took to come. LeRobot has no word for a new scene, so that
 a connection has one; `--robot.record=DIR` writes it as an ordinary recording.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +21,7 @@ import numpy as np
 from lerobot.robots import Robot
 
 from demorec.core.errors import ConfigError
-from demorec.core.geometry import Array
+from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Outcome
 from demorec.episode.features import state_names
 from demorec.gym_env import DemorecEnv
@@ -28,6 +32,27 @@ from demorec.robots.robot import RobotSpec
 from demorec.robots.so101 import SO101_FOLLOWER
 
 __all__ = ["DemorecPanda", "DemorecPandaConfig", "DemorecSO101", "DemorecSO101Config"]
+
+
+HAND = ("delta_x", "delta_y", "delta_z")
+"""How LeRobot's gamepad moves the hand along the axes of the base, x forward and y to the left, each from -1 to 1."""
+CLOSE, OPEN = 0, 2
+"""What it says of the gripper, beside 1 for as it is."""
+KEYS: Mapping[str, tuple[str, float]] = {
+    "w": ("delta_x", 1.0),
+    "s": ("delta_x", -1.0),
+    "a": ("delta_y", 1.0),
+    "d": ("delta_y", -1.0),
+    "r": ("delta_z", 1.0),
+    "f": ("delta_z", -1.0),
+    "q": ("turn", 1.0),
+    "e": ("turn", -1.0),
+    "o": ("gripper", OPEN),
+    "c": ("gripper", CLOSE),
+}
+"""What a held key does."""
+HAND_SPEED, TURN_SPEED = 0.2, 1.0
+"""Of the hand, m/s of an arm of task_scale 1, and rad/s."""
 
 
 class SimulatedArm(Robot):  # type: ignore[misc]
@@ -53,6 +78,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
             privileged=False,
         )
         self._target: dict[str, float] = {}
+        self._hand: Pose | None = None
         self._writer: EpisodeWriter | None = None
 
     @property
@@ -94,7 +120,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         """Build the scene; SceneError where that is not possible."""
         del calibrate
         self._env.reset(seed=self.config.scene)
-        self._target = self._state()
+        self._target, self._hand = self._state(), None
 
     @property
     def is_calibrated(self) -> bool:
@@ -118,6 +144,10 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         Raises:
             ConfigError: It has no element of this arm.
         """
+        if all(value is None for value in action.values()):  # keys, or none
+            action = dict.fromkeys(HAND, 0.0) | dict(KEYS[key] for key in action if key in KEYS)
+        if set(HAND) <= action.keys():
+            action = self._moved(action)
         if not action.keys() & set(self.names):
             raise ConfigError(
                 f"The teleoperator says {', '.join(map(str, action)) or 'nothing'}; the arm takes "
@@ -147,6 +177,20 @@ class SimulatedArm(Robot):  # type: ignore[misc]
             self._writer = None
         self._target = {}
         self._env.close()
+
+    def _moved(self, action: dict[str, Any]) -> dict[str, float]:
+        """The joints that move the hand by an increment, pointing as before; where that is out of reach it stays."""
+        arm, gripper = self._env.world.arm, self.spec.gripper
+        hand = self._hand or arm.kinematics.forward(arm.target)
+        way = np.array([float(action[name]) for name in HAND]) * (HAND_SPEED * self.spec.task_scale / self.config.fps)
+        turn = Pose.from_yaw((0.0, 0.0, 0.0), float(action.get("turn", 0.0)) * TURN_SPEED / self.config.fps)
+        moved = Pose(position=hand.position + way, quat_xyzw=(turn @ hand).quat_xyzw)
+        rest = arm.kinematics.turned_towards(np.array(self.spec.home_q), moved.position)
+        joints = arm.kinematics.inverse(moved, start=arm.target, rest=rest)
+        self._hand = hand if joints is None else moved
+        width = {CLOSE: gripper.min_width, OPEN: gripper.open_width}.get(action.get("gripper"), arm.gripper_target)
+        fingers = gripper.joint_position(width)
+        return self._named(self.told(np.append(arm.target if joints is None else joints, fingers)))
 
     def _state(self) -> dict[str, float]:
         return self._named(self.state_values(self._env.situation.observation.joint_position))

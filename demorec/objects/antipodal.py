@@ -30,8 +30,8 @@ _SKIN = 0.0015
 """Surface points that are so near to the outermost one touch the finger, metres."""
 LEAST_FACING = math.cos(math.radians(25.0))
 """Cosine of the angle between a finger's motion and what it touches, in the mean."""
-LEAST_WIDTH, PLAY = 0.015, 0.01
-"""Metres: of what is gripped (the expert takes less for nothing), and how much narrower than the opening it is."""
+PLAY = 0.01
+"""How much narrower than the opening what is gripped has to be, metres."""
 _STEEP = 0.5
 """Largest vertical part of the normal where a finger may touch."""
 
@@ -45,12 +45,14 @@ class Hand:
         finger_depth: From the TCP to the finger tips.
         palm_clearance: From the TCP back to the palm.
         tip_clearance: Air between the finger tips and the support.
+        least_width: Of what is gripped: the expert takes less for nothing.
     """
 
     max_width: float
     finger_depth: float
     palm_clearance: float
     tip_clearance: float = 0.005
+    least_width: float = 0.015
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +120,7 @@ def _grasp(points: Array, normals: Array, row: int, hand: Hand) -> Grasp | None:
     pad = (np.abs(u - middle) < PAD) & (w > z - hand.finger_depth) & (w < z + PAD_ABOVE)
     first, last = float(v[pad].min()), float(v[pad].max())
     width, centre = last - first, (first + last) / 2
-    if not LEAST_WIDTH <= width <= hand.max_width - PLAY:
+    if not hand.least_width <= width <= hand.max_width - PLAY:
         return None
     swept = (np.abs(u - middle) < FINGER) & (w > z - hand.finger_depth - hand.tip_clearance / 2)
     if float(np.abs(v[swept] - centre).max()) > hand.max_width / 2 - 0.003:

@@ -5,7 +5,7 @@ Datasets have float32 actions of any kind; their scenes come from the sidecar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,6 +19,8 @@ from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.recording import frames_of
 from demorec.mcap.streams import action_at
+from demorec.robots.motors import Motors
+from demorec.robots.robot import RobotSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +34,8 @@ class ReplayOptions:
         delay: Steps by which every command comes late.
         seed: Of the noise.
         allowed: The user's own modules that may be imported for what the demonstrations name.
+        robot: The arm that does what a real one did, by its numbers alone; None: that of each recorded scene.
+        motors: The servos whose values the states and actions of datasets are, if the user says so.
     """
 
     states: bool = False
@@ -40,6 +44,8 @@ class ReplayOptions:
     delay: int = 0
     seed: int = 0
     allowed: tuple[str, ...] = ()
+    robot: RobotSpec | None = None
+    motors: Motors | None = None
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
@@ -47,6 +53,10 @@ class ReplayOptions:
         check_option("delay", self.delay, 0, 1000, "steps")
         if self.states and (self.noise or self.delay or self.export_hz):
             raise ConfigError("--states sends no commands: leave out --noise, --delay and --export-hz.")
+        if self.robot is not None and (self.states or self.export_hz):
+            raise ConfigError("--states and --export-hz are for recordings with a scene: leave them out with --robot.")
+        if self.motors is not None and self.robot is None:
+            raise ConfigError("--motor-units says how the dataset of a real arm is to be read: add --robot so101.")
 
     @property
     def is_plain(self) -> bool:
@@ -77,6 +87,7 @@ class Demonstration:
         recorded: The recorded frames, without images, where every one of them is replayed.
         recorded_checks: Conditions of the task as recorded.
         gave_up: Whether the recording shows why it failed whatever the conditions say (`gave_up`).
+        is_measured: Whether the states are those of a real arm, which no simulated one has to the bit.
     """
 
     name: str
@@ -97,6 +108,7 @@ class Demonstration:
     recorded: tuple[Frame, ...] = ()
     recorded_checks: tuple[SuccessCheck, ...] = ()
     gave_up: bool = False
+    is_measured: bool = False
 
     @property
     def num_steps(self) -> int:
@@ -168,7 +180,18 @@ def sensed_now(observation: Observation) -> dict[str, Array]:
 
 
 def open_file(path: Path, options: ReplayOptions) -> Demonstration:
-    """A recording's file to be replayed; errors as `open_demonstration`."""
+    """A recording's file to be replayed; errors as `open_demonstration` or, with a robot, `demonstration_of`."""
+    if options.robot is not None:
+        from demorec.check.evidence import motion_of_recording
+        from demorec.replay.real_arm import demonstration_of
+
+        with open_recording(path) as recording:
+            if options.motors is not None:
+                raise ConfigError(f"--motor-units belongs to datasets, recordings say their units: {path}")
+            if recording.info.simulation is not None:
+                raise ConfigError(f"The recording has an arm and a scene of its own: leave --robot out: {path}")
+            index, motion = recording.info.episode_index, motion_of_recording(recording.info, recording.columns(), "")
+        return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=index)
     with open_recording(path, simulated=True) as recording:
         return replace(open_demonstration(recording, options), source=path)
 
@@ -185,21 +208,29 @@ def dataset_demonstrations(
         limit: No more than this many, spread evenly.
 
     Raises:
-        ConfigError: The dataset has no sidecar of ours, other actions, or the options make no sense for it.
+        ConfigError: The dataset has no sidecar of ours, other actions, or the options make no sense for it; with a
+            robot, as `demonstration_of`.
         ExportError: It is damaged.
     """
     from demorec.check.dataset import Dataset
 
     if options.states or options.export_hz:
         raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
-    dataset = Dataset(path)
+    dataset = Dataset(path, motors=options.motors)
+    if options.robot is not None:
+        from demorec.replay.real_arm import demonstration_of
+
+        for number, motion in _spread([each for each in enumerate(dataset.motions.all) if wanted(each[0])], limit):
+            name = f"{path.name}_episode_{number:06d}"
+            yield demonstration_of(motion, options.robot, name=name, where=path, episode_index=number)
+        return
     if not dataset.sidecar:
-        raise ConfigError(f"The dataset does not say how its scenes were (no demorec/episodes): {path}")
+        raise ConfigError(
+            f"The dataset does not say how its scenes were (no demorec/episodes): --robot replays what a real arm did: "
+            f"{path}"
+        )
     dataset.check_simulated()
-    chosen = [each for each in dataset.described() if wanted(each.number)]
-    if limit is not None and len(chosen) > limit:
-        chosen = [chosen[k * len(chosen) // limit] for k in range(limit)]
-    for each in chosen:
+    for each in _spread([each for each in dataset.described() if wanted(each.number)], limit):
         number, rows, row, info = each.number, each.rows, each.kept, each.info
         kind = dataset.action_kind(info)
         if kind is None:
@@ -218,3 +249,10 @@ def dataset_demonstrations(
             tolerance=1e-6,
             digest=str(row["content_digest"]),
         )
+
+
+def _spread[T](chosen: Sequence[T], limit: int | None) -> Sequence[T]:
+    """No more than so many of them, spread evenly."""
+    if limit is None or len(chosen) <= limit:
+        return chosen
+    return [chosen[k * len(chosen) // limit] for k in range(limit)]

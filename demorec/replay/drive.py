@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, repeat, zip_longest
 from pathlib import Path
 
@@ -50,6 +50,8 @@ class ReplayReport:
             expert gave up) stays one though the conditions hold.
         failed_checks: Conditions that do not hold now.
         unreachable: Steps whose pose inverse kinematics did not reach (the arm held its last target).
+        tracking: Joint of the arm (rad) or "gripper" (m) -> median and largest difference from what was measured of a
+            real one; empty for simulated episodes.
     """
 
     name: str
@@ -70,6 +72,7 @@ class ReplayReport:
     is_outcome_as_recorded: bool
     failed_checks: tuple[str, ...] = ()
     unreachable: int = 0
+    tracking: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def replay(
@@ -93,7 +96,7 @@ def replay(
         The report, and how the replay ended; with `states`, which judge nothing, how the recording did.
     """
     d = demonstration
-    task = None if options.states else TASKS.load(d.info.task, options.allowed)()
+    task = None if options.states or not d.info.task else TASKS.load(d.info.task, options.allowed)()
     session = Session(world, d.info.scene, task, painter=painter)
     agent = DemonstrationAgent(d, options)
     seen: list[Observation] = []
@@ -241,7 +244,15 @@ def _report(
         or (d.gave_up and not d.recorded_success),
         failed_checks=failed,
         unreachable=unreachable,
+        tracking=_tracking(d, off) if d.is_measured else {},
     )
+
+
+def _tracking(d: Demonstration, off: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
+    """As of the report."""
+    columns = np.abs(np.column_stack([off["joint positions"], off["gripper opening"]])).T
+    names = (*d.info.robot.arm_joints, "gripper")
+    return {name: (float(np.median(column)), float(column.max())) for name, column in zip(names, columns, strict=True)}
 
 
 def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessCheck]) -> str:
@@ -269,9 +280,11 @@ def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: boo
 
     Args:
         report: Of the replay.
-        tolerance: Differences (m, rad) up to which states count as the same.
+        tolerance: Differences (m, rad) up to which states count as the same; of what a real arm did, 0 is no limit.
         bitwise: Whether the states must be the same; otherwise (changed commands) the outcome alone counts.
     """
+    if report.tracking and tolerance:
+        return max(report.joint_error, report.gripper_error) <= tolerance
     if not report.is_bitwise or not bitwise:
         return report.is_outcome_as_recorded
     errors = report.joint_error, report.gripper_error, report.object_error
@@ -298,7 +311,7 @@ def replay_all(
     allow_models(options.allowed)
     with closing(SimulatorCache()) as simulators:
         for demonstration in demonstrations:
-            if not options.states:
+            if not options.states and demonstration.info.task:
                 TASKS.check_name(demonstration.info.task, options.allowed)  # before anything is made
             if out is not None:
                 yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)

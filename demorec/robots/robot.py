@@ -46,6 +46,11 @@ class ParallelGripper:
     """Opening, metres, when closed on nothing."""
     rotor_inertia: ClassVar[float] = 0.0
 
+    @property
+    def open_width(self) -> float:
+        """How far tasks open it, metres."""
+        return self.max_width
+
     def joint_position(self, width: Array | float) -> Array:
         """Positions (..., n_joints), m, of the finger joints at openings (...), metres."""
         return np.asarray(np.multiply.outer(width, np.full(len(self.joints), 0.5)))
@@ -97,6 +102,7 @@ class JawGripper:
         finger_links: The link of the fixed finger (which may be the hand itself), and that of the jaw.
         opening: Position of the joint, rad, and the opening there, metres, measured at the tips; from closed (what the
             expert closes to) to open (as far as it opens).
+        open_width: How far tasks open it, metres: a jaw that turns on may rise above what it shall grasp; 0: fully.
         force: Torque of the joint's motor, N m.
         finger_depth: How far a finger reaches beyond the TCP, the jaw wherever it turns, metres.
         palm_clearance: From the TCP back to the palm, metres: what fits between the fingers above the grasp.
@@ -108,6 +114,7 @@ class JawGripper:
     joints: tuple[str, ...]
     finger_links: tuple[str, ...]
     opening: tuple[tuple[float, float], ...]
+    open_width: float = 0.0
     force: float
     finger_depth: float
     palm_clearance: float
@@ -127,6 +134,8 @@ class JawGripper:
                 "the opening of a jaw needs two rows or more of joint position and opening, from closed to open, in "
                 "which the opening never shrinks while the joint turns one way"
             )
+        if not self.open_width:
+            object.__setattr__(self, "open_width", self.max_width)
 
     @property
     def min_width(self) -> float:
@@ -144,8 +153,8 @@ class JawGripper:
         return np.asarray(np.interp(width, opening, position)[..., np.newaxis])
 
     def stroke_seconds(self) -> float:
-        """How long the jaw takes from closed to open, s."""
-        return abs(self.opening[-1][0] - self.opening[0][0]) / self.joint_speed
+        """How long the jaw takes from closed to where tasks open it, s."""
+        return float(abs(self.joint_position(self.open_width)[0] - self.opening[0][0])) / self.joint_speed
 
     def width(self, joint_position: Array) -> Array:
         """Openings (...), metres, at positions (..., 1), rad."""
@@ -174,6 +183,7 @@ class JawGripper:
         return replace(
             self,
             opening=tuple((position, width * scale) for position, width in self.opening),
+            open_width=self.open_width * scale,
             finger_depth=self.finger_depth * scale,
             palm_clearance=self.palm_clearance * scale,
             play=self.play * scale,

@@ -42,7 +42,13 @@ SO101 = RobotSpec(
             (0.1, 0.0230),
             (0.2, 0.0303),
             (0.25, 0.0340),
+            # A point of its tip there, followed as it turns on and up to its stop.
+            (0.6, 0.0552),
+            (1.0, 0.0753),
+            (1.4, 0.0881),
+            (1.74533, 0.0917),
         ),
+        open_width=0.0340,
         force=0.2,
         finger_depth=0.0085,
         palm_clearance=0.056,

@@ -102,7 +102,7 @@ def robot_at_origin(robot: RobotSpec, sampler: Sampler) -> RobotPlacement:
         name=robot.name,
         world_from_base=Pose(),
         joint_position=tuple(map(float, np.clip(drawn, robot.position_lower, robot.position_upper))),
-        gripper_width=robot.gripper.max_width,
+        gripper_width=robot.gripper.open_width,
     )
 
 

@@ -15,9 +15,10 @@ from demorec.robots.robot import RobotSpec
 from demorec.tasks.script import Behaviour
 from demorec.tasks.success import resting_half_height
 
-# Of the open hand, metres, from the TCP along its x and y axes; the larger of the Panda's and the iiwa's.
-_FINGERS = (0.012, 0.07)
-_PALM = (0.035, 0.11)
+# Half of the open hand, metres (of an arm of task_scale 1), along its x and y axes: the larger of the Panda's and the
+# iiwa's; with the gap, that of the SO-101 at its scale.
+_FINGERS = np.array([0.012, 0.07])
+_PALM = np.array([0.035, 0.11])
 _UP = np.array([0.0, 0.0, 1.0])
 _GAP = 0.005
 """Air between the hand and what it shall not touch, metres."""
@@ -107,7 +108,7 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
     above_support = gripper.finger_depth + 0.005 * robot.task_scale
     z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + above_support)
     found = []
-    for yaw in nearest_first(grasp_yaws(body, pose, now, gripper.max_width), now):
+    for yaw in nearest_first(grasp_yaws(body, pose, now, gripper.open_width), now):
         across = hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
         x, y = pose.position[:2] - gripper.object_offset(2 * half_extent(body, pose, across)) * across[:2]
         found.append(_perturbed(hand_down((x, y, z), yaw), behaviour))
@@ -118,10 +119,11 @@ def found_grasps(shape: Shape, robot: RobotSpec, up: Array) -> tuple[Grasp, ...]
     """The grasps of a solid that stands with the direction `up` (3,) of its own axes upward, best first."""
     gripper = robot.gripper
     hand = Hand(
-        max_width=gripper.max_width,
+        max_width=gripper.open_width,
         finger_depth=gripper.finger_depth,
         palm_clearance=gripper.palm_clearance,
         tip_clearance=0.005 * robot.task_scale,
+        least_width=gripper.min_width + 0.015 * robot.task_scale,
     )
     x, y, z = np.round(up, 2).tolist()
     length = math.hypot(x, y, z)
@@ -153,11 +155,14 @@ def clear_first(grasps: Sequence[Pose], others: Sequence[tuple[Body, Pose]], rob
 
 def _is_clear(hand: Pose, body: Body, pose: Pose, robot: RobotSpec) -> bool:
     """Whether the open hand, pointing down at `world_from_tcp`, touches nothing of a body."""
-    tips, palm = hand.position[2] - robot.gripper.finger_depth, hand.position[2] + robot.gripper.palm_clearance
+    gripper, scale = robot.gripper, robot.task_scale
+    tips, palm = hand.position[2] - gripper.finger_depth, hand.position[2] + gripper.palm_clearance
+    offset = gripper.object_offset(gripper.open_width)  # a jaw opens to one side of the TCP
+    around = Pose(position=hand.position + offset * hand.rotation[:, 1], quat_xyzw=hand.quat_xyzw)
     return (
         _is_lower(body, pose, tips)
-        or (_is_beside(hand, _FINGERS, body, pose) and _is_lower(body, pose, palm))
-        or _is_beside(hand, _PALM, body, pose)
+        or (_is_beside(around, scale * _FINGERS, body, pose) and _is_lower(body, pose, palm))
+        or _is_beside(around, scale * _PALM, body, pose)
     )
 
 
@@ -220,8 +225,8 @@ def _is_lower(body: Body, pose: Pose, height: float) -> bool:
     return not body.collides or pose.position[2] + half_extent(body, pose, _UP) < height
 
 
-def _is_beside(hand: Pose, half_size: tuple[float, float], body: Body, pose: Pose) -> bool:
-    """Whether a body is clear of a rectangle around the TCP, both seen from above along the hand's axes."""
+def _is_beside(hand: Pose, half_size: Array, body: Body, pose: Pose) -> bool:
+    """Whether a body is clear of a rectangle around the hand's middle, both seen from above along the hand's axes."""
     offset = np.abs((pose.position - hand.position) @ hand.rotation)
     return any(
         offset[axis] > half_size[axis] + half_extent(body, pose, hand.rotation[:, axis]) + _GAP for axis in (0, 1)

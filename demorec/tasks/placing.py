@@ -111,8 +111,8 @@ def _beside_the_hand(robot: RobotSpec, *, joint_spread: float) -> Callable[[tupl
     if home.position[2] - gripper.finger_depth - off > scale * TALLEST:
         return lambda point: True
     # Seen from above, in the hand's axes: a jaw opens to one side of the TCP.
-    middle = home.apply(np.array([0.0, gripper.object_offset(gripper.max_width), 0.0]))
-    half = np.array([scale * HAND_AND_THING, gripper.max_width / 2 + scale * HAND_AND_THING]) + off
+    middle = home.apply(np.array([0.0, gripper.object_offset(gripper.open_width), 0.0]))
+    half = np.array([scale * HAND_AND_THING, gripper.open_width / 2 + scale * HAND_AND_THING]) + off
 
     def is_free(point: tuple[float, float]) -> bool:
         away = np.array([scale * point[0], scale * point[1], middle[2]]) - middle

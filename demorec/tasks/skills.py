@@ -32,7 +32,7 @@ from demorec.tasks.grasping import (
     symmetric_yaws,
 )
 from demorec.tasks.script import Behaviour, Step, steady_width
-from demorec.tasks.success import goal_pose, on_support, placement_checks
+from demorec.tasks.success import goal_pose, is_at_rest, on_support, placement_checks
 
 MAX_TRIES = 3
 FREE_SPEED, DESCEND_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.25, 0.3, 0.08
@@ -46,6 +46,8 @@ LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
 LEAST_ABOVE_GOAL = 0.10
 """Metres of the TCP above the goal on its way there; it stays at `lift_height` where that is higher."""
+ROCKING_SECONDS = 0.5
+"""How long what a small arm, which is soon away, has let go of may rock."""
 ANY_YAW = 24
 """Yaws that are tried where any will do."""
 CARRIED_ABOVE_M = 0.04
@@ -93,6 +95,8 @@ class Expert:
             joint_acceleration=0.8 * np.array(robot.acceleration_limit),
         )
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
+        # Recordings of arms of six joints and more are made again byte for byte: what was learnt later is not for them.
+        self._repeats = self.arm.freedom == WHOLE_POSE
         # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
         self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
         self._base_from_world = self.world.arm.world_from_base.inverse()
@@ -100,7 +104,7 @@ class Expert:
     @property
     def open_width(self) -> float:
         """The gripper's full opening, metres."""
-        return self.world.robot.gripper.max_width
+        return self.world.robot.gripper.open_width
 
     def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> GaveUp:
         """What is raised for something that cannot be reached, noted with what is wrong with the first of its poses.
@@ -108,7 +112,7 @@ class Expert:
         Of arms that need no freedom the text stays as it was: recordings are made again byte for byte.
         """
         why = ""
-        for pose in poses[:1] if self.arm.freedom != WHOLE_POSE else ():
+        for pose in poses[:1] if not self._repeats else ():
             goal = self._base_from_world @ pose
             why = self.arm.why_unreachable(goal, start=self.joint_target, rest=self.rest_for(pose))
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
@@ -359,10 +363,19 @@ class Expert:
         clear_height = float(here.position[2]) + 0.07 * self._scale
         yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
+        if not self._repeats:
+            yield from self._until_at_rest(name)
         failed = [check.name for check in placement_checks(world, goal) if not check.passed]
         if failed:
             self.note(f"misplaced_{failed[0]}", f"{name} lies badly: {', '.join(failed)}", trouble=True)
         return not failed
+
+    def _until_at_rest(self, name: str) -> Iterator[Step]:
+        """Hold still while an object that was let go of rocks, for half a second at most."""
+        for _ in range(round(ROCKING_SECONDS * self.world.fps)):
+            if is_at_rest(self.world, name):
+                return
+            yield self.step()
 
     def _transport_height(self, place: Pose) -> float:
         """Height of the TCP, m, on the way to a place: never lower than now."""
@@ -385,7 +398,7 @@ class Expert:
         world = self.world
         body, pose = world.body(name), world.pose(name)
         grasps = grasps_of(body, pose, now=hand_yaw(self.tcp()), robot=world.robot, behaviour=self.behaviour)
-        if body.shape.mesh:
+        if body.shape.mesh or not self._repeats:
             grasps = clear_first(grasps, self._others(name), world.robot)
         return grasps
 
@@ -401,8 +414,7 @@ class Expert:
             GaveUp: Out of reach at every allowed yaw.
         """
         body, pose = self.world.body(goal.object), self.world.pose(goal.object)
-        # A shape of pick_shapes only goes down at the present yaw: recordings are made again byte for byte.
-        any_yaw = ANY_YAW if body.shape.mesh else 0
+        any_yaw = ANY_YAW if body.shape.mesh or not self._repeats else 0
         symmetry = 0 if keep_yaw else goal.yaw_symmetry or any_yaw
         places = places_of(body, pose, goal_pose(self.world, goal), hand=self.tcp(), yaw_symmetry=symmetry)
         for place in places:

@@ -62,6 +62,12 @@ def on_support(world: World, name: str, onto: str) -> bool:
     )
 
 
+def is_at_rest(world: World, name: str) -> bool:
+    """Whether a body moves no faster than what counts as lying still."""
+    linear, angular = world.velocity(name)
+    return math.hypot(*linear.tolist()) <= MAX_SPEED and math.hypot(*angular.tolist()) <= MAX_SPIN
+
+
 def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
     """That one object lies at its goal: near, on its support, upright, at rest and let go.
 
@@ -87,4 +93,4 @@ def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
 
 def gripper_open_check(world: World) -> SuccessCheck:
     """That the hand has let go."""
-    return at_least("gripper_width", world.arm.gripper_width(), MIN_OPENING * world.robot.gripper.max_width, "m")
+    return at_least("gripper_width", world.arm.gripper_width(), MIN_OPENING * world.robot.gripper.open_width, "m")

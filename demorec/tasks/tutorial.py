@@ -122,7 +122,7 @@ class Tutorial(Task):
                 world_from_base=Pose(position=np.array(BASE)),
                 scale=ROBOT_SCALE,
                 joint_position=tuple(q + sampler.uniform(-spread, spread) for q in joints),
-                gripper_width=robot.gripper.scaled(ROBOT_SCALE).max_width,
+                gripper_width=robot.gripper.scaled(ROBOT_SCALE).open_width,
             ),
             bodies=(floor(0.0), table, cube),
             goals=(goal,),

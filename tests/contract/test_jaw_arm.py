@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -19,14 +20,18 @@ from support.jaw_arm.my_arms import JAW_ARM, opening
 from demorec.cli import generate_dataset_main
 from demorec.core.geometry import Pose
 from demorec.core.plain import from_json, to_json
+from demorec.episode.mesh import SolidMesh, encode_mesh
+from demorec.episode.scene import Shape
 from demorec.robots.kinematics import ArmKinematics, Freedom
 from demorec.robots.motion import MotionLimits, plan_straight
+from demorec.robots.panda import PANDA
 from demorec.robots.robot import JawGripper, RobotSpec
+from demorec.robots.so101 import SO101
 from demorec.robots.urdf import Urdf
-from demorec.tasks.grasping import hand_down
+from demorec.tasks.grasping import found_grasps, hand_down
 from demorec.tasks.pick import PickPlace
 from demorec.tasks.sampling import Sampler
-from demorec.testing import RobotContract
+from demorec.testing import RobotContract, run_expert
 
 FOLDER = Path(__file__).parents[1] / "support" / "jaw_arm"
 assert isinstance(JAW_ARM.gripper, JawGripper)
@@ -38,6 +43,42 @@ ARM = ArmKinematics.from_urdf(
     lower=JAW_ARM.position_lower,
     upper=JAW_ARM.position_upper,
 )
+
+
+@pytest.mark.parametrize(
+    ("task", "index"),
+    [
+        ("sort_by_color", 96),  # at the nearest yaw the open jaw comes down on the rim of a tray
+        ("pick_shapes", 49),  # the roll's limit is between the grasp's yaw and the mark
+        ("pick_shapes", 165),  # a mug that rocks when the hand has let go of it
+    ],
+)
+def test_a_small_arm_finds_a_clear_grasp_a_yaw_in_reach_and_waits_for_what_rocks(task: str, index: int) -> None:
+    _, outcome = run_expert(task, "so101", 0, index)
+    assert outcome.success
+    assert outcome.num_retries == 0
+
+
+@pytest.mark.parametrize(("robot", "least"), [(PANDA, 0.015), (SO101, 0.0022 + 0.38 * 0.015)])
+def test_the_thinnest_thing_that_is_grasped_is_as_thin_as_the_hand_is_small(robot: RobotSpec, least: float) -> None:
+    def found(width: float) -> bool:
+        box = trimesh.creation.box(extents=(0.12, width, 0.03))
+        corners, faces = np.array(box.vertices), np.array(box.faces)
+        mesh = encode_mesh(SolidMesh(points=corners, faces=faces, parts=(np.arange(8),)))
+        shape = Shape(kind="mesh", mesh=mesh, size=(0.12, width, 0.03))
+        return bool(found_grasps(shape, robot, np.array([0.0, 0.0, 1.0])))
+
+    assert found(least + 0.001)
+    assert not found(least - 0.001)
+
+
+def test_tasks_open_a_jaw_less_than_it_turns() -> None:
+    half = replace(JAW, open_width=0.5 * JAW.max_width)
+    assert half.stroke_seconds() < JAW.stroke_seconds()
+    assert half.scaled(2.0).open_width == JAW.max_width
+    assert replace(JAW_ARM, gripper=half) == from_json(to_json(replace(JAW_ARM, gripper=half)), RobotSpec)
+    assert SO101.gripper.joint_position(SO101.gripper.open_width) == pytest.approx([0.25])
+    assert SO101.gripper.joint_position(SO101.gripper.max_width) == pytest.approx([1.74533])  # the URDF's stop
 
 
 @given(q=st.floats(-0.33, 0.45), speed=st.floats(-1.0, 1.0))

@@ -120,7 +120,7 @@ def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec: RobotSpe
         world.reset(episode(robot=spec.name).info.scene)
         goal = world.arm.world_from_base.inverse() @ hand_down(spec.task_scale * np.array([0.5, 0.0, 0.2]), 0.0)
         found = world.arm.kinematics.inverse(goal, start=np.array(spec.home_q))
-        world.arm.place(present(found), spec.gripper.max_width)
+        world.arm.place(present(found), spec.gripper.open_width)
         world.client.performCollisionDetection()
         tcp = world.arm.world_from_tcp().position
         boxes = {

@@ -85,7 +85,7 @@ def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
     pose = Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5])) @ camera.mount_from_camera
     tcp = world.arm.world_from_tcp()
     gripper, turned = world.robot.gripper, -1 if world.robot.wrist_camera else 1
-    half, middle = gripper.max_width / 2, gripper.object_offset(gripper.max_width)
+    half, middle = gripper.open_width / 2, gripper.object_offset(gripper.open_width)
     for point in ([0, middle, 0], [0, middle + 0.7 * half, 0], [0, middle - 0.7 * half, 0], [0, middle, 0.1]):
         assert inside(camera, pixel(camera, pose, tuple(tcp.apply(np.array(point))))), point
     # The hand's own x axis runs down in the image: what lies ahead of the fingers comes in from below. SO-101's mount

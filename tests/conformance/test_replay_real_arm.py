@@ -1,0 +1,180 @@
+"""What a real SO-101 did, by its numbers alone: the simulated one does it again, and says how far off it is."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.check import simulate, simulate_run
+from support.commands import exit_code
+from support.export import data_table, info
+from support.lerobot_tools import Command, run_commands
+
+from demorec.robots.motors import CALIBRATIONS, MotorUnits
+from demorec.robots.so101 import SO101
+
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+
+ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+CALIBRATION = CALIBRATIONS / "so101_urdf.json"
+DEGREES = ("--robot", "so101", "--motor-units", "degrees")
+HELD = 0.012
+"""Metres that the recorded fingers may be held apart by the cube, which the replay does not know of."""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes as LeRobot would have them of a real arm, which says nothing but names and numbers."""
+    folder = tmp_path_factory.mktemp("real")
+    run = simulate_run(folder / "run", 2, robot="so101", seed=11, variation="none", cameras=())
+    out = folder / "d"
+    assert exit_code("export", "lerobot", run, "--motor-units", "degrees", "--no-verify", "--out", out) == 0
+    shutil.rmtree(out / "demorec")
+    return out
+
+
+def replayed(capsys: pytest.CaptureFixture[str], path: Path, *flags: object) -> list[dict[str, tuple[float, float]]]:
+    """Of each episode: joint -> (median, largest) error, degrees; the gripper's in metres."""
+    capsys.readouterr()
+    assert exit_code("replay", *flags, path, "--json") == 0
+    found = [report["tracking"] for report in json.loads(capsys.readouterr().out)]
+    for tracking in found:
+        assert list(tracking) == [*ARM, "gripper"]
+        tracking |= {joint: tuple(math.degrees(error) for error in tracking[joint]) for joint in ARM}
+    return found
+
+
+def changed(dataset: Path, out: Path, change: Any) -> Path:
+    """A copy whose states (T, 6) have been changed, the first row of each episode kept."""
+    shutil.copytree(dataset, out)
+    (path,) = (out / "data").glob("*/*.parquet")
+    table = pq.read_table(path)
+    number = np.array(table["episode_index"].to_pylist())
+    state = np.array(table["observation.state"].to_pylist(), dtype=np.float32)
+    for episode in set(number.tolist()):
+        state[number == episode] = change(state[number == episode])
+    rows = pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 6)
+    place = table.column_names.index("observation.state")
+    pq.write_table(table.set_column(place, table.schema.field(place), rows), path)
+    return out
+
+
+def test_what_the_simulator_did_itself_is_tracked(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = replayed(capsys, dataset, *DEGREES)
+    assert len(found) == 2
+    for tracking in found:
+        assert max(largest for joint, (_, largest) in tracking.items() if joint in ARM) < 0.1
+        assert tracking["gripper"][1] < 2 * HELD
+    (one,) = replayed(capsys, dataset, *DEGREES, "--episodes", "1")
+    assert one == found[1]
+
+
+def test_an_imported_recording_says_its_units_itself(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code("import", "lerobot", dataset, "--motor-units", "degrees", "--out", tmp_path / "run") == 0
+    by_run = replayed(capsys, tmp_path / "run", "--robot", "so101")
+    assert by_run == replayed(capsys, dataset, *DEGREES)
+    assert exit_code("replay", *DEGREES, tmp_path / "run") == 2
+    assert "recordings say their units" in capsys.readouterr().err
+
+
+def test_an_offset_and_a_lag_show_in_their_joints(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def offset(state: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        state[1:, 2] += 3.0  # degrees
+        return state
+
+    def late(state: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return np.concatenate([np.repeat(state[:1], 3, axis=0), state[:-3]])
+
+    for tracking in replayed(capsys, changed(dataset, tmp_path / "offset", offset), *DEGREES):
+        median, largest = tracking["elbow_flex"]
+        assert median == pytest.approx(3.0, abs=0.05)
+        assert largest == pytest.approx(3.0, abs=0.1)
+        assert max(tracking[joint][1] for joint in ARM if joint != "elbow_flex") < 0.1
+    lagging = changed(dataset, tmp_path / "late", late)
+    plain, delayed = (replayed(capsys, lagging, *DEGREES, *more) for more in ((), ("--delay", 3)))
+    for before, after in zip(plain, delayed, strict=True):
+        assert before["shoulder_pan"][1] > 1.0
+        assert after["shoulder_pan"][1] < 0.1
+    # More than a hundredth of a radian off: not as recorded, if that is asked for.
+    assert exit_code("replay", *DEGREES, "--tolerance", 0.01, lagging) == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--robot", "so101"), "or --motor-units is missing"),
+        (("--robot", "panda", "--motor-units", "degrees"), "it is of another robot"),
+        (("--motor-units", "degrees"), "add --robot so101"),
+        ((*DEGREES, "--states"), "--states and --export-hz are for recordings with a scene"),
+        ((*DEGREES, "--view"), "leave --out, --view out"),
+        ((), "--robot replays what a real arm did"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_sentence(
+    dataset: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...], said: str
+) -> None:
+    capsys.readouterr()
+    assert exit_code("replay", *flags, dataset) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_other_robots_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    panda = simulate(tmp_path / "panda.mcap", seed=11)
+    assert exit_code("replay", "--robot", "so101", panda) == 2
+    assert "leave --robot out" in capsys.readouterr().err
+    assert exit_code("export", "lerobot", panda, "--no-verify", "--out", tmp_path / "d") == 0
+    assert exit_code("replay", *DEGREES, tmp_path / "d") == 2
+    assert "of so101: it is of another robot" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_jaw_turns_as_far_as_a_real_one(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """LeRobot's 100 is the joint's stop, far beyond what tasks use."""
+    shutil.copytree(dataset, tmp_path / "d")
+    (path,) = (tmp_path / "d" / "data").glob("*/*.parquet")
+    table = pq.read_table(path)
+    action = np.array(table["action"].to_pylist(), dtype=np.float32)
+    action[:, 5] = 100.0
+    for name, values in (("action", action), ("observation.state", action)):
+        rows = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 6)
+        place = table.column_names.index(name)
+        table = table.set_column(place, table.schema.field(place), rows)
+    pq.write_table(table, path)
+    for tracking in replayed(capsys, tmp_path / "d", *DEGREES):
+        assert tracking["gripper"][0] < 1e-3
+    assert SO101.gripper.width(np.array([1.74533])) > 2 * SO101.gripper.open_width
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("units", ["degrees", "range_m100_100"])
+def test_what_lerobot_recorded_of_its_own_driver(
+    dataset: Path, tmp_path: Path, units: MotorUnits, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Through a stub of the bus, whose servos are at once where they are sent."""
+    state = np.array(data_table(dataset)["observation.state"].to_pylist())[:40]
+    names = tuple(info(dataset)["features"]["observation.state"]["names"])
+    share = np.array([m["range_max"] - m["range_min"] for m in json.loads(CALIBRATION.read_text()).values()])
+    values = state if units == "degrees" else state * np.append(4095 / 360 * 200 / share[:5], 1.0)
+    (tmp_path / "script.json").write_text(json.dumps({"names": names, "rows": values.tolist()}))
+    arm = ["--robot.type=so101_follower", "--robot.port=none", "--robot.id=so101_urdf"]
+    arm += [f"--robot.calibration_dir={CALIBRATIONS}", f"--robot.use_degrees={units == 'degrees'}".lower()]
+    camera = "--robot.cameras={front: {type: still, width: 96, height: 96, fps: 30}}"
+    flags = ["repo_id=local/real", f"root={tmp_path / 'd'}", "no_stamp=true", "num_episodes=1", "episode_time_s=1"]
+    flags += ["fps=30", "single_task=Move.", "push_to_hub=false", "rgb_encoder.vcodec=h264"]
+    teleop = ["--teleop.type=scripted", f"--teleop.script={tmp_path / 'script.json'}"]
+    record = [*(f"--dataset.{flag}" for flag in flags), "--play_sounds=false"]
+    stub = {"STUB_CALIBRATION": str(CALIBRATION)}
+    run_commands([Command(command="lerobot_record", args=[*arm, camera, *teleop, *record], env=stub)], tmp_path)
+    (tracking,) = replayed(capsys, tmp_path / "d", "--robot", "so101", "--motor-units", units)
+    # The stub's servos jump: the simulated ones are a control step behind them.
+    assert max(tracking[joint][0] for joint in ARM) < 2.0
