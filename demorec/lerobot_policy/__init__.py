@@ -47,8 +47,8 @@ class ActKeypointsConfig(ACTConfig):  # type: ignore[misc]
             dataset that the policy is trained on, and its images by ImageNet.
     """
 
-    num_keypoints: int = 16
-    encoder_channels: int = 16
+    num_keypoints: int = 32
+    encoder_channels: int = 32
     num_targets: int = 0
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {

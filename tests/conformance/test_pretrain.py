@@ -86,10 +86,10 @@ def test_what_it_tells_is_what_the_left_out_episode_shows(
         next((k for k in range(i + 1, len(pose)) if episode[k] == episode[i] and is_open[k] != is_open[k - 1]), None)
         for i in range(len(pose))
     ]
-    last = {number: np.flatnonzero(episode == number)[-1] for number in (0, 1, 2)}
-    then = np.array([last[episode[i]] if k is None else k for i, k in enumerate(ahead)])
-    offset = pose[then] - pose
-    baseline = np.median(np.linalg.norm(offset[episode == 2] - offset[episode < 2].mean(0), axis=1))
+    rows = np.flatnonzero([k is not None for k in ahead])  # nothing is to be told after the last
+    offset = pose[[ahead[i] for i in rows]] - pose[rows]
+    is_left_out = episode[rows] == 2
+    baseline = np.median(np.linalg.norm(offset[is_left_out] - offset[~is_left_out].mean(0), axis=1))
     found = json.loads((taught / "pretraining.json").read_text())["result"]
     assert found["baseline_m"] == pytest.approx(baseline, abs=2e-5)
     assert found["episodes"] == 1

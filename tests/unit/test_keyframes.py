@@ -28,7 +28,8 @@ def test_targets_are_those_of_geometry() -> None:
     """The hand, turned by 90 degrees, will grasp 3 cm along base x: that is -3 cm along its own y."""
     position = np.array([[0.50, 0.10, 0.30], [0.53, 0.10, 0.02], [0.53, 0.06, 0.02]])
     quat = np.array([about_z(math.pi / 2), about_z(math.pi / 6), about_z(-math.pi / 3)])
-    found = keyframe_targets(position, quat, np.array([[1, 2], [1, 2], [2, 2]]))
+    found = keyframe_targets(position, quat, np.array([3, 3, 3]), np.array([[1, 2], [1, 2], [2, 2]]))
+    assert found.is_ahead.tolist() == [True, True, False]
     now = dict(zip(found.names, found.values[0].tolist(), strict=True))
     expected = {
         "keyframe_0.x": 0.53,

@@ -27,11 +27,13 @@ class KeyframeTargets:
     Attributes:
         values: (N, K) metres, and sines and cosines of angles.
         names: Of the components.
+        is_ahead: (N,) whether the gripper is still to be told something; nothing is learned from the other frames.
         offsets: Places of the offset from the TCP to the next keyframe, base frame, x, y, z.
     """
 
     values: NDArray[np.float32]
     names: tuple[str, ...]
+    is_ahead: NDArray[np.bool_]
     offsets: tuple[int, int, int]
 
 
@@ -59,14 +61,17 @@ def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) 
 
 
 def keyframe_targets(
-    position: NDArray[np.floating], quat_xyzw: NDArray[np.floating], keyframes: NDArray[np.int64]
+    position: NDArray[np.floating],
+    quat_xyzw: NDArray[np.floating],
+    episode: NDArray[np.integer],
+    keyframes: NDArray[np.int64],
 ) -> KeyframeTargets:
     """The hand's poses at its next keyframes, as they are and as seen from where it is now.
 
     Args:
         position: (N, 3) of the TCP, metres, base frame.
         quat_xyzw: (N, 4) of the TCP, base frame.
-        keyframes: As of `find_keyframes`.
+        episode, keyframes: As of `find_keyframes`.
     """
     xyz = position.astype(np.float64)
     yaw = _yaw(quat_xyzw.astype(np.float64))
@@ -93,7 +98,10 @@ def keyframe_targets(
     names = tuple(columns)
     x, y, z = (names.index(f"keyframe_0.from_tcp.{name}") for name in "xyz")
     return KeyframeTargets(
-        values=np.stack(list(columns.values()), axis=1).astype(np.float32), names=names, offsets=(x, y, z)
+        values=np.stack(list(columns.values()), axis=1).astype(np.float32),
+        names=names,
+        is_ahead=np.append(np.diff(episode) == 0, False)[keyframes[:, 0]],
+        offsets=(x, y, z),
     )
 
 

@@ -155,8 +155,8 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
     places = [_names(features[pose]).index(name) for name in _TCP]
     tcp = _column(dataset, pose)[:, places]
     opening = _column(dataset, _ACTION)[:, _names(features[_ACTION]).index(_OPENING)]
-    keyframes = find_keyframes(opening, _column(dataset, "episode_index").reshape(-1))
-    return keyframe_targets(tcp[:, :3], tcp[:, 3:], keyframes)
+    episode = _column(dataset, "episode_index").reshape(-1)
+    return keyframe_targets(tcp[:, :3], tcp[:, 3:], episode, find_keyframes(opening, episode))
 
 
 class _Lessons:
@@ -169,10 +169,12 @@ class _Lessons:
         self._policy = make_policy(policy, ds_meta=dataset.meta)
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
-        self._learnt, self._held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1))
-        learnt = targets.values[self._learnt]
-        spread = learnt.std(0)
-        self._mean = learnt.mean(0)
+        rows = np.flatnonzero(targets.is_ahead)
+        learnt, held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1)[rows])
+        self._learnt, self._held_out = rows[learnt], rows[held_out]
+        values = targets.values[self._learnt]
+        spread = values.std(0)
+        self._mean = values.mean(0)
         self._spread = np.where(spread > 1e-4, spread, np.inf).astype(np.float32)
         self._network = self._policy.encoder.requires_grad_(True)
         self._network.normalize_by(dataset.meta.stats, list(self._policy.config.image_features))
@@ -269,11 +271,14 @@ def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
     """Rows that are learned from, rows of the last twentieth of the episodes (one at least), and how many these are.
 
     Raises:
-        ConfigError: There is one episode only.
+        ConfigError: There are fewer than two episodes.
     """
     numbers_of = np.unique(episode)
     if len(numbers_of) < 2:
-        raise ConfigError("The dataset has one episode only: at least 2 are needed, one of which is left out.")
+        raise ConfigError(
+            f"The gripper is told to close or to open in {len(numbers_of)} of the dataset's episodes: at least 2 are "
+            "needed, one of which is left out."
+        )
     count = max(1, round(_HELD_OUT_SHARE * len(numbers_of)))
     is_held_out = np.isin(episode, numbers_of[-count:])
     return np.flatnonzero(~is_held_out), np.flatnonzero(is_held_out), count
