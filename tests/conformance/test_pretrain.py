@@ -82,14 +82,17 @@ def test_what_it_tells_is_what_the_left_out_episode_shows(
     table = pq.read_table(next((settings.parent / "dataset" / "data").rglob("*.parquet")))
     episode, pose = table["episode_index"].to_numpy(), np.stack(table["observation.ee_pose"].to_numpy())[:, :3]
     is_open = np.stack(table["action"].to_numpy())[:, -1] > 0.04
-    ahead = [
-        next((k for k in range(i + 1, len(pose)) if episode[k] == episode[i] and is_open[k] != is_open[k - 1]), None)
-        for i in range(len(pose))
-    ]
-    rows = np.flatnonzero([k is not None for k in ahead])  # nothing is to be told after the last
-    offset = pose[[ahead[i] for i in rows]] - pose[rows]
-    is_left_out = episode[rows] == 2
-    baseline = np.median(np.linalg.norm(offset[is_left_out] - offset[~is_left_out].mean(0), axis=1))
+    changes = [k for k in range(1, len(pose)) if episode[k] == episode[k - 1] and is_open[k] != is_open[k - 1]]
+    offsets: dict[bool, list[np.ndarray[Any, Any]]] = {False: [], True: []}  # to the next closing, to the next opening
+    first = []
+    for i, number in enumerate(episode):
+        ahead = [k for k in changes if k > i and episode[k] == number]
+        if number == 2:
+            first += [(bool(is_open[k]), pose[k] - pose[i]) for k in ahead[:1]]
+        else:
+            for opens, offset in offsets.items():
+                offset += [pose[k] - pose[i] for k in ahead if is_open[k] == opens][:1]
+    baseline = np.median([np.linalg.norm(offset - np.mean(offsets[opens], axis=0)) for opens, offset in first])
     found = json.loads((taught / "pretraining.json").read_text())["result"]
     assert found["baseline_m"] == pytest.approx(baseline, abs=2e-5)
     assert found["episodes"] == 1

@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from lerobot.policies import make_policy, make_pre_post_processors
 from numpy.typing import NDArray
-from torch.nn import functional
 from torch.utils.data import default_collate
 
 from demorec.core.errors import ConfigError, DemorecError, describe_error
@@ -67,7 +66,7 @@ class PretrainResult:
     Attributes:
         median_m, most_m: Error of the offset from the TCP to the next keyframe in metres: of half of the frames, and
             of nine tenths.
-        baseline_m: Median error of always telling the mean offset.
+        baseline_m: Median error of always telling the mean offset of the closings, or of the openings.
         episodes: That were left out.
         cpu_seconds: Of the last call.
     """
@@ -155,8 +154,8 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
     places = [_names(features[pose]).index(name) for name in _TCP]
     tcp = _column(dataset, pose)[:, places]
     opening = _column(dataset, _ACTION)[:, _names(features[_ACTION]).index(_OPENING)]
-    episode = _column(dataset, "episode_index").reshape(-1)
-    return keyframe_targets(tcp[:, :3], tcp[:, 3:], episode, find_keyframes(opening, episode))
+    keyframes = find_keyframes(opening, _column(dataset, "episode_index").reshape(-1))
+    return keyframe_targets(tcp[:, :3], tcp[:, 3:], keyframes)
 
 
 class _Lessons:
@@ -169,12 +168,12 @@ class _Lessons:
         self._policy = make_policy(policy, ds_meta=dataset.meta)
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
-        rows = np.flatnonzero(targets.is_ahead)
+        rows = np.flatnonzero(~np.isnan(targets.values).all(1))  # nothing is to be told after the last keyframe
         learnt, held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1)[rows])
         self._learnt, self._held_out = rows[learnt], rows[held_out]
         values = targets.values[self._learnt]
-        spread = values.std(0)
-        self._mean = values.mean(0)
+        spread = np.nanstd(values, 0)
+        self._mean = np.nanmean(values, 0)
         self._spread = np.where(spread > 1e-4, spread, np.inf).astype(np.float32)
         self._network = self._policy.encoder.requires_grad_(True)
         self._network.normalize_by(dataset.meta.stats, list(self._policy.config.image_features))
@@ -204,15 +203,15 @@ class _Lessons:
         with torch.no_grad():
             for start in range(0, len(rows), self._plan.batch_size):
                 told.append(self._tell(rows[start : start + self._plan.batch_size]).cpu().numpy())
-        offsets = list(self._targets.offsets)
         spread = np.where(np.isinf(self._spread), 0, self._spread)
-        found = (np.concatenate(told) * spread + self._mean)[:, offsets]
-        true = self._targets.values[rows][:, offsets]
+        true, mean = self._targets.values[rows], np.broadcast_to(self._mean, (len(rows), len(self._mean)))
+        found = np.concatenate(told) * spread + mean
+        true, found, mean = (np.take_along_axis(each, self._targets.offsets[rows], 1) for each in (true, found, mean))
         error = np.linalg.norm(found - true, axis=1)
         return PretrainResult(
             median_m=round(float(np.median(error)), 5),
             most_m=round(float(np.quantile(error, 0.9)), 5),
-            baseline_m=round(float(np.median(np.linalg.norm(true - self._mean[offsets], axis=1))), 5),
+            baseline_m=round(float(np.median(np.linalg.norm(true - mean, axis=1))), 5),
             episodes=self._num_held_out,
             cpu_seconds=round(cpu_seconds, 1),
         )
@@ -230,7 +229,10 @@ class _Lessons:
         rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / plan.updates))
         for group in self._optimizer.param_groups:
             group["lr"] = plan.learning_rate * rate
-        loss = functional.l1_loss(self._tell(rows), torch.from_numpy(wanted).to(self._device))
+        is_known = torch.from_numpy(~np.isnan(wanted)).to(self._device)
+        error = self._tell(rows) - torch.from_numpy(np.nan_to_num(wanted)).to(self._device)
+        # Closings count as much as openings, which are ahead for longer.
+        loss = ((error.abs() * is_known).sum(0) / is_known.sum(0).clamp(min=1)).mean()
         self._optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), _GRADIENT_NORM)
