@@ -53,7 +53,7 @@ class PretrainConfig:
         seed: Of the weights at the start, and of which frames are seen.
     """
 
-    updates: int = 1500
+    updates: int = 3000
     batch_size: int = 64
     learning_rate: float = 2e-3
     seed: int = 0
@@ -121,6 +121,7 @@ def pretrain(
         "dataset": _digest(dataset),
         "episodes": chosen.episodes,
         "policy": _deciding(config.policy),
+        "targets": list(targets.names),
     }
     out.mkdir(parents=True, exist_ok=True)
     with run_lock(out):
