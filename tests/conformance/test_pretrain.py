@@ -206,6 +206,13 @@ def test_wrong_requests(
     assert not (tmp_path / "out").exists()
 
 
+def test_one_episode_is_too_few(settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert pretrain(settings, tmp_path / "out", "--dataset.episodes=[0]") == 2
+    assert (
+        "is told to close or to open in 1 of the dataset's episodes: at least 2 are needed" in capsys.readouterr().err
+    )
+
+
 def test_a_dataset_that_does_not_tell_where_the_hand_is(
     settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
