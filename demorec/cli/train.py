@@ -51,10 +51,11 @@ class Train:
 class Pretrain:
     """Pretrain the image encoder of a policy of type act_keypoints before the policy is trained.
 
-    From the images, it learns to predict where the hand will be when the gripper is next commanded to close or open.
-    The targets come from the dataset's own poses and commands; no object poses are needed. The result is a policy
-    folder for --policy.path of demorec train. All other flags are those of lerobot-train, of which only those about the
-    dataset, the policy and the seed matter. Run the same command again to continue where it stopped.
+    From the images, it learns to predict where the hand will be when the gripper is next commanded to close, and when
+    it is next commanded to open. The targets come from the dataset's own poses and commands; no object poses are
+    needed. The result is a policy folder for --policy.path of demorec train. All other flags are those of
+    lerobot-train, of which only those about the dataset, the policy and the seed matter. Run the same command again to
+    continue where it stopped.
 
     Examples:
       demorec pretrain --config_path=examples/act_images.json --out outputs/eye
@@ -63,7 +64,7 @@ class Pretrain:
 
     out: Path
     """Folder of the policy."""
-    num_updates: int = 1500
+    num_updates: int = 3000
     """Number of updates of the encoder's weights."""
     frames_per_update: int = 64
     """Frames per update, each with the images of all cameras."""

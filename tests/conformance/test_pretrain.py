@@ -82,14 +82,17 @@ def test_what_it_tells_is_what_the_left_out_episode_shows(
     table = pq.read_table(next((settings.parent / "dataset" / "data").rglob("*.parquet")))
     episode, pose = table["episode_index"].to_numpy(), np.stack(table["observation.ee_pose"].to_numpy())[:, :3]
     is_open = np.stack(table["action"].to_numpy())[:, -1] > 0.04
-    ahead = [
-        next((k for k in range(i + 1, len(pose)) if episode[k] == episode[i] and is_open[k] != is_open[k - 1]), None)
-        for i in range(len(pose))
-    ]
-    last = {number: np.flatnonzero(episode == number)[-1] for number in (0, 1, 2)}
-    then = np.array([last[episode[i]] if k is None else k for i, k in enumerate(ahead)])
-    offset = pose[then] - pose
-    baseline = np.median(np.linalg.norm(offset[episode == 2] - offset[episode < 2].mean(0), axis=1))
+    changes = [k for k in range(1, len(pose)) if episode[k] == episode[k - 1] and is_open[k] != is_open[k - 1]]
+    offsets: dict[bool, list[np.ndarray[Any, Any]]] = {False: [], True: []}  # to the next closing, to the next opening
+    first = []
+    for i, number in enumerate(episode):
+        ahead = [k for k in changes if k > i and episode[k] == number]
+        if number == 2:
+            first += [(bool(is_open[k]), pose[k] - pose[i]) for k in ahead[:1]]
+        else:
+            for opens, offset in offsets.items():
+                offset += [pose[k] - pose[i] for k in ahead if is_open[k] == opens][:1]
+    baseline = np.median([np.linalg.norm(offset - np.mean(offsets[opens], axis=0)) for opens, offset in first])
     found = json.loads((taught / "pretraining.json").read_text())["result"]
     assert found["baseline_m"] == pytest.approx(baseline, abs=2e-5)
     assert found["episodes"] == 1
@@ -201,6 +204,13 @@ def test_wrong_requests(
     assert ends("pretrain", *given, "--out", str(tmp_path / "out"), *words) == 2
     assert sentence in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_one_episode_is_too_few(settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert pretrain(settings, tmp_path / "out", "--dataset.episodes=[0]") == 2
+    assert (
+        "is told to close or to open in 1 of the dataset's episodes: at least 2 are needed" in capsys.readouterr().err
+    )
 
 
 def test_a_dataset_that_does_not_tell_where_the_hand_is(

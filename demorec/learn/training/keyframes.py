@@ -2,8 +2,8 @@
 
 A keyframe is a moment at which the gripper is told to close or to open (James and Davison, "Q-attention", 2021; PerAct,
 Shridhar et al., 2022). Keyframes are read off the robot's own poses and commands, so that nothing is needed that a real
-recording does not have, poses of objects least of all; yet the first of them is where the object is, and the second
-where it has to go.
+recording does not have, poses of objects least of all; yet the next closing is where the object is, and the next
+opening where it has to go. Each stays the same from frame to frame until it has passed, which is easy to learn.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.episode.features import near_field
 
-NUM_KEYFRAMES = 2
+COMMANDS = ("closing", "opening")
 
 Array = NDArray[np.float64]
 
@@ -25,36 +25,32 @@ class KeyframeTargets:
     """What an encoder of images learns to tell of each frame.
 
     Attributes:
-        values: (N, K) metres, and sines and cosines of angles.
+        values: (N, K) metres, and sines and cosines of angles; NaN about a keyframe that is not ahead.
         names: Of the components.
-        offsets: Places of the offset from the TCP to the next keyframe, base frame, x, y, z.
+        offsets: (N, 3) places of the offset from the TCP to the keyframe that comes first, base frame, x, y, z.
     """
 
     values: NDArray[np.float32]
     names: tuple[str, ...]
-    offsets: tuple[int, int, int]
+    offsets: NDArray[np.int64]
 
 
 def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The next frames at which the gripper is told to close or to open.
+    """The next frames at which the gripper is told to close, and to open.
 
     Args:
         opening: (N,) commanded opening, in any unit. It is open above the middle of all that is commanded.
         episode: (N,) number of each frame's episode; its frames follow one another.
 
     Returns:
-        (N, 2) indices of the next one and of the one after it; the episode's last frame where there is none.
+        (N, 2) indices of the next closing and of the next opening; -1 where the episode has none ahead.
     """
     is_open = opening > (opening.min() + opening.max()) / 2
-    frames = np.arange(len(episode))
     changes = np.flatnonzero((np.diff(is_open) != 0) & (np.diff(episode) == 0)) + 1
-    ends = np.append(np.flatnonzero(np.diff(episode)), len(episode) - 1)
-    last = ends[np.searchsorted(ends, frames)]
-    found = np.empty((len(episode), NUM_KEYFRAMES), np.int64)
-    place = np.searchsorted(changes, frames, side="right")
-    for k in range(NUM_KEYFRAMES):
-        candidate = np.append(changes, len(episode))[np.minimum(place + k, len(changes))]
-        found[:, k] = np.minimum(candidate, last)
+    found = np.empty((len(episode), len(COMMANDS)), np.int64)
+    for k, each in enumerate((changes[~is_open[changes]], changes[is_open[changes]])):
+        following = np.append(each, -1)[np.searchsorted(each, np.arange(len(episode)), side="right")]
+        found[:, k] = np.where(episode[following] == episode, following, -1)
     return found
 
 
@@ -71,29 +67,27 @@ def keyframe_targets(
     xyz = position.astype(np.float64)
     yaw = _yaw(quat_xyzw.astype(np.float64))
     columns: dict[str, Array] = {}
-    for k in range(NUM_KEYFRAMES):
-        then = keyframes[:, k]
-        offset = xyz[then] - xyz
+    for command, then in zip(COMMANDS, keyframes.T, strict=True):
+        is_ahead = then >= 0
+        place, turn = np.where(is_ahead[:, None], xyz[then], np.nan), np.where(is_ahead, yaw[then], np.nan)
+        offset = place - xyz
+        for axis, name in enumerate("xyz"):
+            columns[f"{command}.{name}"] = place[:, axis]
+            columns[f"{command}.from_tcp.{name}"] = offset[:, axis]
+            columns[f"{command}.from_tcp.near_{name}"] = near_field(offset[:, axis])
         x_in_hand = np.cos(yaw) * offset[:, 0] + np.sin(yaw) * offset[:, 1]
         y_in_hand = np.cos(yaw) * offset[:, 1] - np.sin(yaw) * offset[:, 0]
-        for axis, name in enumerate("xyz"):
-            columns[f"keyframe_{k}.{name}"] = xyz[then, axis]
-            columns[f"keyframe_{k}.from_tcp.{name}"] = offset[:, axis]
-            columns[f"keyframe_{k}.from_tcp.near_{name}"] = near_field(offset[:, axis])
         for name, in_hand in (("x", x_in_hand), ("y", y_in_hand)):
-            columns[f"keyframe_{k}.from_tcp.hand_{name}"] = in_hand
-            columns[f"keyframe_{k}.from_tcp.near_hand_{name}"] = near_field(in_hand)
-        for name, angle in (("yaw", yaw[then]), ("from_tcp.yaw", yaw[then] - yaw)):
-            columns[f"keyframe_{k}.{name}.sin2"] = np.sin(2 * angle)  # two fingers: half a turn is the same
-            columns[f"keyframe_{k}.{name}.cos2"] = np.cos(2 * angle)
-    between = xyz[keyframes[:, 1]] - xyz[keyframes[:, 0]]
-    for axis, name in enumerate("xyz"):
-        columns[f"keyframe_1.from_keyframe_0.{name}"] = between[:, axis]
-        columns[f"keyframe_1.from_keyframe_0.near_{name}"] = near_field(between[:, axis])
+            columns[f"{command}.from_tcp.hand_{name}"] = in_hand
+            columns[f"{command}.from_tcp.near_hand_{name}"] = near_field(in_hand)
+        for name, angle in (("yaw", turn), ("from_tcp.yaw", turn - yaw)):
+            columns[f"{command}.{name}.sin2"] = np.sin(2 * angle)  # two fingers: half a turn is the same
+            columns[f"{command}.{name}.cos2"] = np.cos(2 * angle)
     names = tuple(columns)
-    x, y, z = (names.index(f"keyframe_0.from_tcp.{name}") for name in "xyz")
+    first = np.where(keyframes < 0, len(keyframes), keyframes).argmin(1)
+    offsets = np.array([[names.index(f"{command}.from_tcp.{name}") for name in "xyz"] for command in COMMANDS])
     return KeyframeTargets(
-        values=np.stack(list(columns.values()), axis=1).astype(np.float32), names=names, offsets=(x, y, z)
+        values=np.stack(list(columns.values()), axis=1).astype(np.float32), names=names, offsets=offsets[first]
     )
 
 
