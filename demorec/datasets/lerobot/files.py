@@ -204,8 +204,19 @@ def column_numbers(column: pa.Array) -> NDArray[Any]:
     if not pa.types.is_list(flat.type) and not pa.types.is_fixed_size_list(flat.type):
         return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(-1, 1)
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
-        flat = flat.flatten()
+        flat = _elements(flat)
     return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(len(column), -1)
+
+
+def _elements(lists: pa.Array) -> pa.Array:
+    """Of all lists, one after the other; as `flatten`, which would load pyarrow.compute where no list is missing."""
+    if lists.null_count or not len(lists):
+        return lists.flatten()
+    if pa.types.is_list(lists.type):
+        first, last = lists.offsets[0].as_py(), lists.offsets[-1].as_py()
+    else:
+        first, last = (row * lists.type.list_size for row in (lists.offset, lists.offset + len(lists)))
+    return lists.values[first:last]
 
 
 def plain_column(column: pa.Array) -> pa.Array:
