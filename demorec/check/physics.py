@@ -246,7 +246,7 @@ def velocity_follows_servo(episode: CheckedEpisode) -> Found:
             seen, due = c.joint_velocity[1:, joint][rows], expected[rows, joint]
             # What pushes the joint adds to slow motions and hardly to fast ones; false velocities are so in both.
             usual, fast = np.median(np.abs(seen / due - 1)), np.abs(seen - due).sum() / np.abs(due).sum()
-            # What noise does to and fro cancels in a ratio; of other joints and moments it is the scatter that shows it.
+            # What noise does to and fro cancels in a ratio; elsewhere the scatter shows it.
             ratio, gain = abs(np.median(seen / due) - 1), abs((seen * due).sum() / (due * due).sum() - 1)
             value = float(max(min(ratio, gain), _SCATTER * min(usual, fast)))
             found.append(Measurement(value=value, detail=f"{name}, {int(rows.sum())} frames"))

@@ -190,7 +190,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         self._hand = hand if joints is None else moved
         width = {CLOSE: gripper.min_width, OPEN: gripper.open_width}.get(action.get("gripper"), arm.gripper_target)
         fingers = gripper.joint_position(width)
-        return self._named(self.told(np.append(arm.target if joints is None else joints, fingers)))
+        return self._named(self.state_values(np.append(arm.target if joints is None else joints, fingers)))
 
     def _state(self) -> dict[str, float]:
         return self._named(self.state_values(self._env.situation.observation.joint_position))
