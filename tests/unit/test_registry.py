@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, NotAllowedError
 from demorec.core.registry import Registry
 
 SHAPES: Registry[type] = Registry(
@@ -35,6 +35,12 @@ def test_of_many_names_the_refusal_names_the_command_that_lists_them() -> None:
     assert "Did you mean 'law_3" in str(refused.value)
     with pytest.raises(ConfigError, match=r"Allowed: ordered, counter, or"):
         SHAPES.load("law")
+
+
+@pytest.mark.parametrize("allowed", [(), ("fraction",), ("fractions.sub",), ("decimal",)])
+def test_somebody_elses_object_is_refused_when_nobody_allowed_its_module(allowed: tuple[str, ...]) -> None:
+    with pytest.raises(NotAllowedError, match=r"if you trust that module, add --allow fractions\."):
+        SHAPES.load("fractions:Fraction", allowed)
 
 
 @pytest.mark.parametrize("name", ["no_such_package.task:Mine", "decimal:NoSuchThing"])
