@@ -55,7 +55,7 @@ def _touched(episode: CheckedEpisode) -> dict[str, NDArray[np.bool_]]:
         velocity = _speeds(episode, body.name)
         # What starts in the air falls straight down, and comes to rest after that.
         falling = velocity[:, 2] < -0.05 - 3.0 * np.linalg.norm(velocity[:, :2], axis=1)
-        active[body.name] = _held_for(near[:-1] | near[1:] | falling, coast)
+        active[body.name] = held_for(near[:-1] | near[1:] | falling, coast)
     for _ in range(len(bodies) - 1):  # a push travels from body to body
         for body in bodies:
             for other in bodies:
@@ -67,11 +67,11 @@ def _touched(episode: CheckedEpisode) -> dict[str, NDArray[np.bool_]]:
                     axis=1,
                 )
                 close = (gap < reach)[:-1] & active[other.name]
-                active[body.name] = active[body.name] | _held_for(close, coast)
+                active[body.name] = active[body.name] | held_for(close, coast)
     return active
 
 
-def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     """Each True lasts for `count` more entries."""
     if not len(flags):
         return flags
@@ -250,7 +250,7 @@ def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
         velocity = (pose[2:, :3] - pose[:-2, :3]) * (fps / 2)
         fall = (pose[2:, 2] - 2 * pose[1:-1, 2] + pose[:-2, 2]) * fps**2 < -4.0
         # A fall, and what follows it for a moment, needs no hand.
-        falling = _held_for(fall | (velocity[:, 2] < -0.5), round(COAST_SECONDS * fps))
+        falling = held_for(fall | (velocity[:, 2] < -0.5), round(COAST_SECONDS * fps))
         travelling = (np.linalg.norm(velocity, axis=1) > 0.08) & (pose[1:-1, 2] > pose[0, 2] + 0.03) & ~falling
         reach = math.hypot(*body.shape.extents) / 2 + 0.03
         distance = np.linalg.norm(pose[1:-1, :3] - episode.world_from_tcp[1:-1, :3, 3], axis=1)
