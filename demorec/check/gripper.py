@@ -8,10 +8,12 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.objects import top_of
+from demorec.check.objects import held_for, top_of
 
 CARRIED_HEIGHT = 0.03
 """Metres above its start from which on an object counts as carried."""
+_FIRST = 9
+"""Frames after the first of a way."""
 _MOST_LAG = 4
 """Frames up to which contact force and fingers are shifted against each other."""
 _PRESSES, _APART, _STANDS = 0.25, 0.02, 0.15
@@ -37,7 +39,8 @@ def gripper_label(episode: CheckedEpisode) -> Measurement | None:
 def grip_force(episode: CheckedEpisode) -> Found:
     """Two fingers that hold something press on it with the force of their motors, each of them.
 
-    The median over the frames in which an object is carried: catches another unit, half the sum, a frozen value.
+    The median over the first frames in which an object is carried: catches another unit, half the sum, a frozen value.
+    When the hand turns, what PyBullet reports of the fingers' force goes down by up to a third.
     """
     scene, robot = episode.info.scene, episode.info.robot
     if not scene.movable:
@@ -47,6 +50,7 @@ def grip_force(episode: CheckedEpisode) -> Found:
     carried = np.any([episode.is_carried(body.name, CARRIED_HEIGHT) for body in scene.movable], axis=0)
     if carried.sum() < 10:
         return NotMeasured(why="nothing is carried for ten frames")
+    carried &= held_for(carried & ~np.insert(carried[:-1], 0, False), _FIRST)
     expected = float(np.median(robot.gripper.contact_force(episode.columns.gripper_width[carried])))
     force = float(np.median(episode.columns.contact_force[carried]))
     frame = int(np.argmax(carried))

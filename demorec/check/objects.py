@@ -17,6 +17,8 @@ from demorec.episode.scene import Body, Shape
 
 COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""
+_RESTS = 0.02
+"""m/s, 0.1 of them for each rad/s, below which a thing is at rest."""
 _GAP = 0.005
 """Metres above a support from which on it bears nothing."""
 _CARRIED = 0.01
@@ -55,7 +57,13 @@ def _touched(episode: CheckedEpisode) -> dict[str, NDArray[np.bool_]]:
         velocity = _speeds(episode, body.name)
         # What starts in the air falls straight down, and comes to rest after that.
         falling = velocity[:, 2] < -0.05 - 3.0 * np.linalg.norm(velocity[:, :2], axis=1)
-        active[body.name] = _held_for(near[:-1] | near[1:] | falling, coast)
+        active[body.name] = held_for(near[:-1] | near[1:] | falling, coast)
+        if body.shape.kind != "box":  # what is round or odd rocks on until it rests
+            pose = episode.world_from_object(body.name)
+            moves = displacement(pose[1:], pose[:-1]) * episode.info.fps > _RESTS
+            for frame in np.flatnonzero(moves).tolist():
+                if active[body.name][frame]:
+                    active[body.name][frame : frame + coast + 1] = True
     for _ in range(len(bodies) - 1):  # a push travels from body to body
         for body in bodies:
             for other in bodies:
@@ -67,11 +75,11 @@ def _touched(episode: CheckedEpisode) -> dict[str, NDArray[np.bool_]]:
                     axis=1,
                 )
                 close = (gap < reach)[:-1] & active[other.name]
-                active[body.name] = active[body.name] | _held_for(close, coast)
+                active[body.name] = active[body.name] | held_for(close, coast)
     return active
 
 
-def _held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     """Each True lasts for `count` more entries."""
     if not len(flags):
         return flags
@@ -114,7 +122,8 @@ def teleports(episode: CheckedEpisode) -> Iterator[Found]:
     unit="rad/s",
 )
 def spins(episode: CheckedEpisode) -> Iterator[Found]:
-    """No object's rotation jumps: it turns with the hand that has it, or rolls as fast as it moves past the hand."""
+    """No object's rotation jumps: it turns with the hand that has it, rolls as fast as it moves past the hand, or turns
+    as fast two frames before or after, as what tumbles does."""
     fps, hand = episode.info.fps, episode.world_from_tcp
     with_hand = angle_between(hand[1:], hand[:-1]) * fps
     of_hand = np.diff(hand[:, :3, 3], axis=0) * fps
@@ -122,7 +131,9 @@ def spins(episode: CheckedEpisode) -> Iterator[Found]:
         pose, velocity = episode.world_from_object(name), _speeds(episode, name)
         passing = np.minimum(np.linalg.norm(velocity, axis=1), np.linalg.norm(velocity - of_hand, axis=1))
         rolling = passing / (min(episode.info.scene.body(name).shape.extents) / 2)
-        beyond = angle_between(pose[1:], pose[:-1]) * fps - with_hand - rolling
+        turning = angle_between(pose[1:], pose[:-1]) * fps
+        beside = np.pad(turning, 2)
+        beyond = turning - np.maximum(with_hand + rolling, np.maximum(beside[:-4], beside[4:]))
         yield worst_frame(np.maximum(beyond, 0.0), name, first=1)
 
 
@@ -250,7 +261,7 @@ def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
         velocity = (pose[2:, :3] - pose[:-2, :3]) * (fps / 2)
         fall = (pose[2:, 2] - 2 * pose[1:-1, 2] + pose[:-2, 2]) * fps**2 < -4.0
         # A fall, and what follows it for a moment, needs no hand.
-        falling = _held_for(fall | (velocity[:, 2] < -0.5), round(COAST_SECONDS * fps))
+        falling = held_for(fall | (velocity[:, 2] < -0.5), round(COAST_SECONDS * fps))
         travelling = (np.linalg.norm(velocity, axis=1) > 0.08) & (pose[1:-1, 2] > pose[0, 2] + 0.03) & ~falling
         reach = math.hypot(*body.shape.extents) / 2 + 0.03
         distance = np.linalg.norm(pose[1:-1, :3] - episode.world_from_tcp[1:-1, :3, 3], axis=1)

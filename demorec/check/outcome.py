@@ -128,26 +128,26 @@ def _expected(scene: Scene, names: Sequence[str]) -> Iterator[str]:
 )
 def final_state(episode: CheckedEpisode) -> Iterator[Found]:
     """After a success objects and fingers are in the last recorded frame where the outcome says: distances to goals,
-    heights, tilts, what was not to be moved, the opening."""
+    heights, tilts, what was not to be moved, the opening. The outcome is a step later: what moves goes on as before."""
     outcome, c = episode.outcome, episode.columns
     if outcome is None or not outcome.success or not c.num_frames:
         return
-    shown = dict(_shown(episode))
+    shown, before = (dict(_shown(episode, row)) for row in (c.num_frames - 1, max(c.num_frames - 2, 0)))
     for condition in outcome.checks:
         if condition.name in shown:
             value = shown[condition.name]
             yield Measurement(
-                value=abs(value - condition.value),
+                value=max(abs(value - condition.value) - abs(value - before[condition.name]), 0.0),
                 frame=c.num_frames - 1,
                 detail=f"{condition.name}: {value:.4f}, outcome says {condition.value:.4f}",
             )
 
 
-def _shown(episode: CheckedEpisode) -> Iterator[tuple[str, float]]:
-    """Conditions as the last frame has them."""
+def _shown(episode: CheckedEpisode, frame: int) -> Iterator[tuple[str, float]]:
+    """Conditions as a frame has them."""
     c, scene = episode.columns, episode.info.scene
-    last = {name: matrices(poses[-1:])[0] for name, poses in c.object_poses.items()}
-    yield OPEN, float(c.gripper_width[-1])
+    last = {name: matrices(poses[frame : frame + 1])[0] for name, poses in c.object_poses.items()}
+    yield OPEN, float(c.gripper_width[frame])
     for goal in scene.goals:
         suffix = f":{goal.object}" if len(scene.goals) > 1 else ""
         wanted, pose, body = goal.onto_from_goal.matrix(), last[goal.object], scene.body(goal.object)

@@ -32,6 +32,8 @@ that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as
 _LEAST_TORQUE = 0.012
 """N m below which nothing is said: motors of wrists that bear less differ from the wrench by up to 0.0063 N m (of 145
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
+_AROUND = 6
+"""Frames before and after a peak of the contact force in which it must be the only one."""
 _LOST_SHARE = 0.5
 """Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
 _MOST_LAG, _CLEAR, _UNCLEAR = 3, 0.25, 0.5
@@ -214,7 +216,10 @@ def _peak_of_grip(episode: CheckedEpisode) -> Found:
     rows = np.any([*carried, np.zeros(len(force), dtype=np.bool_)], axis=0)
     if rows.sum() < MIN_FRAMES or not (usual := float(np.median(force[rows]))):
         return NotMeasured(why="nothing is carried for long")
-    return worst_frame(np.where(rows, _peaks(force[:, None])[:, 0], 0.0) / usual, "contact force")
+    peaks = np.where(rows, _peaks(force[:, None])[:, 0], 0.0)
+    # An arm that noise shakes has such peaks one after the other.
+    around = np.max([np.roll(peaks, by) for by in (*range(-_AROUND, -1), *range(2, _AROUND + 1))], axis=0)
+    return worst_frame(np.maximum(peaks - around, 0.0) / usual, "contact force")
 
 
 def _peaks(table: Array) -> Array:
