@@ -16,7 +16,6 @@ import argparse
 import json
 import math
 import subprocess
-import sys
 import time
 from typing import Any
 
@@ -150,4 +149,4 @@ def failed(values: dict[str, float]) -> list[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

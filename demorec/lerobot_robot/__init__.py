@@ -188,7 +188,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         rest = arm.kinematics.turned_towards(np.array(self.spec.home_q), moved.position)
         joints = arm.kinematics.inverse(moved, start=arm.target, rest=rest)
         self._hand = hand if joints is None else moved
-        width = {CLOSE: gripper.min_width, OPEN: gripper.open_width}.get(action.get("gripper"), arm.gripper_target)
+        width = {CLOSE: gripper.min_width, OPEN: gripper.open_width}.get(action.get("gripper", 1), arm.gripper_target)
         fingers = gripper.joint_position(width)
         return self._named(self.state_values(np.append(arm.target if joints is None else joints, fingers)))
 
@@ -210,10 +210,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
 
 
 class DemorecSO101(SimulatedArm):
-    """The SO-101 in the units of LeRobot's own `so101_follower`, by the calibration of `--robot.id` where it has one.
-
-    The jaw opens as far as the expert opens it, 22 per cent of the way.
-    """
+    """The SO-101 in the units of LeRobot's `so101_follower`, by the calibration of `--robot.id` where it has one."""
 
     config_class = DemorecSO101Config
     name = "demorec_so101"
