@@ -18,7 +18,7 @@ import argparse
 import json
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError
 from demorec.core.processes import in_turn
-from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Action, Frame, Outcome
 from demorec.episode.features import action_vectors, observation_vectors
 from demorec.episode.info import EpisodeInfo
@@ -49,6 +48,7 @@ from demorec.tasks.placing import onto_cube
 SEED, ATTEMPTS = 11, 9
 SOUND = 0.8
 """Above it an episode is selected, as docs/datasets.md has it."""
+CHOICES = ("all", "selected", "sound")
 _caches: list[SimulatorCache] = []
 
 
@@ -105,7 +105,8 @@ def spoilt(frames: list[Frame], kind: str, rng: np.random.Generator, arm: ArmKin
         case "label noise":
             targets = np.array([frame.action.joint_target for frame in frames])
             noise = rng.normal(size=targets.shape) * float(rng.uniform(0.005, 0.03)) * np.ptp(targets, axis=0)
-            return [with_labels(f, off(f.action, n, arm), off(f.command, n, arm)) for f, n in zip(frames, noise)]
+            pairs = zip(frames, noise, strict=True)
+            return [with_labels(f, off(f.action, n, arm), off(f.command, n, arm)) for f, n in pairs]
         case "late actions":
             late = max(1, round(float(rng.uniform(0.1, 0.3)) * FPS))
             before = [frames[max(0, t - late)] for t in range(count)]
@@ -160,7 +161,7 @@ def numbers_of(run: Path) -> list[dict[str, torch.Tensor]]:
         with Recording(path) as recording:
             info, columns = recording.info, recording.columns()
         rows = ObservationRows.of_columns(columns)
-        vectors = observation_vectors(rows, ROBOTS.load(info.robot), info.scene, privileged=True)
+        vectors = observation_vectors(rows, info.robot, info.scene, privileged=True)
         vectors[ACTION] = action_vectors(columns, info.scene, "ee_delta")
         found.append({name: torch.from_numpy(vectors[name]) for name in (STATE, ENVIRONMENT, ACTION)})
     return found
@@ -179,49 +180,87 @@ def chosen(kinds: Sequence[str], scores: Sequence[float]) -> dict[str, list[int]
     selected = [number for number, score in enumerate(scores) if score > SOUND]
     sound = [number for number, kind in enumerate(kinds) if not kind]
     few = np.random.default_rng(SEED).permutation(sound)[: len(selected)]
-    return {"all": list(range(len(kinds))), "selected": selected, "sound": sorted(few.tolist())}
+    return dict(zip(CHOICES, (list(range(len(kinds))), selected, sorted(few.tolist())), strict=True))
+
+
+def learned(name: str, numbers: Sequence[int], args: argparse.Namespace) -> Rate:
+    """Success of ACT on some episodes, over all trainings; what was trained or tried before is not done again."""
+    variant = Variant(about="", action="ee_delta")
+    config = GenerateConfig(task="stack", split="eval", cameras=(), fps=FPS)
+    results = []
+    for seed in range(args.seeds):
+        policy = args.out / "policies" / f"{name}_{args.steps}_{seed}"
+        if not (policy / "training.json").exists():
+            episodes = numbers_of(args.out / "run")
+            train(data_of([episodes[number] for number in numbers]), variant, args, seed=seed, out=policy)
+        where = args.out / "evaluations" / policy.name
+        where.parent.mkdir(exist_ok=True)
+        settings = settings_for(policy, config, action=variant.action)  # type: ignore[arg-type]
+        results.append(evaluate(settings, where, num_episodes=args.scenes, workers=args.workers).rate)
+    rate = Rate(successes=sum(r.successes for r in results), trials=sum(r.trials for r in results))
+    low, high = rate.interval
+    by = ", ".join(str(r.successes) for r in results)
+    print(f"{name:9} {len(numbers):4} episodes: {rate.successes}/{rate.trials}, {100 * low:.0f} to {100 * high:.0f} %, "
+          f"by training {by}", flush=True)  # fmt: skip
+    return rate
+
+
+def plot(rates: Mapping[str, Rate], kinds: Sequence[str], scores: Sequence[float], path: Path) -> None:
+    """Scores by kind, and success of each choice with its 95 % interval."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.4), width_ratios=(3, 2), layout="constrained")
+    rng = np.random.default_rng(0)
+    for row, kind in enumerate(("", *KINDS)):
+        own = [score for score, other in zip(scores, kinds, strict=True) if other == kind]
+        left.plot(own, row + rng.uniform(-0.3, 0.3, len(own)), ".", color="C3" if kind else "C0", markersize=4)
+    left.axvline(SOUND, color="black", linewidth=0.8)
+    left.set_yticks(range(1 + len(KINDS)), ["sound", *KINDS], fontsize=8)
+    left.invert_yaxis()
+    left.set_xlabel("score of each demonstration (line: what is selected)")
+    for row, rate in enumerate(rates.values()):
+        low, high = rate.interval
+        right.barh(row, 100 * rate.successes / rate.trials, color=f"C{row}", height=0.6)
+        right.plot([100 * low, 100 * high], [row, row], color="black", linewidth=1.2)
+    right.set_yticks(range(len(rates)), [f"{n}\n{r.successes} of {r.trials}" for n, r in rates.items()], fontsize=8)
+    right.invert_yaxis()
+    right.set_xlim(0, 100)
+    right.set_xlabel("success in held-out scenes, % (line: 95 % interval)")
+    for axes in (left, right):
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    figure.savefig(path, dpi=100)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for episodes, datasets and policies")
-    parser.add_argument("--episodes", type=int, default=600)
+    parser.add_argument("--episodes", type=int, default=320)
+    parser.add_argument("--only", nargs="+", default=CHOICES, choices=CHOICES, help="what is learned from")
     parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--batch-size", type=int, default=128)
+    parser.add_argument("--batch-size", type=int, default=64)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each")
     parser.add_argument("--scenes", type=int, default=150, help="held-out scenes of each training")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--plot", type=Path, help="draw success and what was selected into this image")
+    parser.add_argument("--plot", type=Path, help="draw scores and success into this image")
     args = parser.parse_args()
     args.device = "cpu"
     torch.set_num_threads(1)
     kinds = kinds_of(args.episodes)
     scores = scores_of(args.out, kinds, args.workers)
-    good, bad = ([s for s, kind in zip(scores, kinds) if bool(kind) is spoilt_] for spoilt_ in (False, True))
-    kept = Counter(kind for kind, score in zip(kinds, scores) if score > SOUND)
-    print(f"AUC {auc(good, bad):.3f}; selected: " + ", ".join(
-        f"{kept[kind]} of {kinds.count(kind)} {kind or 'sound'}" for kind in ("", *KINDS)), flush=True)
-    variant, config = Variant(about="", action="ee_delta"), GenerateConfig(task="stack", split="eval", cameras=(), fps=FPS)
-    rates: dict[str, Rate] = {}
-    episodes: list[dict[str, torch.Tensor]] = []
-    for name, numbers in chosen(kinds, scores).items():
-        results = []
-        for seed in range(args.seeds):
-            policy = args.out / "policies" / f"{name}_{args.steps}_{seed}"
-            if not (policy / "training.json").exists():
-                episodes = episodes or numbers_of(args.out / "run")
-                train(data_of([episodes[number] for number in numbers]), variant, args, seed=seed, out=policy)
-            where = args.out / "evaluations" / policy.name
-            where.parent.mkdir(exist_ok=True)
-            settings = settings_for(policy, config, action="ee_delta")
-            results.append(evaluate(settings, where, num_episodes=args.scenes, workers=args.workers).rate)
-        rate = Rate(successes=sum(r.successes for r in results), trials=sum(r.trials for r in results))
-        low, high = rate.interval
-        by = ", ".join(str(r.successes) for r in results)
-        print(f"{name:9} {len(numbers):4} episodes: {rate.successes}/{rate.trials} ({100 * low:.0f} to {100 * high:.0f} %)"
-              f" by training {by}", flush=True)
-        rates[name] = rate
+    good = [score for score, kind in zip(scores, kinds, strict=True) if not kind]
+    bad = [score for score, kind in zip(scores, kinds, strict=True) if kind]
+    kept = Counter(kind for kind, score in zip(kinds, scores, strict=True) if score > SOUND)
+    told = [f"{kept[kind]} of {kinds.count(kind)} {kind or 'sound'}" for kind in ("", *KINDS)]
+    print(f"AUC {auc(good, bad):.3f}; selected: {', '.join(told)}", flush=True)
+    found = chosen(kinds, scores)
+    rates = {name: learned(name, found[name], args) for name in args.only}
+    if args.plot is not None:
+        plot(rates, kinds, scores, args.plot)
 
 
 if __name__ == "__main__":

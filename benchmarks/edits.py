@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import shutil
 import signal
 import statistics
@@ -66,17 +65,18 @@ def multiplied(root: Path, times: int, out: Path) -> Path:
     return out
 
 
-def seconds(*command: object) -> tuple[float, float]:
-    """CPU and wall seconds of a command with its children."""
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run([*map(str, command)], env=ENVIRONMENT, capture_output=True, text=True, check=False)
-    if done.returncode not in (0, -signal.SIGABRT):  # LeRobot's threads may abort when all is written
-        raise SystemExit(f"{' '.join(map(str, command))} failed: {done.stderr[-1500:]}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return (
-        after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
-        time.perf_counter() - start,
-    )
+def seconds(*command: object) -> tuple[float, float, float]:
+    """CPU and wall seconds of a command with its children, and MB of memory at most."""
+    start = time.perf_counter()
+    with tempfile.TemporaryFile() as text:
+        process = subprocess.Popen([*map(str, command)], env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=text)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        wall = time.perf_counter() - start
+        if process.returncode not in (0, -signal.SIGABRT):  # LeRobot's threads may abort when all is written
+            text.seek(0)
+            raise SystemExit(f"{' '.join(map(str, command))} failed: {text.read().decode(errors='replace')[-1500:]}")
+    return used.ru_utime + used.ru_stime, wall, used.ru_maxrss / 1000
 
 
 def commands(root: Path, copies: Sequence[Path], out: Path, episodes: int) -> dict[str, dict[str, list[list[object]]]]:
@@ -127,29 +127,32 @@ def measured(folder: Path, root: Path, episodes: int, rounds: int, without: str)
     """Run everything on a dataset, and print a row for each kind of work."""
     copies = [Path(shutil.copytree(root, folder / f"d{number}")) for number in range(5)]
     idle = start_costs(root)
-    spent: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    spent: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for _ in range(rounds):
         for work, by in commands(root, copies, folder / "out", episodes).items():
             (folder / "out").mkdir()
             for who, calls in by.items():
                 if who != without:
                     costs = [seconds(*call) for call in calls]
-                    spent.setdefault((work, who), []).append((sum(c for c, _ in costs), sum(w for _, w in costs)))
+                    cpu, wall, memory = zip(*costs, strict=True)
+                    spent.setdefault((work, who), []).append((sum(cpu), sum(wall), max(memory)))
             shutil.rmtree(folder / "out")
     size = sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
     print(
         f"{episodes} episodes, {size / 1e6:.1f} MB; start, CPU s: " + ", ".join(f"{k} {v:.2f}" for k, v in idle.items())
     )
-    print("work       CPU s (wall s) with start; ratios of CPU with start / without")
+    print("work       CPU s (wall s, memory) with start; ratios of CPU with start / without")
     for work in dict.fromkeys(work for work, _ in spent):
-        cells, cpu = [], {}
+        cells: list[str] = []
+        spent_cpu: dict[str, float] = {}
         for who in (who for who in idle if (work, who) in spent):
-            cpu[who], wall = (statistics.median(values) for values in zip(*spent[work, who], strict=True))
-            cells.append(f"{who} {cpu[who]:.2f} ({wall:.2f})")
-        own = {who: max(value - idle[who], 0.01) for who, value in cpu.items()}
+            took, passed, most = (statistics.median(values) for values in zip(*spent[work, who], strict=True))
+            spent_cpu[who] = took
+            cells.append(f"{who} {took:.2f} ({passed:.2f}, {most:.0f} MB)")
+        own = {who: max(value - idle[who], 0.01) for who, value in spent_cpu.items()}
         for a, b in (("lerobot", "demorec"), ("demorec", "copy")):
-            if a in cpu:
-                cells.append(f"{a}/{b} {cpu[a] / max(cpu[b], 0.01):.1f} / {own[a] / own[b]:.1f}")
+            if a in spent_cpu:
+                cells.append(f"{a}/{b} {spent_cpu[a] / max(spent_cpu[b], 0.01):.1f} / {own[a] / own[b]:.1f}")
         print(f"{work:9}  {'  '.join(cells)}")
     for copy in copies:
         shutil.rmtree(copy)

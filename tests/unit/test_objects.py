@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 from support.commands import exit_code
-from support.sim import episode, run
+from support.sim import body_index, episode, run
 
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Pose
@@ -210,6 +211,29 @@ def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> 
     inside = vessel.world_from_body.inverse().apply(points)
     assert inside[:, 2].min() == pytest.approx(0.004, abs=2e-3)
     assert np.hypot(inside[:, 0], inside[:, 1]).max() < vessel.shape.size[0] / 2
+
+
+def test_fingers_sink_into_a_light_thing_no_deeper_than_their_stiffness_gives() -> None:
+    """20 N at 120 kN/m; with the 50 iterations that heavier things get the solver leaves them far deeper."""
+    made = next(
+        made
+        for made in (episode(number, task="pick_anything") for number in range(60, 100))
+        if made.info.scene.body(made.info.scene.goals[0].object).mass < 0.022
+    )
+    scene = made.info.scene
+    few = replace(scene, physics=replace(scene.physics, solver_iterations=50))
+    deepest = {}
+    for each in (scene, few):
+        prepared = replace(made, info=made.info.with_simulation(scene=each))
+        with make_world(prepared.info) as world:
+            session, depths = Session.of_episode(world, prepared), [0.0]
+            for _ in session.run(ScriptAgent(prepared)):
+                body = body_index(world, scene.goals[0].object)
+                depths += [-contact[8] for contact in world.client.getContactPoints(world.arm.body, body)]
+            deepest[each is scene] = max(depths), session.outcome.failure_reason
+    assert deepest[True] == (pytest.approx(20.0 / 120e3, abs=1e-4), "")
+    assert deepest[False][0] > 1e-3
+    assert deepest[False][1] == "crush"
 
 
 def test_a_dish_is_hollow_for_physics_too() -> None:
