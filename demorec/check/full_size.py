@@ -174,7 +174,7 @@ def compare_full_size(
     kernels.block_errors(seen, expected, drawn, BLOCK, off, own)
     color, frame = _worst_color(colors)
     grid = CellGrid(width, height)
-    cells = [[grid.read("color", image).cells for image in images] for images in (expected, drawn)]
+    cells = [np.stack([grid.read("color", image).cells for image in images]) for images in (expected, drawn)]
     return FullSize(
         frames=frames,
         displacement=float(np.hypot(*moved[:2]) + np.abs(moved[2:6]).max() * min(height, width) / 4),
@@ -183,7 +183,7 @@ def compare_full_size(
         color_frame=int(frames[frame]),
         errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)])
         * np.where(frames < frames[0] + _PAIR, 1.0, _LATER_WEIGHT),
-        encoded=float(np.sqrt(np.mean(np.subtract(*cells) ** 2))),
+        encoded=float(np.sqrt(np.mean((cells[0] - cells[1]) ** 2))),
     )
 
 
