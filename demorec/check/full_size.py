@@ -25,6 +25,8 @@ LEAD = 6
 """Frames before those that are compared, by which the encoder finds its quality: its memory halves with each."""
 _STEPS = (0.0, 0.25, 0.5, -0.25, 0.75, -0.5, 1.0, -0.75, 1.25, -1.0)
 """By which the quality of an image may be another one than was asked for, the likely ones first (units of CRF)."""
+_FAR_STEPS = (*(-quarter / 4 for quarter in range(25)), 0.25, 0.5, 0.75, 1.0)
+"""The same where a keyframe comes so seldom that nothing before it is encoded again."""
 _SAME = 0.05
 """Of 255, mean square: images that differ by less are of one quality."""
 _PAIR = 2
@@ -134,9 +136,10 @@ def _most_alike(
         recorded: (N, H, W, 3) what it made of the last N of them.
     """
     best, least = recorded, np.inf
-    for step in _STEPS if config.codec == "h264" and config.crf is not None else _STEPS[:1]:
+    steps = _STEPS if len(images) > len(recorded) else _FAR_STEPS
+    for step in steps if config.codec == "h264" and config.crf is not None else steps[:1]:
         # A whole number to the user; x264 knows parts of it.
-        other = replace(config, crf=config.crf + step) if step and config.crf else config  # type: ignore[arg-type]
+        other = replace(config, crf=max(config.crf + step, 0)) if step else config  # type: ignore[arg-type]
         found = _encoded(settings, other, images)[-len(recorded) :]
         off = float(np.square(found.astype(np.float32) - recorded).mean())
         if off < least:
@@ -174,7 +177,7 @@ def compare_full_size(
     kernels.block_errors(seen, expected, drawn, BLOCK, off, own)
     color, frame = _worst_color(colors)
     grid = CellGrid(width, height)
-    cells = [[grid.read("color", image).cells for image in images] for images in (expected, drawn)]
+    cells = [np.stack([grid.read("color", image).cells for image in images]) for images in (expected, drawn)]
     return FullSize(
         frames=frames,
         displacement=float(np.hypot(*moved[:2]) + np.abs(moved[2:6]).max() * min(height, width) / 4),
@@ -183,7 +186,7 @@ def compare_full_size(
         color_frame=int(frames[frame]),
         errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)])
         * np.where(frames < frames[0] + _PAIR, 1.0, _LATER_WEIGHT),
-        encoded=float(np.sqrt(np.mean(np.subtract(*cells) ** 2))),
+        encoded=float(np.sqrt(np.mean((cells[0] - cells[1]) ** 2))),
     )
 
 

@@ -17,6 +17,8 @@ from demorec.episode.scene import Body, Shape
 
 COAST_SECONDS = 0.7
 """How long a thing may go on moving by itself after it was last touched."""
+_TUMBLES = 1.5
+"""Times as fast as two frames before or after a thing may turn that tumbles."""
 _RESTS = 0.02
 """m/s, 0.1 of them for each rad/s, below which a thing is at rest."""
 _GAP = 0.005
@@ -133,7 +135,7 @@ def spins(episode: CheckedEpisode) -> Iterator[Found]:
         rolling = passing / (min(episode.info.scene.body(name).shape.extents) / 2)
         turning = angle_between(pose[1:], pose[:-1]) * fps
         beside = np.pad(turning, 2)
-        beyond = turning - np.maximum(with_hand + rolling, np.maximum(beside[:-4], beside[4:]))
+        beyond = turning - np.maximum(with_hand + rolling, _TUMBLES * np.maximum(beside[:-4], beside[4:]))
         yield worst_frame(np.maximum(beyond, 0.0), name, first=1)
 
 
