@@ -15,12 +15,10 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import signal
 import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -65,18 +63,26 @@ def multiplied(root: Path, times: int, out: Path) -> Path:
     return out
 
 
+_MEASURED = """
+import resource, signal, subprocess, sys, time
+start = time.perf_counter()
+done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+if done.returncode not in (0, -signal.SIGABRT):  # LeRobot's threads may abort when all is written
+    sys.exit(done.stderr.decode(errors="replace")[-1500:])
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, time.perf_counter() - start, used.ru_maxrss / 1000)
+"""
+"""A process of its own, since what it starts is said to take as much memory as itself at least."""
+
+
 def seconds(*command: object) -> tuple[float, float, float]:
     """CPU and wall seconds of a command with its children, and MB of memory at most."""
-    start = time.perf_counter()
-    with tempfile.TemporaryFile() as text:
-        process = subprocess.Popen([*map(str, command)], env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=text)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        wall = time.perf_counter() - start
-        if process.returncode not in (0, -signal.SIGABRT):  # LeRobot's threads may abort when all is written
-            text.seek(0)
-            raise SystemExit(f"{' '.join(map(str, command))} failed: {text.read().decode(errors='replace')[-1500:]}")
-    return used.ru_utime + used.ru_stime, wall, used.ru_maxrss / 1000
+    words = [sys.executable, "-c", _MEASURED, *map(str, command)]
+    done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(map(str, command))} failed: {done.stderr}")
+    cpu, wall, memory = map(float, done.stdout.split())
+    return cpu, wall, memory
 
 
 def commands(root: Path, copies: Sequence[Path], out: Path, episodes: int) -> dict[str, dict[str, list[list[object]]]]:

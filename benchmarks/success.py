@@ -2,6 +2,7 @@
 
     python benchmarks/success.py --episodes 500
     python benchmarks/success.py --tasks pick_place --robots panda --episodes 300 --json out.json
+    python benchmarks/success.py --tasks pick_anything --objects household blocks random --episodes 2000
 
 Speed is given per core from process CPU time, so that it can be compared on a shared machine.
 """
@@ -25,6 +26,7 @@ from demorec.loop import ScriptAgent, Session, make_world, prepare
 def measure(config: GenerateConfig, *, first: int, episodes: int) -> dict[str, Any]:
     """Run episodes first .. first + episodes - 1 of a config and sum them up."""
     outcomes: dict[int, Outcome] = {}
+    things: dict[int, str] = {}
     unplaceable: list[int] = []
     warm_up = prepare(EpisodePlan(config=config, episode_index=first))
     with make_world(warm_up.info) as world:
@@ -41,6 +43,7 @@ def measure(config: GenerateConfig, *, first: int, episodes: int) -> dict[str, A
             for _ in session.run(ScriptAgent(episode)):
                 pass
             outcomes[index] = session.outcome
+            things[index] = episode.info.scene.goals[0].object if episode.info.scene.goals else ""
         seconds = time.process_time() - started
     done = list(outcomes.values())
     successes = [outcome for outcome in done if outcome.success]
@@ -55,7 +58,7 @@ def measure(config: GenerateConfig, *, first: int, episodes: int) -> dict[str, A
         "success": len(successes),
         "first_try": sum(outcome.num_retries == 0 for outcome in successes),
         "failures": dict(Counter(f"{o.failure_phase}: {o.failure_reason}" for o in done if not o.success)),
-        "failed_episodes": [index for index, outcome in outcomes.items() if not outcome.success],
+        "failed_episodes": {index: things[index] for index, outcome in outcomes.items() if not outcome.success},
         "no_layout": unplaceable,
         "frames": sum(outcome.num_frames for outcome in done) / max(1, len(done)),
         "distance_mm": [1000 * distances[round(q * (len(distances) - 1))] for q in (0.5, 0.95, 1.0)]
@@ -83,6 +86,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="index of the first episode")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--variations", nargs="+", default=["mild"], choices=["none", "mild", "full"])
+    parser.add_argument("--objects", nargs="+", default=[], help="shelves of pick_anything")
     parser.add_argument("--json", type=Path, help="write the figures here too")
     args = parser.parse_args()
     rows = []
@@ -93,7 +97,14 @@ def main() -> None:
     for task in TASKS.names() if args.tasks == ["all"] else args.tasks:
         for robot in ROBOTS.names() if args.robots == ["all"] else args.robots:
             for variation in args.variations:
-                config = GenerateConfig(task=task, robot=robot, seed=args.seed, variation=variation, cameras=())
+                config = GenerateConfig(
+                    task=task,
+                    robot=robot,
+                    seed=args.seed,
+                    variation=variation,
+                    cameras=(),
+                    objects=tuple(args.objects),
+                )
                 config.validate()
                 row = measure(config, first=args.first, episodes=args.episodes)
                 rows.append(row)

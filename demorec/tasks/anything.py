@@ -35,8 +35,8 @@ MASSES = (0.01, 0.2)
 """Limits, kg: lighter things take too many iterations (see below), heavier ones slip."""
 _PUSH = 200.0
 """Acceleration, m/s^2, with which one finger's force would push a thing away, up to which 50 iterations of the solver
-find the forces between two fingers. Faster ones take so many times more: with too few of them a thing of 40 g was sunk
-into by 1.9 mm, with enough by the 0.2 mm that the fingers' stiffness gives."""
+find the forces between two fingers; faster ones take so many times more. With 50 a vase of 40 g was sunk into by
+1.9 mm, so by 0.3; the fingers' stiffness alone gives 0.2."""
 DRAWS = 50
 """Of a thing until one rests on a table and can be grasped."""
 NEUTRAL_COLORS: Mapping[str, Rgba] = {"grey": (0.5, 0.5, 0.51, 1.0), "black": (0.15, 0.15, 0.16, 1.0)}
