@@ -78,6 +78,8 @@ def plan_straight(
         dt: Control step, s.
     """
     goal_q = arm.inverse(goal, start=start, rest=rest)
+    if goal_q is None and arm.freedom != WHOLE_POSE:
+        goal_q = arm.inverse(goal, start=rest, rest=rest)  # from where a joint is at its limit it may find nothing
     if goal_q is None:
         return None
     base_from_start = arm.forward(start)
