@@ -33,8 +33,8 @@ OF_NUMBERS: dict[str, Callable[[Changed], Any]] = {
     "wrench two frames late": lambda c: c.columns.sensed["wrench"][:, 4],
     "efforts of two light joints exchanged": lambda c: c.columns.joint_effort[:, 4],
     "contact force four frames late": lambda c: c.columns.contact_force,
-    "an object slips by 15 mm": lambda c: (
-        c.columns.object_poses[faults.goal_object(c)][:, 2] - c.columns.base_from_tcp[:, 2]
+    "an object slips by 15 mm": lambda c: np.maximum(
+        c.columns.object_poses[faults.goal_object(c)][:, 2] - c.columns.base_from_tcp[:, 2], -0.03
     ),
     "ten frames cut out": lambda c: c.columns.joint_position[:, 1],
 }
