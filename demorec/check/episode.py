@@ -359,9 +359,13 @@ class CheckedEpisode(ExitStack):
             wanted = with_lead(frames).tolist()
             seen = dict(zip(wanted, self.recording.images_at(camera.name, wanted), strict=True))
             images = np.stack([drawn[frame] for frame in frames.tolist()])
-            expected = encoded_again(self.recording.video_settings(camera.name), list(images), frames, seen)
             recorded = np.stack([seen[frame] for frame in frames.tolist()])
-            self._full_sizes[camera.name] = compare_full_size(recorded, expected, images, frames)
+            settings = self.recording.video_settings(camera.name)
+            for tries_qualities in (False, True):  # which takes long, and is seldom needed
+                expected = encoded_again(settings, list(images), frames, seen, tries_qualities=tries_qualities)
+                self._full_sizes[camera.name] = found = compare_full_size(recorded, expected, images, frames)
+                if found.is_clear:
+                    break
         return self._full_sizes[camera.name]
 
     def pixels_off(self, camera: SceneCamera, kind: ImageKind) -> tuple[Array, NDArray[np.intp]] | NotMeasured:

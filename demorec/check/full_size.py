@@ -27,6 +27,8 @@ _STEPS = (0.0, 0.25, 0.5, -0.25, 0.75, -0.5, 1.0, -0.75, 1.25, -1.0)
 """By which the quality of an image may be another one than was asked for, the likely ones first (units of CRF)."""
 _FAR_STEPS = (*(-quarter / 4 for quarter in range(25)), 0.25, 0.5, 0.75, 1.0)
 """The same where a keyframe comes so seldom that nothing before it is encoded again."""
+_CLEAR = (0.03, 0.01, 0.22, 1.2)
+"""Displacement, sharpness, colour and error: half of what is warned of, or little more."""
 _SAME = 0.05
 """Of 255, mean square: images that differ by less are of one quality."""
 _PAIR = 2
@@ -68,6 +70,12 @@ class FullSize:
     errors: Array
     encoded: float
 
+    @property
+    def is_clear(self) -> bool:
+        """Whether all of them are far enough below every limit."""
+        found = (self.displacement, abs(self.sharpness), self.color, float(self.errors.max()))
+        return all(value < bound for value, bound in zip(found, _CLEAR, strict=True))
+
 
 def frames_to_compare(keyframes: NDArray[np.int64], count: int, detail: NDArray[np.float32]) -> NDArray[np.int64]:
     """(N,) the first two frames, two later ones, and those around the keyframe whose detail is most unusual.
@@ -93,7 +101,12 @@ def with_lead(frames: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def encoded_again(
-    settings: VideoSettings, drawn: Sequence[Rgb], frames: NDArray[np.int64], seen: dict[int, Rgb]
+    settings: VideoSettings,
+    drawn: Sequence[Rgb],
+    frames: NDArray[np.int64],
+    seen: dict[int, Rgb],
+    *,
+    tries_qualities: bool,
 ) -> NDArray[np.uint8]:
     """(N, H, W, 3) what the encoder makes of drawn frames.
 
@@ -102,6 +115,8 @@ def encoded_again(
         drawn: N images.
         frames: (N,) which they are, those of one keyframe one after the other.
         seen: Frame -> recorded image, also of the frames before.
+        tries_qualities: Whether the quality is found that explains the recorded images best, instead of taking the one
+            that was asked for.
 
     Raises:
         ConfigError: This build of FFmpeg lacks the encoder.
@@ -118,8 +133,12 @@ def encoded_again(
         first = int(frames[part[0]])
         lead = LEAD // recorded.gop * recorded.gop  # so that the first of them is a keyframe as it was
         before = [seen[frame] for frame in range(max(first - lead, 0), first)]
-        true = np.stack([seen[int(frame)] for frame in frames[part]])
-        images += list(_most_alike(settings, recorded, [*before, *(drawn[n] for n in part)], true))
+        given = [*before, *(drawn[n] for n in part)]
+        if tries_qualities:
+            true = np.stack([seen[int(frame)] for frame in frames[part]])
+            images += list(_most_alike(settings, recorded, given, true))
+        else:
+            images += list(_encoded(settings, recorded, given)[-len(part) :])
     return np.stack(images)
 
 
@@ -139,7 +158,7 @@ def _most_alike(
     steps = _STEPS if len(images) > len(recorded) else _FAR_STEPS
     for step in steps if config.codec == "h264" and config.crf is not None else steps[:1]:
         # A whole number to the user; x264 knows parts of it.
-        other = replace(config, crf=max(config.crf + step, 0)) if step else config  # type: ignore[arg-type]
+        other = replace(config, crf=max(config.crf + step, 0)) if step else config  # type: ignore[arg-type, operator]
         found = _encoded(settings, other, images)[-len(recorded) :]
         off = float(np.square(found.astype(np.float32) - recorded).mean())
         if off < least:
