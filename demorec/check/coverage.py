@@ -64,10 +64,12 @@ def _values(scene: Scene) -> dict[str, float]:
         values[f"{label} x"], values[f"{label} y"] = float(position[0]), float(position[1])
         if body.yaw_symmetry > 0:
             values[f"{label} yaw"] = yaw_of(body.world_from_body) % (2 * math.pi / body.yaw_symmetry)
-        if body.shape.kind != "mesh":  # one of a shelf, whose sizes are no range: a banana is longer than all else
+        if (
+            body.shape.kind != "mesh"
+        ):  # one of a shelf has no ranges: a banana is longer than all else, a hammer heavier
             values[f"{label} size"] = max(body.shape.extents)
-        if body.mass > 0:
-            values[f"{label} mass"] = body.mass
+            if body.mass > 0:
+                values[f"{label} mass"] = body.mass
         goal_label = "goal" if len(scene.goals) == 1 else f"goal {number + 1}"
         # On a body, apart from where that body is: which of two trays it is, is a choice and not a range with a gap.
         if goal.onto:

@@ -1,26 +1,39 @@
 """What is replayed, a recording or the episodes of a dataset opened for it, and how its actions shall be sent.
 
-Datasets have float32 actions of any kind; their scenes come from the sidecar.
+Datasets have float32 actions of any kind; their scenes come from the sidecar. Of a real arm nothing but its own numbers
+is known: the simulated one starts where it was, on an empty table, and is sent its actions. How far it is from the
+recorded states says how well the simulator (or the calibration) fits that arm.
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from demorec.core.config import deciding_versions
 from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option
-from demorec.core.geometry import Array
+from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Columns, Frame, Observation, SuccessCheck, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.info import EpisodeInfo, Simulation
+from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Physics, RobotPlacement, Scene
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.recording import frames_of
 from demorec.mcap.streams import action_at
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
+
+if TYPE_CHECKING:
+    from demorec.check.evidence import Motion
+
+_LEAST_HZ = Physics.hz
+"""Of the physics of a real arm's replay, which takes whole steps between frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +196,6 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
     """A recording's file to be replayed; errors as `open_demonstration` or, with a robot, `demonstration_of`."""
     if options.robot is not None:
         from demorec.check.evidence import motion_of_recording
-        from demorec.replay.real_arm import demonstration_of
 
         with open_recording(path) as recording:
             if options.motors is not None:
@@ -218,8 +230,6 @@ def dataset_demonstrations(
         raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
     dataset = Dataset(path, motors=options.motors)
     if options.robot is not None:
-        from demorec.replay.real_arm import demonstration_of
-
         for number, motion in _spread([each for each in enumerate(dataset.motions.all) if wanted(each[0])], limit):
             name = f"{path.name}_episode_{number:06d}"
             yield demonstration_of(motion, options.robot, name=name, where=path, episode_index=number)
@@ -256,3 +266,81 @@ def _spread[T](chosen: Sequence[T], limit: int | None) -> Sequence[T]:
     if limit is None or len(chosen) <= limit:
         return chosen
     return [chosen[k * len(chosen) // limit] for k in range(limit)]
+
+
+def demonstration_of(
+    motion: Motion | None, robot: RobotSpec, *, name: str, where: Path, episode_index: int
+) -> Demonstration:
+    """What an arm was told to do in an episode, for a simulated one of its kind.
+
+    Args:
+        motion: Of the episode; None for one without a state.
+        robot: The simulated arm.
+        name: Of the demonstration.
+        where: Its file or dataset, for messages.
+        episode_index: Number of the episode.
+
+    Raises:
+        ConfigError: The joints of its state are not known to be those of the robot, or some have no action.
+    """
+    from demorec.tasks.furniture import table_and_floor
+
+    if motion is None or motion.action is None:
+        raise ConfigError(f"There is no observation.state with an action of the same elements to replay: {where}")
+    state, action = (_of_robot(values, motion, robot, where) for values in (motion.state, motion.action))
+    if np.isnan(action).any():
+        raise ConfigError(f"Not every joint of {robot.name} has an action, so it cannot be replayed: {where}")
+    count, fps = len(robot.arm_joints), round(motion.fps)
+    hz = fps * math.ceil(_LEAST_HZ / fps)
+    start = RobotPlacement(
+        name=robot.name,
+        world_from_base=Pose(),
+        joint_position=tuple(state[0, :count].tolist()),
+        gripper_width=float(state[0, count]),
+    )
+    physics = Physics(hz=hz, contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD, finger_stiffness=FINGER_STIFFNESS)
+    info = EpisodeInfo(
+        episode_index=episode_index,
+        instruction="",
+        fps=fps,
+        versions=deciding_versions(),
+        simulation=Simulation(
+            root_seed=0,
+            task="",
+            robot=robot,
+            scene=Scene(robot=start, bodies=table_and_floor(), physics=physics),
+            physics_hz=hz,
+        ),
+    )
+    return Demonstration(
+        name=name,
+        info=info,
+        fps=fps,
+        actions=action,
+        action_kind="joint",
+        joint_position=state[:, :count],
+        gripper_width=state[:, count],
+        object_poses={},
+        recorded_success=None,
+        is_measured=True,
+        digest=hashlib.sha256(state.tobytes() + action.tobytes()).hexdigest(),
+    )
+
+
+def _of_robot(values: Array, motion: Motion, robot: RobotSpec, where: Path) -> Array:
+    """(T, n_arm + 1) positions of the arm's joints, rad, and opening of the gripper, m, of (T, D) of a motion."""
+    from demorec.check.evidence import GRIPPER
+    from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS
+
+    fingers = robot.gripper.joints
+    wanted = [*robot.arm_joints, *(() if GRIPPER in motion.names else fingers)]
+    if missing := [joint for joint in wanted if joint not in motion.joints]:
+        motors = ", or --motor-units is missing" if robot.name in IN_MOTOR_UNITS else ""
+        raise ConfigError(
+            f"The elements of observation.state ({', '.join(motion.names)}) are not known to be the joints "
+            f"{', '.join(missing)} of {robot.name}: it is of another robot{motors}: {where}"
+        )
+    arm = values[:, [motion.joints.index(joint) for joint in robot.arm_joints]]
+    if GRIPPER in motion.names:
+        return np.column_stack([arm, values[:, motion.names.index(GRIPPER)]])
+    return np.column_stack([arm, robot.gripper.width(values[:, [motion.joints.index(joint) for joint in fingers]])])

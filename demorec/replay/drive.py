@@ -311,7 +311,7 @@ def replay_all(
     allow_models(options.allowed)
     with closing(SimulatorCache()) as simulators:
         for demonstration in demonstrations:
-            if not options.states and demonstration.info.task:
+            if not (options.states or demonstration.is_measured):
                 TASKS.check_name(demonstration.info.task, options.allowed)  # before anything is made
             if out is not None:
                 yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
