@@ -17,16 +17,16 @@ class Listener:
     """Of pynput, which needs a screen: hears what `press` is told."""
 
     def __init__(self, on_press: Any, on_release: Any) -> None:
-        self.on_press, self.on_release = on_press, on_release
+        self.on_press, self.on_release, self._is_alive = on_press, on_release, False
 
     def start(self) -> None:
-        pass
+        self._is_alive = True
 
     def stop(self) -> None:
-        pass
+        self._is_alive = False
 
     def is_alive(self) -> bool:
-        return True
+        return self._is_alive
 
     def press(self, key: str, is_down: bool) -> None:
         (self.on_press if is_down else self.on_release)(SimpleNamespace(char=key))
@@ -77,6 +77,7 @@ def operated(teleoperator: Any, folder: Path, scene: int, monkeypatch: pytest.Mo
     with pytest.raises(Done):
         lerobot_teleoperate.teleop_loop(teleoperator, robot, 30, **processors)
     robot.disconnect()
+    teleoperator.disconnect()
     with Recording(folder / str(scene) / "episode_000000.mcap") as recording:
         return bool(recording.success)
 
