@@ -68,8 +68,8 @@ class Replay:
     robot: str = ""
     """The arm that does what a real one did: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
     motor_units: MotorUnits | None = None
-    """Of a dataset that LeRobot recorded of an SO-101 (shoulder_pan.pos to gripper.pos): the joints are in degrees, its
-    default, or from -100 to 100 of their ranges."""
+    """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
+    degrees, LeRobot's default, or scaled to -100..100 of their ranges."""
     calibration: Path | None = None
     """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
     says)."""
