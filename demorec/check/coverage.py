@@ -64,9 +64,7 @@ def _values(scene: Scene) -> dict[str, float]:
         values[f"{label} x"], values[f"{label} y"] = float(position[0]), float(position[1])
         if body.yaw_symmetry > 0:
             values[f"{label} yaw"] = yaw_of(body.world_from_body) % (2 * math.pi / body.yaw_symmetry)
-        if (
-            body.shape.kind != "mesh"
-        ):  # one of a shelf has no ranges: a banana is longer than all else, a hammer heavier
+        if body.shape.kind != "mesh":  # one of a shelf has no ranges: a banana is longer than all else
             values[f"{label} size"] = max(body.shape.extents)
             if body.mass > 0:
                 values[f"{label} mass"] = body.mass

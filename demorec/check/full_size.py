@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.cells import CellGrid
+from demorec.check.limits import limit_table
 from demorec.core.config import VideoConfig
 from demorec.core.geometry import Array
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, make_encoder
@@ -27,8 +28,8 @@ _STEPS = (0.0, 0.25, 0.5, -0.25, 0.75, -0.5, 1.0, -0.75, 1.25, -1.0)
 """By which the quality of an image may be another one than was asked for, the likely ones first (units of CRF)."""
 _FAR_STEPS = (*(-quarter / 4 for quarter in range(25)), 0.25, 0.5, 0.75, 1.0)
 """The same where a keyframe comes so seldom that nothing before it is encoded again."""
-_CLEAR = (0.03, 0.01, 0.22, 1.2)
-"""Displacement, sharpness, colour and error: half of what is warned of, or little more."""
+_CLEAR = 0.75
+"""Share of what is warned of, below which the quality that was asked for explains the images well enough."""
 _SAME = 0.05
 """Of 255, mean square: images that differ by less are of one quality."""
 _PAIR = 2
@@ -72,9 +73,15 @@ class FullSize:
 
     @property
     def is_clear(self) -> bool:
-        """Whether all of them are far enough below every limit."""
-        found = (self.displacement, abs(self.sharpness), self.color, float(self.errors.max()))
-        return all(value < bound for value, bound in zip(found, _CLEAR, strict=True))
+        """Whether all of them are well below what is warned of."""
+        limits = limit_table().checks
+        found = {
+            "image_placement": self.displacement,
+            "image_sharpness": abs(self.sharpness),
+            "image_colors": self.color,
+            "image_errors": float(self.errors.max()),
+        }
+        return all(value < _CLEAR * limits[check].warn for check, value in found.items())
 
 
 def frames_to_compare(keyframes: NDArray[np.int64], count: int, detail: NDArray[np.float32]) -> NDArray[np.int64]:

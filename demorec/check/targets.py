@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -31,6 +31,17 @@ _NO_TARGETS = "the action is no target of the state's elements (by their names a
 
 target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
 """Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
+
+
+def quaternion_elements(names: Sequence[str]) -> set[str]:
+    """Those of four elements in a row that are x, y, z and w of one thing: orientation.x to orientation.w, qx to qw."""
+    fours = [names[start : start + 4] for start in range(len(names) - 3)]
+    return {
+        name
+        for four in fours
+        if "".join(each[-1:] for each in four) == "xyzw" and len({each[:-1] for each in four}) == 1
+        for name in four
+    }
 
 
 @target_check(
@@ -78,8 +89,10 @@ def actions_in_order(subject: Moving) -> Found:
     best = table.argmax(axis=1)
     # Two joints of one motion may go alike; an exchange shows where an element hardly follows its own action at all.
     # A quaternion is left out: its elements are of one rotation, and a small one follows any other.
-    turns = [any(word in name for word in ("orientation", "quat", ".q")) for name in names]
-    wrong = [i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3 and not turns[i]]
+    turns = quaternion_elements(subject.motions.all[0].names)
+    wrong = [
+        i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3 and names[i] not in turns
+    ]
     words = [f"{names[i]} follows that of {names[best[i]]}" for i in wrong]
     return Measurement(value=len(wrong), detail="; ".join(words[:3]))
 

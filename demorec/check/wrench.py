@@ -162,17 +162,17 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
         return NotMeasured(why="there are too few joints or frames")
     lags, core = range(-_MOST_LAG, _MOST_LAG + 1), slice(_MOST_LAG, -_MOST_LAG)
     share = size = 0.0
-    told = []
+    found = []
     for name in _motors(episode)[-2:]:
         needed, effort = _of_joint(episode, hand, name)
         off = np.array([float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags])
         size, usual = float(np.sqrt((effort**2).mean())), float(np.median(off))
         share, lag = float(off.min()) / max(usual, 1e-12), lags[int(np.argmin(off))]
         if share < _CLEAR:
-            told.append(Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}"))
-    if not told and share > _UNCLEAR and size > _LEAST_TORQUE / 2:  # nothing but the hand is beyond the last motor
+            found.append(Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}"))
+    if not found and share > _UNCLEAR and size > _LEAST_TORQUE / 2:  # nothing but the hand is beyond the last motor
         return Measurement(value=_MOST_LAG + 1, detail=f"no shift fits {name}")
-    return worst(*told) or NotMeasured(why="the wrist's motors do not tell one shift from another")
+    return worst(*found) or NotMeasured(why="the wrist's motors do not tell one shift from another")
 
 
 @physics_check(

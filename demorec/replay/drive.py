@@ -96,7 +96,7 @@ def replay(
         The report, and how the replay ended; with `states`, which judge nothing, how the recording did.
     """
     d = demonstration
-    task = None if options.states or not d.info.task else TASKS.load(d.info.task, options.allowed)()
+    task = None if options.states or d.is_measured else TASKS.load(d.info.task, options.allowed)()
     session = Session(world, d.info.scene, task, painter=painter)
     agent = DemonstrationAgent(d, options)
     seen: list[Observation] = []

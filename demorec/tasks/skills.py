@@ -96,7 +96,7 @@ class Expert:
         )
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
         # Recordings of arms of six joints and more are made again byte for byte: what was learnt later is not for them.
-        self._repeats = self.arm.freedom == WHOLE_POSE
+        self._keeps_bytes = self.arm.freedom == WHOLE_POSE
         # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
         self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
         self._base_from_world = self.world.arm.world_from_base.inverse()
@@ -112,7 +112,7 @@ class Expert:
         Of arms that need no freedom the text stays as it was: recordings are made again byte for byte.
         """
         why = ""
-        for pose in poses[:1] if not self._repeats else ():
+        for pose in poses[:1] if not self._keeps_bytes else ():
             goal = self._base_from_world @ pose
             why = self.arm.why_unreachable(goal, start=self.joint_target, rest=self.rest_for(pose))
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
@@ -363,7 +363,7 @@ class Expert:
         clear_height = float(here.position[2]) + 0.07 * self._scale
         yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
-        if not self._repeats:
+        if not self._keeps_bytes:
             yield from self._until_at_rest(name)
         failed = [check.name for check in placement_checks(world, goal) if not check.passed]
         if failed:
@@ -398,7 +398,7 @@ class Expert:
         world = self.world
         body, pose = world.body(name), world.pose(name)
         grasps = grasps_of(body, pose, now=hand_yaw(self.tcp()), robot=world.robot, behaviour=self.behaviour)
-        if body.shape.mesh or not self._repeats:
+        if body.shape.mesh or not self._keeps_bytes:
             grasps = clear_first(grasps, self._others(name), world.robot)
         return grasps
 
@@ -414,7 +414,7 @@ class Expert:
             GaveUp: Out of reach at every allowed yaw.
         """
         body, pose = self.world.body(goal.object), self.world.pose(goal.object)
-        any_yaw = ANY_YAW if body.shape.mesh or not self._repeats else 0
+        any_yaw = ANY_YAW if body.shape.mesh or not self._keeps_bytes else 0
         symmetry = 0 if keep_yaw else goal.yaw_symmetry or any_yaw
         places = places_of(body, pose, goal_pose(self.world, goal), hand=self.tcp(), yaw_symmetry=symmetry)
         for place in places:

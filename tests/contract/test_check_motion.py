@@ -16,6 +16,7 @@ from support.check import checked, copy, edit_column, edit_json, simulate_run
 from support.export import rewrite_video
 
 from demorec.check.dataset import Dataset
+from demorec.check.targets import quaternion_elements
 from demorec.cli import main
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
@@ -380,3 +381,11 @@ def test_images_of_an_episode_that_run_backwards(strange: Path, tmp_path: Path) 
     rewrite_video(spoilt, FRONT, lambda images: [*images[:length][::-1], *images[length:]])
     assert level(strange, "images_follow_state", images=True) == "pass"
     assert level(spoilt, "images_follow_state", images=True) == "fail"
+
+
+def test_only_quaternions_are_left_out_of_the_order_of_actions() -> None:
+    joints = [f"arm.q{number}" for number in range(1, 8)]
+    pose = ["position.x", "position.y", "position.z", *(f"orientation.{axis}" for axis in "xyzw")]
+    assert quaternion_elements([*joints, *pose]) == set(pose[3:])
+    assert quaternion_elements(["x", "y", "z", "qx", "qy", "qz", "qw", "gripper.width"]) == {"qx", "qy", "qz", "qw"}
+    assert quaternion_elements(joints) == set()
