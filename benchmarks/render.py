@@ -2,6 +2,7 @@
 
     python benchmarks/render.py                        # a quick look
     python benchmarks/render.py --rounds 11 --memory --rate-seconds 10
+    python benchmarks/render.py --robot so101 --task stack --sizes 224x224
 
 Process CPU time, since machines are shared; medians over rounds; the ratio is against TinyRenderer in the same run.
 """
@@ -87,8 +88,7 @@ def measure(painter: Painter, world: World, states: list[State]) -> float:
     return 1e3 * spent / len(states)
 
 
-def table(renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frames: int) -> None:
-    episode = plan(width=96, height=96)
+def table(episode: Episode, renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frames: int) -> None:
     variants = [
         Variant(name, antialias, everything)
         for name in renderers
@@ -97,7 +97,7 @@ def table(renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frame
     ]
     with make_world(episode.info) as world:
         states = run_episode(world, episode)
-        print(f"{len(states)} frames of an episode of {episode.info.task}; {rounds} rounds of {frames} frames each")
+        print(f"{len(states)} frames of {episode.info.task} by {episode.info.robot.name}; {rounds} rounds of {frames}")
         for width, height in sizes:
             every = [replace(camera, width=width, height=height) for camera in episode.info.scene.cameras]
             for cameras in [(camera,) for camera in every] + [tuple(every)]:
@@ -179,6 +179,8 @@ def memory(images: int, resets: int) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--renderers", nargs="+", default=list(RENDERERS.names()), choices=RENDERERS.names())
+    parser.add_argument("--robot", default="panda", help="whose episode the table measures")
+    parser.add_argument("--task", default="pick_place", help="which")
     parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=16, help="frames a round; a quarter of them for slow renderers")
@@ -197,7 +199,8 @@ def main() -> int:
                 continue
         renderers.append(name)
     if options.rounds > 0:
-        table(renderers, sizes, options.rounds, options.frames)
+        episode = plan(width=96, height=96, robot=options.robot, task=options.task)
+        table(episode, renderers, sizes, options.rounds, options.frames)
     if options.rate_seconds > 0:
         print(f"\nImages a second, both cameras, {options.rate_seconds:g} s each")
         rate(renderers, sizes, options.rate_seconds, options.workers)

@@ -26,8 +26,8 @@ __all__ = ["DemorecEnvConfig"]
 
 
 _AS_THEY_ARE = (
-    "split", "variation", "fps", "renderer", "privileged", "state", "action", "episode_length", "render_mode",
-    "render_camera", "render_width", "render_height",
+    "robot", "split", "variation", "fps", "renderer", "privileged", "state", "action", "episode_length",
+    "render_mode", "render_camera", "render_width", "render_height",
 )  # fmt: skip
 """Flags that are arguments of the environment by the same name."""
 
@@ -38,6 +38,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
     """Flags `--env.NAME=...`; the scenes of one seed are the same in `demorec evaluate`."""
 
     task: str | None = "pick_place"
+    robot: str = "panda"
     split: str = "eval"
     scene_seed: int = 0
     variation: str = "mild"

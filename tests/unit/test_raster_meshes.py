@@ -9,11 +9,14 @@ import pytest
 import trimesh
 from support import render as scenes
 
+import demorec
 from demorec.core.errors import RenderError
 from demorec.render.raster import RasterRenderer
 from demorec.render.raster.cache import cached_mesh
 from demorec.render.raster.decimate import decimate
 from demorec.render.raster.mesh_files import load_mesh
+
+SO101_MESHES = Path(demorec.__file__).parent / "sim" / "assets" / "so101"
 
 
 def test_stl_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
@@ -69,6 +72,16 @@ def test_decimation_stays_near_the_surface() -> None:
     )[1]
     assert np.median(distance) < 1e-3
     assert np.allclose((few.normals**2).sum(-1), 1, atol=1e-6)
+
+
+def test_a_mesh_whose_edges_resist_is_coarsened_first() -> None:
+    """Of a part of SO-101 fewer than 270 triangles cannot be had by collapsing edges."""
+    mesh = load_mesh(SO101_MESHES / "base_motor_holder_so101_v1.obj")
+    few = decimate(mesh, 40)
+    assert few.num_faces <= 60
+    low, high = mesh.points.min(0), mesh.points.max(0)
+    assert np.allclose(few.points[few.faces].min((0, 1)), low, atol=0.1 * (high - low).max())
+    assert np.allclose(few.points[few.faces].max((0, 1)), high, atol=0.1 * (high - low).max())
 
 
 def test_the_cache_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
