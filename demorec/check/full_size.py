@@ -36,8 +36,9 @@ _PAIR = 2
 """Frames that are compared from a keyframe on: one of each kind."""
 _NEAR = 10
 """Keyframes around one that tell how much detail is usual."""
-_LEAST_PIXELS, _MANY_PIXELS = 64, 512
-"""Of a colour in an image: one of fewer is not judged, one of many fully."""
+_LEAST_PIXELS, _MANY_PIXELS = 64, 1024
+"""Of a colour in an image: one of fewer is not judged, one of many fully (four macroblocks of H.264, each of which has
+one step of quality)."""
 _LEVELS = 2.0
 """By which a block may be off beside its encoder's error: what rounding does."""
 _LATER_WEIGHT = 0.7

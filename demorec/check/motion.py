@@ -340,7 +340,7 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     if not steady.any():
         return NotMeasured(why="the gripper's command never lasts")
     gap = opening - command
-    is_open = command > command.min() + 0.5 * reach
+    is_open = command > (command.min() + command.max()) / 2
     holds = ~is_open
     if motion.contact is not None:
         holds = motion.contact > 0

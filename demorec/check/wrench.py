@@ -26,12 +26,15 @@ from demorec.core.geometry import Array
 
 _LEVER = 0.2
 """Metres at which a torque counts as much as a force."""
-_GRIP = 0.25
+_GRIP = 0.5
 """Of the force with which fingers hold something, which counts beside the weight: the wrench is what is left of forces
-that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as force (0.95 N of 40 N)."""
+that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as force (0.95 N of 40 N), between jaws
+that turn a 26th (0.21 N of 5.5 N)."""
 _LEAST_TORQUE = 0.012
 """N m below which nothing is said: motors of wrists that bear less differ from the wrench by up to 0.0063 N m (of 145
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
+_STOP = 2e-3
+"""Radians before its limit at which a joint is at its stop."""
 _AROUND = 6
 """Frames before and after a peak of the contact force in which it must be the only one."""
 _LOST_SHARE = 0.5
@@ -231,7 +234,10 @@ def _peaks(table: Array) -> Array:
 
 
 def _of_joint(episode: CheckedEpisode, hand: _Hand, name: str) -> tuple[Array, Array]:
-    """(T - 4,) N m each: what a joint's motor needs to give by the wrench and the links above it, and what it gave."""
+    """(T - 4,) N m each: what a joint's motor needs to give by the wrench and the links above it, and what it gave.
+
+    Both are 0 where the joint is at its stop, which bears what the motor adds.
+    """
     joint = next(joint for joint in episode.urdf.joints if joint.name == name)
     pose = episode.world_from_link(joint.child)
     below = hand.dynamics.below(_mount(episode))
@@ -240,4 +246,8 @@ def _of_joint(episode: CheckedEpisode, hand: _Hand, name: str) -> tuple[Array, A
         if not any(load is other for other in below):
             total = total + np.cross(load.point - pose[:, :3, 3], load.force)
     needed = ((pose[:, :3, :3] @ np.array(joint.axis)) * total).sum(axis=1)
-    return needed[2:-2], episode.columns.joint_effort[2:-2, episode.info.robot.arm_joints.index(name)]
+    index = episode.info.robot.arm_joints.index(name)
+    position = episode.columns.joint_position[:, index]
+    robot = episode.info.robot
+    free = (position > robot.position_lower[index] + _STOP) & (position < robot.position_upper[index] - _STOP)
+    return (needed * free)[2:-2], (episode.columns.joint_effort[:, index] * free)[2:-2]

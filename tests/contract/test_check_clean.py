@@ -49,6 +49,20 @@ def test_an_arm_that_noise_shakes(config: dict[str, Any], tmp_path: Path) -> Non
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 
+@pytest.mark.parametrize(
+    ("task", "index"),
+    [
+        pytest.param("place_in_tray", 26, id="the jaw opens as far as the tray's wall lets it"),
+        pytest.param("stack_three", 25, id="the wrist rests on its stop"),
+        pytest.param("stack_three", 33, id="a jaw that has turned presses askew"),
+        pytest.param("stack_three", 36, id="the tower rocks in the end"),
+    ],
+)
+def test_a_small_arm_that_touches_much(task: str, index: int, tmp_path: Path) -> None:
+    path = simulate(tmp_path / "e.mcap", robot="so101", task=task, seed=31, episode_index=index)
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
