@@ -121,6 +121,19 @@ def test_lerobot_is_told_of_the_state() -> None:
         DemorecEnvConfig(state="joint_e")
 
 
+def test_lerobot_gets_the_robot_that_it_asks_for() -> None:
+    from demorec.lerobot_env import DemorecEnvConfig
+
+    config = DemorecEnvConfig(robot="so101")
+    assert config.features["action"].shape == (6,)  # five joints and the jaw
+    (envs,) = config.create_envs(1)["demorec"].values()
+    observation, _ = envs.reset(seed=0)
+    assert observation["agent_pos"].shape == (1, 6)
+    envs.close()
+    with pytest.raises(ConfigError, match="so102"):
+        DemorecEnvConfig(robot="so102")
+
+
 def test_states_of_two_kinds_do_not_go_into_one_dataset(run: Path, dataset: Path) -> None:
     before = states(dataset)
     with pytest.raises(ConfigError, match=STATE):
