@@ -26,10 +26,10 @@ from demorec.core.geometry import Array
 
 _LEVER = 0.2
 """Metres at which a torque counts as much as a force."""
-_GRIP = 0.5
-"""Of the force with which fingers hold something, which counts beside the weight: the wrench is what is left of forces
-that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as force (0.95 N of 40 N), between jaws
-that turn a 26th (0.21 N of 5.5 N)."""
+_GRIP = {"prismatic": 0.25, "revolute": 0.5}
+"""Of the force with which fingers of a kind of joint hold something, which counts beside the weight: the wrench is what
+is left of forces that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as force (0.95 N of
+40 N), of a jaw that turns a 26th (0.21 N of 5.5 N)."""
 _LEAST_TORQUE = 0.012
 """N m below which nothing is said: motors of wrists that bear less differ from the wrench by up to 0.0063 N m (of 145
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
@@ -109,17 +109,14 @@ def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     lifted = {name: free & episode.is_carried(name, LIFTED_HEIGHT) for name in c.object_poses}
     empty = free & ~np.any([*lifted.values(), np.zeros_like(free)], axis=0)
     grips = {"nothing": empty, **lifted}
-    found = [
-        _unborne(hand, rows, c.contact_force[rows], what) for what, rows in grips.items() if rows.sum() >= MIN_FRAMES
-    ]
+    pressed = _GRIP[episode.info.robot.gripper.joint_kind] * c.contact_force
+    found = [_unborne(hand, rows, pressed[rows], what) for what, rows in grips.items() if rows.sum() >= MIN_FRAMES]
     return worst(*found) or NotMeasured(why=f"the hand is free and moves smoothly in fewer than {MIN_FRAMES} frames")
 
 
 def _unborne(hand: _Hand, rows: NDArray[np.bool_], grip: Array, what: str) -> Measurement:
-    """What force and torque differ by in some frames, in units of the weight that is borne, and of the grip's force."""
-    weight = math.hypot(
-        float(np.median(np.linalg.norm(hand.loads_force[rows], axis=1))), _GRIP * float(np.median(grip))
-    )
+    """What force and torque differ by in some frames, in units of the weight that is borne, and of the grip's share."""
+    weight = math.hypot(float(np.median(np.linalg.norm(hand.loads_force[rows], axis=1))), float(np.median(grip)))
     off = np.hstack([hand.force - hand.loads_force, (hand.torque - hand.loads_torque) / _LEVER])[rows]
     along = np.einsum("tji,tkj->tki", hand.rotation[rows], off.reshape(-1, 2, 3))
     force, torque = np.linalg.norm(np.median(along, axis=0), axis=1) / weight
