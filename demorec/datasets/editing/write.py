@@ -131,6 +131,7 @@ class _Reader:
         tables = self.source.episode_tables if self.source.fact_types else ()
         self._facts_beside = EpisodeRows(tables, schema, rows=_EPISODES_AT_ONCE)
         self._known = _ImageStatistics(self.source) if not decode else None
+        self._has_digests = any(source.sidecar_tables for source in plan.sources)
 
     def episode(self, cut: Cut) -> EpisodeData:
         """Read an episode."""
@@ -150,7 +151,8 @@ class _Reader:
                 language = self._language(rows, cut)
                 continue
             if feature.is_video:
-                videos[name] = self._cutters[take.feature].cut(place, cut.first, cut.last)
+                video = self._cutters[take.feature].cut(place, cut.first, cut.last)
+                videos[name] = video.with_digest() if self._has_digests else video
                 video_info[name] = feature.info or self._cutters[take.feature].stream_info(place)
             else:
                 columns[name] = self._column(rows, take, feature)
