@@ -109,7 +109,12 @@ class WriterStart:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenEpisode:
-    """Where an episode went, and its digest (`demorec.datasets.lerobot.layout`), "" with images in rows or without those of its videos."""
+    """Where an episode went, and its digest (`demorec.datasets.lerobot.layout`).
+
+    Attributes:
+        episode_index: Its number in the dataset.
+        digest: "" where images are in rows, or its videos have none.
+    """
 
     episode_index: int
     digest: str
