@@ -2,6 +2,7 @@
 
     python benchmarks/edits.py                          200 episodes of 100 frames, less than five minutes
     python benchmarks/edits.py --episodes 20 --frames 50
+    python benchmarks/edits.py --episodes 50 --frames 150 --size 640 480     images as people have them
     python benchmarks/edits.py --copies 1 10 --without-lerobot     how demorec's cost grows with the dataset
 
 Deletes a twentieth of the episodes, splits 80 to 20, merges 5 datasets, trims a frame off either end of every episode
@@ -29,20 +30,20 @@ ENVIRONMENT = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1", 
 ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # with it every start would compile the package anew
 
 
-def written_by_lerobot(root: Path, episodes: int, frames: int, size: int) -> Path:
+def written_by_lerobot(root: Path, episodes: int, frames: int, width: int, height: int) -> Path:
     from lerobot.datasets import LeRobotDataset
 
     rng = np.random.default_rng(0)
     vector = {"dtype": "float32", "shape": (7,), "names": [f"joint_{number}" for number in range(7)]}
-    camera = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    camera = {"dtype": "video", "shape": (height, width, 3), "names": ["height", "width", "channels"]}
     cameras = ("observation.images.top", "observation.images.wrist")
     features = {"observation.state": vector, "action": vector, **dict.fromkeys(cameras, camera)}
     dataset = LeRobotDataset.create("local/x", fps=30, features=features, root=root)
-    y, x = np.mgrid[:size, :size]
+    y, x = np.mgrid[:height, :width]
     for episode in range(episodes):
         for t in range(frames):
             image = np.stack([x + 3 * t + 7 * episode, 2 * y + t, x * y // 16 + 5 * episode], axis=-1).astype(np.uint8)
-            begin = 10 + t % (size - 40)
+            begin = 10 + t % (height - 40)
             image[begin : begin + 20, begin : begin + 20] = 200
             numbers = rng.normal(size=(2, 7)).astype(np.float32)
             frame = {"observation.state": numbers[0], "action": numbers[1], "task": "go"}
@@ -168,14 +169,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--frames", type=int, default=100, help="of each episode")
-    parser.add_argument("--size", type=int, default=96, help="width and height of the images")
+    parser.add_argument("--size", type=int, nargs=2, default=(96, 96), help="width and height of the images")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--copies", type=int, nargs="+", default=[1], help="datasets so many times as large")
     parser.add_argument("--without-lerobot", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="demorec-benchmark-") as name:
         folder = Path(name)
-        few = written_by_lerobot(folder / "few", max(1, args.episodes // 10), args.frames, args.size)
+        few = written_by_lerobot(folder / "few", max(1, args.episodes // 10), args.frames, *args.size)
         base = multiplied(few, 10, folder / "base")
         for times in args.copies:
             root = multiplied(base, times, folder / f"times_{times}")

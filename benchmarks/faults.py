@@ -543,7 +543,7 @@ class Stranger:
     form: ClassVar[Form] = "external"
 
     def __init__(self, features: Features, names: Mapping[str, tuple[str, ...]], fps: int) -> None:
-        self.motions = Motions(lambda: [motion_of_features(features, names, fps)])
+        self.motions = Motions([motion_of_features(features, names, fps)])
 
     def dynamics_of(self, motion: Motion) -> Any:
         """As of an imported recording."""

@@ -141,7 +141,7 @@ class Dataset:
     @cached_property
     def motions(self) -> Motions:
         """Those of its episodes."""
-        return Motions(lambda: list(motions_of_dataset(self.info, self.rows, self._arms, self.urdf)))
+        return Motions(list(motions_of_dataset(self.info, self.rows, self._arms, self.urdf)))
 
     @property
     def _arms(self) -> dict[int, DatasetRobot]:

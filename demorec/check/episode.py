@@ -56,6 +56,12 @@ class CheckedEpisode(ExitStack):
         self._bodies: dict[str, Array] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
 
+    def __exit__(self, *error: Any) -> bool | None:
+        """Free everything: parts that refer to the whole would keep its images until the next garbage collection."""
+        result = super().__exit__(*error)
+        vars(self).clear()
+        return result
+
     def shared[T](self, compute: Callable[[CheckedEpisode], T]) -> T:
         """What a function makes of the episode, computed once for all checks that ask for it."""
         if compute not in self._shared:
@@ -138,7 +144,7 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def motions(self) -> Motions:
         """The one of its robot, if it has a state."""
-        return Motions(lambda: [self._motion] if self._motion is not None else [])
+        return Motions([self._motion] if self._motion is not None else [])
 
     @cached_property
     def _motion(self) -> Motion | None:

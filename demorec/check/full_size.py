@@ -7,6 +7,7 @@ frames before, which are taken from the recording. Depth and labels are stored w
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -144,15 +145,15 @@ def encoded_again(
         given = [*before, *(drawn[n] for n in part)]
         if tries_qualities:
             true = np.stack([seen[int(frame)] for frame in frames[part]])
-            images += list(_most_alike(settings, recorded, given, true))
+            images += _most_alike(settings, recorded, given, true)
         else:
-            images += list(_encoded(settings, recorded, given)[-len(part) :])
+            images += _encoded(settings, recorded, given, len(part))
     return np.stack(images)
 
 
 def _most_alike(
     settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb], recorded: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
+) -> Sequence[Rgb]:
     """What an encoder makes of the last of some images, at the quality that was asked for or one near it.
 
     Which it takes depends on all images before: x264 remembers how much they showed.
@@ -162,13 +163,13 @@ def _most_alike(
         images: What it gets.
         recorded: (N, H, W, 3) what it made of the last N of them.
     """
-    best, least = recorded, np.inf
+    best, least = list[Rgb](), np.inf
     steps = _STEPS if len(images) > len(recorded) else _FAR_STEPS
     for step in steps if config.codec == "h264" and config.crf is not None else steps[:1]:
         # A whole number to the user; x264 knows parts of it.
         other = replace(config, crf=max(config.crf + step, 0)) if step else config  # type: ignore[arg-type, operator]
-        found = _encoded(settings, other, images)[-len(recorded) :]
-        off = float(np.square(found.astype(np.float32) - recorded).mean())
+        found = _encoded(settings, other, images, len(recorded))
+        off = float(np.square(np.stack(found).astype(np.float32) - recorded).mean())
         if off < least:
             best, least = found, off
         if least < _SAME:
@@ -176,15 +177,15 @@ def _most_alike(
     return best
 
 
-def _encoded(settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb]) -> NDArray[np.uint8]:
-    """(N, H, W, 3) what an encoder makes of N images."""
+def _encoded(settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb], count: int) -> list[Rgb]:
+    """What an encoder makes of the last `count` of some images."""
     encoder = make_encoder(config, settings.width, settings.height, settings.fps)
     data = [packet for image in images for packet in encoder.encode(image)]
     packets = [
         VideoPacket(frame_index=n, time_ns=0, data=packet, is_keyframe=n == 0)
         for n, packet in enumerate([*data, *encoder.finish()])
     ]
-    return np.stack(list(decode(settings, packets)))
+    return list(deque(decode(settings, packets), maxlen=count))
 
 
 def compare_full_size(

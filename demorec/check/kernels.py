@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-_njit: Any = numba.njit(cache=True)
+from demorec.core.compiled import njit
+
+_njit: Any = njit(cache=True)
 
 
 @_njit  # type: ignore[untyped-decorator]

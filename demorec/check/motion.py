@@ -6,7 +6,7 @@ An action is compared with the state where its elements are targets of the same 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from typing import Protocol
 
@@ -63,17 +63,12 @@ motion_check = partial(check, group="physics", on=EVERYWHERE)
 class Motions:
     """All motions of a dataset, or the one of a recording.
 
-    Args:
-        read: Gives them.
+    Attributes:
+        all: Of every episode that has a state.
     """
 
-    def __init__(self, read: Callable[[], Sequence[Motion]]) -> None:
-        self._read = read
-
-    @cached_property
-    def all(self) -> Sequence[Motion]:
-        """Of every episode that has a state."""
-        return self._read()
+    def __init__(self, motions: Sequence[Motion]) -> None:
+        self.all = motions
 
     @cached_property
     def targets(self) -> list[tuple[Array, Array]]:

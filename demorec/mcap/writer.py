@@ -11,7 +11,7 @@ hold them, so that whatever a crash leaves of the frames has its images.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from heapq import merge
@@ -135,15 +135,13 @@ class EpisodeWriter(Closing):
 
     def _describe(self, info: EpisodeInfo) -> None:
         self._info = info
-        self._gather: Callable[[Any], _Pending]
         if info.simulation is not None:
             check_joint_names(info)
-            self._gather = partial(self._of_simulation, FrameCheck(info))
+            self._check_simulated = FrameCheck(info)
         elif wrong := find_problems(info):
             raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
         else:
             self._check = SampledFrameCheck(info)
-            self._gather = self._of_samples
         self._tree = FrameTree(info) if info.simulation is not None or info.urdf else None
         self._streams = frame_streams(info, self._tree)
 
@@ -185,7 +183,7 @@ class EpisodeWriter(Closing):
             RecordingError: Frames out of order; vectors, objects, features or cameras that are missing, unknown, of
                 another length or type; numbers that are not finite; images missing or of another size; a full disk.
         """
-        self._pending.append(self._gather(frame))
+        self._pending.append(self._of_simulation(frame) if isinstance(frame, Frame) else self._of_samples(frame))
         self.num_frames += 1
         if len(self._pending) >= self._info.fps or frame.time_ns - self._pending[0].time_ns >= _SECOND_NS:
             self.flush()
@@ -197,14 +195,14 @@ class EpisodeWriter(Closing):
         changes = [(SUBTASK, messages.STRING, encode(messages.STRING, text))] if text else []
         return _Pending(frame.time_ns, frame, frame.images, changes)
 
-    def _of_simulation(self, check: FrameCheck, frame: Frame) -> _Pending:
+    def _of_simulation(self, frame: Frame) -> _Pending:
         due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
             raise RecordingError(
                 f"Frame {frame.frame_index} at {frame.time_ns} ns came where frame {due[0]} at {due[1]} ns was due: "
                 "frames are written in order, one each."
             )
-        check(frame)
+        self._check_simulated(frame)
         if not self._is_begun:
             self._open_cameras(frame)
             self._write_description()

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-_njit = numba.njit(cache=True, error_model="numpy")
+from demorec.core.compiled import njit
+
+_njit = njit(cache=True, error_model="numpy")
 
 
 @_njit

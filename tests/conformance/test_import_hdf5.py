@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
+from support.export import recordings
 from support.hdf5 import (
     ALOHA_CAMERAS,
     HEIGHT,
@@ -33,10 +34,6 @@ from demorec.sources.mapping import Episodes
 
 pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 DEMOS = ("demo_0", "demo_1", "demo_10")
-
-
-def recordings(run: Path) -> list[Path]:
-    return sorted((run / "episodes").glob("*.mcap"))
 
 
 def suggested(file: Path, changes: dict[str, str] | None = None) -> Path:

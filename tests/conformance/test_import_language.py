@@ -14,7 +14,7 @@ import pytest
 from rerun.chunk import RrdReader
 from support import bag_mappings, bags
 from support.commands import exit_code
-from support.export import export
+from support.export import export, recordings
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
@@ -49,10 +49,6 @@ def row_at(recording: Path, at_s: float) -> int:
     with Recording(recording) as opened:
         times = opened.columns().time_ns
     return next(row for row, time in enumerate(times.tolist()) if time >= bags.EPOCH_NS + round(at_s * bags.NS))
-
-
-def recordings(run: Path) -> list[Path]:
-    return sorted((run / "episodes").glob("*.mcap"))
 
 
 def rows_of(dataset: Path) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
-from support.export import data_table, export, make_run
+from support.export import data_table, export, make_run, recordings
 from support.training import CAMERA, DEPTH, write_by_lerobot
 
 from demorec.cli import main
@@ -42,10 +42,6 @@ def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     write_by_lerobot(folder / "dataset", LENGTHS, **arguments)
     import_lerobot(folder / "dataset", folder / "run")
     return kind, folder / "dataset", folder / "run"
-
-
-def recordings(run: Path) -> list[Path]:
-    return sorted((run / "episodes").glob("*.mcap"))
 
 
 def columns_of(dataset: Path, name: str) -> NDArray[np.generic]:

@@ -76,7 +76,7 @@ def test_a_training_that_fails_is_told_and_begun_anew(
     failing = Failing(train / "logs" / "a.txt")
     monkeypatch.setattr(improvement, "start_program", failing)
     assert ends(words_for(place, out)) == 1
-    assert "The training failed (no such field), all that it said is in" in capsys.readouterr().err
+    assert "The training failed (no such field), its output is in" in capsys.readouterr().err
     assert len(data_table(out / "round_00" / "dataset")) == info(out / "round_00" / "dataset")["total_frames"]
     assert f"--config_path={place / 'settings.json'}" in failing.commands[0]
 

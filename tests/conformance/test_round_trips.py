@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.commands import exit_code
-from support.export import export, make_run
+from support.export import export, make_run, recordings
 from support.external import TOP, Episode, make_external, write_external
 
 from demorec.core.geometry import Pose
@@ -63,10 +63,6 @@ def imported(exporter: str, source: Path, out: Path) -> Path:
     mapping = out.with_suffix(".toml")
     assert exit_code("import", "hdf5", source, "--mapping", mapping, "--out", out) == 0
     return out
-
-
-def recordings(run: Path) -> list[Path]:
-    return sorted((run / "episodes").glob("*.mcap"))
 
 
 @pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])

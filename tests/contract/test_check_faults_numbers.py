@@ -13,23 +13,26 @@ import pytest
 from support.check import simulate
 from support.faults import (
     Changed,
+    Fault,
     Rows,
     backwards,
+    both_grippers,
+    condition,
     frozen,
     halved,
+    info,
     inverted,
     judged,
     late,
     noisy,
     one_alien,
+    outcome,
     upside_down,
 )
 
 from demorec.check.rows import matrices
 from demorec.episode.episode import SuccessCheck
 from demorec.robots.panda import PANDA
-
-Fault = Callable[[Changed], Changed]
 
 
 @pytest.fixture(scope="session")
@@ -166,30 +169,6 @@ def beside_the_middle_of_the_fingers(c: Changed) -> Changed:
 
 def wrench(change: Callable[[Rows], Rows]) -> Fault:
     return lambda c: c.with_columns(sensed={"wrench": change(c.columns.sensed["wrench"])})
-
-
-def info(**fields: Any) -> Fault:
-    return lambda c: c.with_info(**fields)
-
-
-def outcome(**fields: Any) -> Fault:
-    return lambda c: c.with_outcome(**fields)
-
-
-def condition(name: str, **fields: Any) -> Fault:
-    def fault(c: Changed) -> Changed:
-        assert any(check.name == name for check in c.outcome.checks)
-        return c.with_outcome(
-            checks=tuple(replace(check, **fields) if check.name == name else check for check in c.outcome.checks)
-        )
-
-    return fault
-
-
-def both_grippers(change: Callable[[Rows], Rows]) -> Fault:
-    return lambda c: c.with_columns(
-        action_gripper=change(c.columns.action_gripper), command_gripper=change(c.columns.command_gripper)
-    )
 
 
 def stuck(first: int, last: int) -> Callable[[Rows], Rows]:

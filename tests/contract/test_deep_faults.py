@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.check import Message, Spoilt, level_of, rewrite_messages, simulate
-from support.faults import Changed, Rows, late
+from support.faults import Changed, Fault, Rows, both_grippers, condition, info, late, outcome
 from support.mcap import sealed
 
 from demorec.core.geometry import Pose
@@ -29,7 +29,6 @@ from demorec.replay.deep import deep_check
 from demorec.robots.panda import PANDA
 
 Edit = Callable[[Message], list[Message]]
-Fault = Callable[[Changed], Changed]
 INFO = channels.camera_topic("front", "camera_info")
 VIDEO, H264 = channels.camera_topic("front", "video"), channels.camera_topic("front", "h264")
 DEPTH, LABELED = channels.camera_topic("front", "depth"), channels.camera_topic("front", "segmentation")
@@ -228,32 +227,8 @@ def missed(frames: slice) -> Fault:
     return fault
 
 
-def both_grippers(change: Callable[[Rows], Rows]) -> Fault:
-    return lambda c: c.with_columns(
-        action_gripper=change(c.columns.action_gripper), command_gripper=change(c.columns.command_gripper)
-    )
-
-
-def info(**fields: Any) -> Fault:
-    return lambda c: c.with_info(**fields)
-
-
-def outcome(**fields: Any) -> Fault:
-    return lambda c: c.with_outcome(**fields)
-
-
 def scene(change: Callable[[Any], Any]) -> Fault:
     return lambda c: c.with_info(scene=change(c.info.scene))
-
-
-def condition(name: str, **fields: Any) -> Fault:
-    def fault(c: Changed) -> Changed:
-        assert any(check.name == name for check in c.outcome.checks)
-        return c.with_outcome(
-            checks=tuple(replace(check, **fields) if check.name == name else check for check in c.outcome.checks)
-        )
-
-    return fault
 
 
 DESCRIBED: list[tuple[str, Fault]] = [

@@ -26,6 +26,11 @@ from demorec.datasets.lerobot import export as lerobot_export
 from support.recording import write_episode
 
 
+def recordings(run: Path) -> list[Path]:
+    """Of the episodes of a run, in order."""
+    return sorted((run / "episodes").glob("*.mcap"))
+
+
 def make_run(
     folder: Path,
     lengths: Sequence[int],

@@ -129,7 +129,10 @@ class Changed:
         return replace(self, outcome=outcome)
 
 
-def judged(path: Path, check: str, fault: Callable[[Changed], Changed]) -> Result:
+Fault = Callable[[Changed], Changed]
+
+
+def judged(path: Path, check: str, fault: Fault) -> Result:
     """What a check says of a recording with a fault in its numbers or in what is said about it."""
     with CheckedEpisode(path) as episode:
         recording = episode.recording
@@ -140,6 +143,35 @@ def judged(path: Path, check: str, fault: Callable[[Changed], Changed]) -> Resul
         episode.__dict__["columns"] = changed.columns
         recording.info, recording.outcome = changed.info, changed.outcome
         return CHECKS.load(check).run(episode)
+
+
+def info(**fields: Any) -> Fault:
+    """Another description."""
+    return lambda c: c.with_info(**fields)
+
+
+def outcome(**fields: Any) -> Fault:
+    """Another outcome."""
+    return lambda c: c.with_outcome(**fields)
+
+
+def condition(name: str, **fields: Any) -> Fault:
+    """Another result of a condition of success."""
+
+    def fault(c: Changed) -> Changed:
+        assert any(check.name == name for check in c.outcome.checks)
+        return c.with_outcome(
+            checks=tuple(replace(check, **fields) if check.name == name else check for check in c.outcome.checks)
+        )
+
+    return fault
+
+
+def both_grippers(change: Callable[[Rows], Rows]) -> Fault:
+    """Other actions and commands of the gripper."""
+    return lambda c: c.with_columns(
+        action_gripper=change(c.columns.action_gripper), command_gripper=change(c.columns.command_gripper)
+    )
 
 
 def late(rows: Rows) -> Rows:

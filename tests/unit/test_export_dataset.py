@@ -12,7 +12,7 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from support.export import data_table, episode_rows, export, files_of, info, make_run
+from support.export import data_table, episode_rows, export, files_of, info, make_run, recordings
 from support.recording import make_episode, write_episode
 
 from demorec.core.config import VideoConfig
@@ -33,10 +33,6 @@ def video_frames(dataset: Path, camera: str) -> Iterator[np.ndarray[Any, Any]]:
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
                 yield frame.to_ndarray(format="rgb24")
-
-
-def recordings(run: Path) -> list[Path]:
-    return sorted((run / "episodes").glob("*.mcap"))
 
 
 def vectors(dataset: Path, name: str) -> np.ndarray[Any, Any]:

@@ -42,7 +42,8 @@ class EncodedVideo:
         samples: All images back to back, as an mp4 file stores them; or a file of them that is deleted once written.
         sizes: (lead + T + tail,) int64, bytes of each in `samples`.
         is_keyframe: (lead + T + tail,) bool, which ones can be decoded by themselves.
-        digest: SHA-256 of T samples, those of the images, hex; with a tail, of those that are stored in their place.
+        digest: SHA-256 of T samples, those of the images, hex; with a tail, of those that are stored in their place. ""
+            where nobody asks for it.
         lead: How many images are in front that belong to no frame, from a keyframe on.
         tail: How many images are shown behind the last frame, since some of the T are decoded from them.
         shifts: (lead + T + tail,) int64, by how many places each image is shown after the place at which it is stored;
@@ -56,7 +57,7 @@ class EncodedVideo:
     samples: bytes | Path
     sizes: NDArray[np.int64]
     is_keyframe: NDArray[np.bool_]
-    digest: str
+    digest: str = ""
     lead: int = 0
     tail: int = 0
     shifts: NDArray[np.int64] | None = None
@@ -69,7 +70,7 @@ class EncodedVideo:
         unit_lengths = np.asarray(lengths, dtype=np.int64)
         samples, sizes, is_key = mp4_samples(codec, data, unit_lengths)
         first = data[: int(unit_lengths[0])] if len(unit_lengths) else b""
-        return cls(
+        video = cls(
             codec=codec,
             width=width,
             height=height,
@@ -77,9 +78,15 @@ class EncodedVideo:
             samples=samples,
             sizes=sizes,
             is_keyframe=is_key,
-            digest=hashlib.sha256(memoryview(samples)[int(sizes[:lead].sum()) :]).hexdigest(),
             lead=lead,
         )
+        return video.with_digest()
+
+    def with_digest(self) -> EncodedVideo:
+        """The same with its digest, if its `samples` are bytes."""
+        assert isinstance(self.samples, bytes)
+        begin, end = (int(self.sizes[:count].sum()) for count in (self.lead, self.lead + self.num_frames))
+        return replace(self, digest=hashlib.sha256(memoryview(self.samples)[begin:end]).hexdigest())
 
     @property
     def num_frames(self) -> int:

@@ -109,7 +109,12 @@ class WriterStart:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenEpisode:
-    """Where an episode went, and its digest (`demorec.datasets.lerobot.layout`), "" with images in rows."""
+    """Where an episode went, and its digest (`demorec.datasets.lerobot.layout`).
+
+    Attributes:
+        episode_index: Its number in the dataset.
+        digest: "" where images are in rows, or its videos have none.
+    """
 
     episode_index: int
     digest: str
@@ -226,7 +231,7 @@ class DatasetWriter:
         self.num_episodes += 1
         if spoken:
             values.update(language_digests(episode.language, frames))
-        has_digest = len(digests) == len(self._cameras)
+        has_digest = len(digests) == len(self._cameras) and all(digests.values())
         return WrittenEpisode(
             episode_index=self.num_episodes - 1,
             digest=episode_digest(episode.task, values, digests) if has_digest else "",

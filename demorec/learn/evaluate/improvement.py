@@ -163,7 +163,7 @@ class Improvement:
             new = replace(self._config, seed=self._config.seed + plan.seed + number)  # scenes that no round had
             self._act(before, new, self._corrections(number), plan.num_episodes, plan.takeover)
         dataset = self._dataset(number)
-        self._tell(f"round {number}: training, {folder / LOG_NAME} tells how it goes")
+        self._tell(f"round {number}: training, its output is in {folder / LOG_NAME}")
         seconds = self._train(number, dataset)
         self._tell(f"round {number}: {self._plan.num_scenes} held-out scenes")
         config = replace(self._config, split="eval", seed=0)
@@ -276,5 +276,5 @@ def _run_training(words: Sequence[str], log: Path) -> None:
             process.wait()
             raise
     if code:
-        lines = log.read_text(errors="replace").strip().splitlines() or ["nothing was said"]
-        raise DemorecError(f"The training failed ({lines[-1].strip()}), all that it said is in {log}")
+        lines = log.read_text(errors="replace").strip().splitlines() or ["no output"]
+        raise DemorecError(f"The training failed ({lines[-1].strip()}), its output is in {log}")

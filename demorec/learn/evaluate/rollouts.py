@@ -124,7 +124,7 @@ def settings_for(
     episode_length: int | None = None,
     allowed: Sequence[str] = (),
 ) -> Settings:
-    """Fill in what the policy itself tells: its kind, its actions, its inputs, its cameras' sizes.
+    """Fill in what the policy's folder states: its kind, its actions, its inputs, its cameras' sizes.
 
     Args:
         policy: Folder of the policy.

@@ -166,7 +166,7 @@ class Turns:
 
 @dataclass(frozen=True, kw_only=True)
 class TakenOver:
-    """What a recording tells of its corrections.
+    """The corrections in a recording.
 
     Attributes:
         reasons: Why the expert took over, each time.

@@ -48,13 +48,13 @@ class Rehearsal:
         session.reset()
         for command in commands:
             session.step(command)
-        seen, said = [session.observation], [world.hold()]
+        seen, actions = [session.observation], [world.hold()]
         for step in _steps(world, episode, is_start=not commands):
             seen.append(session.observation)
-            said.append(step.action)
+            actions.append(step.action)
             session.step(step.action)
-        self._actions = said
-        self._wanted = np.array([action.base_from_tcp_target.position for action in said])  # (T, 3)
+        self._actions = actions
+        self._wanted = np.array([action.base_from_tcp_target.position for action in actions])  # (T, 3)
         self._places = np.array([_place(observation) for observation in seen])  # (T, 4)
         self._objects = {
             name: np.array([observation.object_poses[name].position for observation in seen])  # (T, 3)

@@ -126,10 +126,10 @@ class Statements:
         place = self._places[row]
         if place < 0:
             bits = self._bits[row]
-            said = bits.values
-            if said is None or not len(said):
-                return None if said is None else []
-            key = said[len(said) - 1], bits  # Arrow's hash of a list is that of its length
+            statements = bits.values
+            if statements is None or not len(statements):
+                return None if statements is None else []
+            key = statements[len(statements) - 1], bits  # Arrow's hash of a list is that of its length
             if key not in self._known:
                 found = self._read(row)
                 if found is None:
@@ -146,15 +146,17 @@ class Statements:
 
     def _read(self, row: int) -> list[Statement] | None:
         """None where a value is more than text or a number."""
-        said = self._lists[row].values
-        values = said.flatten()
-        if said.null_count or not all(map(_is_plain, values)):
+        statements = self._lists[row].values
+        values = statements.flatten()
+        if statements.null_count or not all(map(_is_plain, values)):
             return None
         columns = [
-            [None] * len(said) if array.null_count == len(said) else array.to_numpy(zero_copy_only=False).tolist()
+            [None] * len(statements)
+            if array.null_count == len(statements)
+            else array.to_numpy(zero_copy_only=False).tolist()
             for array in values
         ]
-        fields = [field.name for field in said.type]
+        fields = [field.name for field in statements.type]
         return [dict(zip(fields, statement, strict=True)) for statement in zip(*columns, strict=True)]
 
 
@@ -169,10 +171,10 @@ def _as_bits(lists: pa.ListArray) -> pa.ListArray:
     """The same with the bits of its numbers, so that 0.0 is not -0.0 and NaN is NaN."""
     if lists.null_count:  # Arrow takes no mask beside offsets that begin within an array
         lists = lists.take(pa.array(range(len(lists))))
-    said = lists.values
-    values = [array.view(_BITS[array.type]) if array.type in _BITS else array for array in said.flatten()]
-    names = [field.name for field in said.type]
-    alike = pa.StructArray.from_arrays(values, names, mask=said.is_null() if said.null_count else None)
+    statements = lists.values
+    values = [array.view(_BITS[array.type]) if array.type in _BITS else array for array in statements.flatten()]
+    names = [field.name for field in statements.type]
+    alike = pa.StructArray.from_arrays(values, names, mask=statements.is_null() if statements.null_count else None)
     return pa.ListArray.from_arrays(lists.offsets, alike, mask=lists.is_null() if lists.null_count else None)
 
 

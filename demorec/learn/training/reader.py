@@ -311,7 +311,7 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
         **kwargs: As of `LeRobotDataset`.
 
     Raises:
-        ConfigError: Only the expert's frames are wanted, and the dataset does not tell which these are.
+        ConfigError: Only the expert's frames are wanted, and the dataset does not state which these are.
     """
 
     _frame_cache_bytes = DEFAULT_CACHE_BYTES
@@ -325,7 +325,7 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
         super().__init__(*args, **kwargs)
         if expert_only and INTERVENTION not in self.meta.features:
             raise ConfigError(
-                f"The dataset does not tell which frames are the expert's: export it with --intervention: {self.root}"
+                f"The dataset does not state which frames are the expert's: export it with --intervention: {self.root}"
             )
 
     def __getitems__(self, indices: Sequence[int]) -> list[Item]:

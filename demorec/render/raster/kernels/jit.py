@@ -13,6 +13,7 @@ import numba
 import numpy as np
 
 from demorec.core.cache import cache_folder
+from demorec.core.compiled import njit
 
 # Only flags that change no finite result: images are equal whatever vector width a CPU has. `contract`, `arcp` and
 # `reassoc` are left out on purpose.
@@ -43,7 +44,7 @@ def _compile(function: Callable[..., Any], **options: Any) -> Any:
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(compiled_folder())
     try:
-        return numba.njit(cache=True, fastmath=_FLAGS, error_model="numpy", **options)(function)
+        return njit(cache=True, fastmath=_FLAGS, error_model="numpy", **options)(function)
     finally:
         numba.config.CACHE_DIR = before
 

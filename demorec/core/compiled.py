@@ -1,0 +1,28 @@
+"""Numba's compiler for the modules of kernels, without the SciPy that it would load with the first kernel.
+
+Numba imports SciPy's linear algebra (0.1 CPU s, 16 MB) to know whether np.convolve and np.correlate may use BLAS. No
+kernel here calls them, and without it they add products up themselves. np.dot and np.linalg ask again when they are
+compiled.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numba
+from numba.np import linalg
+
+njit: Any = numba.njit
+
+
+def _has_no_blas() -> None:
+    raise ImportError("not looked for")
+
+
+if "scipy.linalg" not in sys.modules:
+    _ensure_blas, linalg.ensure_blas = linalg.ensure_blas, _has_no_blas
+    try:
+        import numba.np.arraymath
+    finally:
+        linalg.ensure_blas = _ensure_blas
