@@ -20,7 +20,7 @@ def _has_no_blas() -> None:
     raise ImportError("not looked for")
 
 
-if "scipy.linalg" not in sys.modules:
+if "scipy.linalg" not in sys.modules and hasattr(linalg, "ensure_blas"):  # a private name: other versions may lack it
     _ensure_blas, linalg.ensure_blas = linalg.ensure_blas, _has_no_blas
     try:
         import numba.np.arraymath
