@@ -14,7 +14,8 @@ from demorec.robots.robot import RobotSpec
 from demorec.tasks.sampling import Sampler
 
 TABLE_HEIGHT = 0.62
-WALL_HEIGHT = 3.0
+WALL_HEIGHT = 1.6
+"""Of what stands around the table, metres: the sun of `--variation full` comes over it."""
 MARK_THICKNESS = 0.001
 
 COLORS: Mapping[str, Rgba] = {
