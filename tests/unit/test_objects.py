@@ -302,13 +302,19 @@ def test_what_may_lie_at_any_yaw_can_be_put_down_all_around_from_the_present_yaw
         np.testing.assert_allclose((place @ hand.inverse() @ pose).position, wanted.position, atol=1e-9)
 
 
-def test_tasks_with_things_of_their_own_refuse_shelves() -> None:
+def test_tasks_with_things_of_their_own_refuse_shelves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ConfigError, match="--objects was given"):
         episode(task="stack", objects=("blocks",))
     with pytest.raises(ConfigError, match="--object-split was given"):
         episode(task="stack", object_split="train")
     with pytest.raises(ConfigError, match=r"Unknown shelf 'houshold'.*household"):
         episode(task="pick_anything", objects=("houshold",))
+    (tmp_path / "config.json").write_text('{"type": "act", "input_features": {}}')
+    words = ("evaluate", "--policy", tmp_path, "--action", "joint", "--workers", "1", "--out", tmp_path / "out")
+    assert exit_code(*words, "--object-split", "eval") == 1
+    assert "--object-split was given, but the task 'pick_place'" in capsys.readouterr().err
+    assert exit_code(*words, "--task", "pick_anything", "--objects", "houshold") == 2
+    assert "Unknown shelf 'houshold'" in capsys.readouterr().err
 
 
 def export(mesh: trimesh.Trimesh, path: Path) -> Path:
