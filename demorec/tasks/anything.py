@@ -35,8 +35,8 @@ MASSES = (0.01, 0.2)
 """Limits, kg: lighter things take too many iterations (see below), heavier ones slip."""
 _PUSH = 200.0
 """Acceleration, m/s^2, with which one finger's force would push a thing away, up to which 50 iterations of the solver
-find the forces between two fingers; faster ones take so many times more. With 50 a vase of 40 g was sunk into by
-1.9 mm, so by 0.3; the fingers' stiffness alone gives 0.2."""
+find the forces between two fingers; faster ones take so many times more. With 50, vases of 40 g were sunk into by up to
+2.7 mm, so by 0.7; the fingers' stiffness alone gives 0.2."""
 TINTS = (0.6, 0.85)
 """Of the darker colour of a thing's texture."""
 DRAWS = 50

@@ -55,7 +55,7 @@ def table_and_floor() -> tuple[Body, Body]:
 
 
 def walls() -> tuple[Body, Body, Body]:
-    """Behind the table, out of the arm's reach, and at both sides; named "wall..."."""
+    """Behind the table and at both sides, out of the arm's reach, only seen; named "wall..."."""
     places = {
         "wall_back": (-1.3, 0.0, 0.0),
         "wall_left": (0.7, 1.5, -math.pi / 2),
@@ -68,6 +68,7 @@ def walls() -> tuple[Body, Body, Body]:
             shape=Shape(kind="box", size=(0.02, 4.0, WALL_HEIGHT)),
             world_from_body=Pose.from_yaw((x, y, WALL_HEIGHT / 2 - TABLE_HEIGHT), yaw),
             rgba=(0.70, 0.74, 0.76, 1.0),
+            collides=False,
         )
         for name, (x, y, yaw) in places.items()
     )
