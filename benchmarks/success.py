@@ -59,6 +59,8 @@ def measure(config: GenerateConfig, *, first: int, episodes: int) -> dict[str, A
         "first_try": sum(outcome.num_retries == 0 for outcome in successes),
         "failures": dict(Counter(f"{o.failure_phase}: {o.failure_reason}" for o in done if not o.success)),
         "failed_episodes": {index: things[index] for index, outcome in outcomes.items() if not outcome.success},
+        "not_at_first": {index: things[index] for index, outcome in outcomes.items() if outcome.num_retries},
+        "of_kind": dict(Counter(name.rpartition("_")[2] for name in things.values())),
         "no_layout": unplaceable,
         "frames": sum(outcome.num_frames for outcome in done) / max(1, len(done)),
         "distance_mm": [1000 * distances[round(q * (len(distances) - 1))] for q in (0.5, 0.95, 1.0)]
@@ -113,6 +115,8 @@ def main() -> None:
                     print(f"    {count} x {reason}")
                 if row["failed_episodes"] or row["no_layout"]:
                     print(f"    failed episodes {row['failed_episodes']}, no layout {row['no_layout']}")
+                if args.objects:
+                    print(f"    not at the first try {row['not_at_first']}, episodes of each kind {row['of_kind']}")
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1))
 

@@ -34,6 +34,10 @@ class RolloutFlags:
     """A name from `demorec list tasks`, or my_package.my_module:MyTask."""
     robot: str = "panda"
     """A name from `demorec list robots`, or my_package.my_module:MY_ARM."""
+    objects: tuple[str, ...] = ()
+    """Shelves that the task draws from, as in generate-dataset."""
+    object_split: Split = "all"
+    """Which shapes of the shelves: eval has those that generate-dataset --object-split train leaves out."""
     cameras: tuple[str, ...] = ()
     """Cameras of your own that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
     num_episodes: int = 50
@@ -104,6 +108,8 @@ class RolloutFlags:
         return GenerateConfig(
             task=self.task,
             robot=self.robot,
+            objects=self.objects,
+            object_split=self.object_split,
             split=self.split,
             seed=self.seed,
             fps=self.fps,
@@ -156,7 +162,7 @@ class Evaluate(RolloutFlags):
 
         a, b = load_evaluation(first), load_evaluation(second)
         scenes_a, scenes_b = a.settings.config, b.settings.config
-        for name in ("task", "robot", "split", "seed", "variation"):
+        for name in ("task", "robot", "objects", "object_split", "split", "seed", "variation"):
             there, here = getattr(scenes_a, name), getattr(scenes_b, name)
             if there != here:
                 raise ConfigError(f"The two evaluations did not use the same scenes: {name} is {there} and {here}.")

@@ -79,20 +79,37 @@ class SolidMesh:
         return self.moved(np.eye(3), -self.mass_properties()[1])
 
     def surface_obj(self) -> str:
-        """The surface as an OBJ file."""
-        return _obj(self.points, [("surface", self.faces)])
+        """The surface as an OBJ file, its texture coordinates those of `box_projection`."""
+        coordinates, corners = np.unique(self.box_projection().reshape(-1, 2), axis=0, return_inverse=True)
+        corners = np.stack([self.faces, corners.reshape(self.faces.shape)], axis=2).reshape(-1, 6) + 1
+        lines = [*_vertices(self.points), *(f"vt {u:.4f} {v:.4f}" for u, v in coordinates.tolist())]
+        lines += ["o surface", *("f {}/{} {}/{} {}/{}".format(*row) for row in corners.tolist())]
+        return "\n".join(lines) + "\n"
+
+    def box_projection(self) -> Array:
+        """(F, 3, 2) texture coordinates 0..1 of the faces' corners: each face seen along the axis that it faces most.
+
+        The texture is as wide as the solid's longest side and, on what faces sideways, upright.
+        """
+        corners = self.points[self.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        facing = np.argmax(np.abs(normals) * (1.001, 1.0, 1.0), axis=1)  # at 45 degrees all to the same side
+        low = corners.min(axis=(0, 1))
+        across = np.array([[1, 2], [0, 2], [0, 1]])[facing]  # (F, 2)
+        seen = np.take_along_axis(corners - low, across[:, np.newaxis], axis=2)
+        return np.asarray(np.round(seen / self.extents.max(), 4))
 
     def parts_obj(self) -> str:
         """The convex parts as an OBJ file of one object each, of which only the points count."""
-        fans = [np.stack([np.roll(part, -shift) for shift in range(3)], axis=1) for part in self.parts]
-        return _obj(self.points, [(f"part_{number}", fan) for number, fan in enumerate(fans)])
+        lines = _vertices(self.points)
+        for number, part in enumerate(self.parts):
+            fan = np.stack([np.roll(part, -shift) for shift in range(3)], axis=1)
+            lines += [f"o part_{number}", *(f"f {a} {b} {c}" for a, b, c in (fan + 1).tolist())]
+        return "\n".join(lines) + "\n"
 
 
-def _obj(points: Array, objects: list[tuple[str, NDArray[np.int64]]]) -> str:
-    lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in points.tolist()]
-    for name, faces in objects:
-        lines += [f"o {name}", *(f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist())]
-    return "\n".join(lines) + "\n"
+def _vertices(points: Array) -> list[str]:
+    return [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in points.tolist()]
 
 
 def encode_mesh(mesh: SolidMesh) -> str:

@@ -69,6 +69,9 @@ class Shape:
 leave_out_defaults(Shape, "mesh")
 
 
+Pattern = Literal["plain", "checker", "stripes", "noise", "wood"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Texture:
     """A procedural texture, a pure function of its fields: nothing is downloaded.
@@ -80,7 +83,7 @@ class Texture:
         seed: Of the pattern's noise.
     """
 
-    pattern: Literal["plain", "checker", "stripes", "noise", "wood"]
+    pattern: Pattern
     colors: tuple[Vector3, Vector3]
     scale: float = 4.0
     seed: int = 0
@@ -101,7 +104,7 @@ class Body:
         linear_damping, angular_damping: 1/s.
         rgba: Colour; (1, 1, 1, 1) leaves a URDF's or mesh file's own.
         color_name: The word for it in instructions, or "".
-        texture: Procedural texture, or None.
+        texture: Procedural texture, by which the colour is multiplied, or None.
         collides: False for a mark that is only seen.
         yaw_symmetry: n when it looks the same every 2 pi / n about its vertical axis; 0 when at every angle.
     """
@@ -127,6 +130,15 @@ class Body:
     def movable(self) -> bool:
         """Whether physics can move it."""
         return self.mass > 0 and self.collides
+
+    @property
+    def mean_color(self) -> Rgba:
+        """`rgba`, times the mean of the texture's two colours."""
+        if self.texture is None:
+            return self.rgba
+        first, second = self.texture.colors
+        red, green, blue = (own * (a + b) / 2 for own, a, b in zip(self.rgba, first, second, strict=False))
+        return red, green, blue, self.rgba[3]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +188,7 @@ class Physics:
     Attributes:
         hz: Steps a second.
         solver_iterations: Of each step, at most.
+        grip_iterations: The same of steps while a finger touches something; 0 for as many as of the others.
         gravity: m/s^2.
         contact_breaking_threshold: How far two bodies may move along each other until Bullet forgets a contact point
             that it found before, as a share of the smaller one's radius.
@@ -188,9 +201,10 @@ class Physics:
     gravity: Vector3 = (0.0, 0.0, -9.81)
     contact_breaking_threshold: float = 0.02
     finger_stiffness: float = 30_000.0
+    grip_iterations: int = 0
 
 
-leave_out_defaults(Physics, "contact_breaking_threshold", "finger_stiffness")
+leave_out_defaults(Physics, "contact_breaking_threshold", "finger_stiffness", "grip_iterations")
 
 CONTACT_BREAKING_THRESHOLD = 0.05
 """Of new episodes; recordings that do not say it have 0.02. With that, a small, light, slippery cube could rock between

@@ -98,6 +98,7 @@ def _scene(scene: Scene) -> Iterator[str]:
     yield from _positive("scale of the robot", scene.robot.scale)
     yield from _within("hz of the physics", scene.physics.hz, 1, 100_000)
     yield from _within("solver_iterations", scene.physics.solver_iterations, 1, 10_000)
+    yield from _within("grip_iterations", scene.physics.grip_iterations, 0, 10_000)
     yield from _positive("contact_breaking_threshold", scene.physics.contact_breaking_threshold)
     yield from _within("finger_stiffness", scene.physics.finger_stiffness, 1, 1e9)
     for body in scene.bodies:

@@ -74,12 +74,8 @@ def body_description(body: Body) -> str:
     """A URDF of one link, named like the body."""
     robot = ET.Element("robot", name=body.name)
     link = ET.SubElement(robot, "link", name=body.name)
-    rgba = body.rgba
-    if body.texture is not None:
-        first, second = body.texture.colors
-        rgba = (*((a + b) / 2 for a, b in zip(first, second, strict=True)), 1.0)  # type: ignore[assignment]
     for primitive, pose in _body_primitives(body):
-        _add_visual(link, primitive, pose, rgba)
+        _add_visual(link, primitive, pose, body.mean_color)
     return _text(robot)
 
 

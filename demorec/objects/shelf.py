@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from demorec.episode.mesh import SolidMesh
+from demorec.episode.scene import Pattern
 
 Split = Literal["all", "train", "eval"]
 HELD_OUT = 5
@@ -18,25 +19,27 @@ HELD_OUT = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """How heavy and how slippery.
+    """How heavy and how slippery, and what it looks like.
 
     Attributes:
         density: (low, high) kg/m^3 of the whole solid, what is in a tin or a bottle included.
         friction: (low, high) lateral coefficient.
+        patterns: Of its textures, one of which a thing gets.
     """
 
     density: tuple[float, float]
     friction: tuple[float, float]
+    patterns: tuple[Pattern, ...]
 
 
 MATERIALS: Mapping[str, Material] = {
-    "ceramic": Material(density=(1500.0, 2200.0), friction=(0.5, 0.9)),
-    "glass": Material(density=(2200.0, 2600.0), friction=(0.5, 0.9)),
-    "metal": Material(density=(500.0, 1100.0), friction=(0.5, 0.8)),
-    "plastic": Material(density=(300.0, 900.0), friction=(0.5, 0.9)),
-    "carton": Material(density=(200.0, 600.0), friction=(0.5, 0.9)),
-    "fruit": Material(density=(700.0, 1000.0), friction=(0.6, 1.0)),
-    "wood": Material(density=(400.0, 800.0), friction=(0.5, 1.0)),
+    "ceramic": Material(density=(1500.0, 2200.0), friction=(0.5, 0.9), patterns=("plain", "stripes", "noise")),
+    "glass": Material(density=(2200.0, 2600.0), friction=(0.5, 0.9), patterns=("plain",)),
+    "metal": Material(density=(500.0, 1100.0), friction=(0.5, 0.8), patterns=("plain", "stripes", "checker")),
+    "plastic": Material(density=(300.0, 900.0), friction=(0.5, 0.9), patterns=("plain", "stripes", "checker")),
+    "carton": Material(density=(200.0, 600.0), friction=(0.5, 0.9), patterns=("stripes", "checker", "noise")),
+    "fruit": Material(density=(700.0, 1000.0), friction=(0.6, 1.0), patterns=("noise",)),
+    "wood": Material(density=(400.0, 800.0), friction=(0.5, 1.0), patterns=("wood",)),
 }
 
 

@@ -86,6 +86,7 @@ class World:
         self._shape_rows, self._visuals = (), ()
         self.client.resetSimulation()
         set_engine(self.client, scene.physics)
+        self._iterations = scene.physics.solver_iterations
         self._bodies: dict[str, int] = {}
         self._specs: dict[str, Body] = {body.name: body for body in scene.bodies}
         for body in scene.fixed:
@@ -117,6 +118,7 @@ class World:
         samples = []
         for substep in range(1, self._substeps + 1):
             self.arm.drive(start + (end - start) * (substep / self._substeps))
+            self._set_iterations()
             self.client.stepSimulation()
             if self._sample_joints and substep < self._substeps:
                 position, velocity, effort = self.arm.joint_states()
@@ -131,6 +133,20 @@ class World:
         self._steps += 1
         self.joint_samples = tuple(samples)
         self.arm.target = end.copy()
+
+    def _set_iterations(self) -> None:
+        """More of them for what the fingers hold: as few as suffice for all else would leave them deep in light things.
+
+        Bullet finds contacts before bodies touch, so that the last step's are in time.
+        """
+        physics = self.scene.physics
+        if not physics.grip_iterations:
+            return
+        contacts = (self.client.getContactPoints(self.arm.body, -1, link) for link in self.arm.finger_links)
+        wanted = physics.grip_iterations if any(contacts) else physics.solver_iterations
+        if wanted != self._iterations:
+            self.client.setPhysicsEngineParameter(numSolverIterations=wanted)
+            self._iterations = wanted
 
     def observe(self) -> Observation:
         """All that is sensed now."""

@@ -12,13 +12,13 @@ from demorec.annotate.situation import CONTAINERS
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
 from demorec.episode.mesh import decode_mesh, encode_mesh
-from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape
-from demorec.objects.shelf import MATERIALS, Kind
+from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape, Texture
+from demorec.objects.shelf import MATERIALS, Kind, Material
 from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
 from demorec.sim.parts import with_parts
 from demorec.sim.resting import ROLLING_FRICTION, at_rest
-from demorec.tasks.furniture import COLORS, mark, words_for
+from demorec.tasks.furniture import COLORS, mark, walls, words_for
 from demorec.tasks.grasping import found_grasps
 from demorec.tasks.placing import Layout, TableTask
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
@@ -35,8 +35,10 @@ MASSES = (0.01, 0.2)
 """Limits, kg: lighter things take too many iterations (see below), heavier ones slip."""
 _PUSH = 200.0
 """Acceleration, m/s^2, with which one finger's force would push a thing away, up to which 50 iterations of the solver
-find the forces between two fingers; faster ones take so many times more. With 50 a vase of 40 g was sunk into by
-1.9 mm, so by 0.3; the fingers' stiffness alone gives 0.2."""
+find the forces between two fingers; faster ones take so many times more. With 50, vases of 40 g were sunk into by up to
+2.7 mm, so by 0.7; the fingers' stiffness alone gives 0.2."""
+TINTS = (0.6, 0.85)
+"""Of the darker colour of a thing's texture."""
 DRAWS = 50
 """Of a thing until one rests on a table and can be grasped."""
 NEUTRAL_COLORS: Mapping[str, Rgba] = {"grey": (0.5, 0.5, 0.51, 1.0), "black": (0.15, 0.15, 0.16, 1.0)}
@@ -101,8 +103,8 @@ class PickAnything(TableTask):
         wanted = scene.body(scene.goals[0].object)
         force = float(robot.gripper.contact_force(np.array(min(wanted.shape.extents)))) / 2
         times = max(1.0, force / wanted.mass / _PUSH)
-        physics = replace(scene.physics, solver_iterations=round(times * scene.physics.solver_iterations))
-        return replace(scene, physics=physics)
+        physics = replace(scene.physics, grip_iterations=round(times * scene.physics.solver_iterations))
+        return replace(scene, bodies=(*scene.bodies, *walls()), physics=physics)
 
     def layout(self, sampler: Sampler) -> Layout:
         """Draw it."""
@@ -204,6 +206,20 @@ def make_object(sampler: Sampler, kind: Kind, number: int, color_name: str) -> B
         rgba=_ALL_COLORS[color_name],
         color_name=color_name,
         yaw_symmetry=kind.yaw_symmetry,
+        texture=_texture(sampler, material),
+    )
+
+
+def _texture(sampler: Sampler, material: Material) -> Texture | None:
+    """Tints of the thing's own colour, so that its word stays true; None where it is plain."""
+    pattern, tint = sampler.choice(material.patterns), sampler.uniform(*TINTS)
+    if pattern == "plain":
+        return None
+    return Texture(
+        pattern=pattern,
+        colors=((1.0, 1.0, 1.0), (tint, tint, tint)),
+        scale=float(sampler.rng.integers(4, 13)),
+        seed=int(sampler.rng.integers(2**31)),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from demorec.robots.robot import RobotSpec
 from demorec.tasks.sampling import Sampler
 
 TABLE_HEIGHT = 0.62
+WALL_HEIGHT = 1.6
+"""Of what stands around the table, metres: the sun of `--variation full` comes over it."""
 MARK_THICKNESS = 0.001
 
 COLORS: Mapping[str, Rgba] = {
@@ -49,6 +52,27 @@ def table_and_floor() -> tuple[Body, Body]:
         rgba=(0.80, 0.70, 0.57, 1.0),
     )
     return floor(-TABLE_HEIGHT), table
+
+
+def walls() -> tuple[Body, Body, Body]:
+    """Behind the table and at both sides, out of the arm's reach, only seen; named "wall..."."""
+    places = {
+        "wall_back": (-1.3, 0.0, 0.0),
+        "wall_left": (0.7, 1.5, -math.pi / 2),
+        "wall_right": (0.7, -1.5, math.pi / 2),
+    }
+    back, left, right = (
+        Body(
+            name=name,
+            role="fixture",
+            shape=Shape(kind="box", size=(0.02, 4.0, WALL_HEIGHT)),
+            world_from_body=Pose.from_yaw((x, y, WALL_HEIGHT / 2 - TABLE_HEIGHT), yaw),
+            rgba=(0.70, 0.74, 0.76, 1.0),
+            collides=False,
+        )
+        for name, (x, y, yaw) in places.items()
+    )
+    return back, left, right
 
 
 def mark(name: str, point: tuple[float, float], yaw: float, *, side: float, color_name: str) -> Body:

@@ -150,7 +150,7 @@ def vary_looks(scene: Scene, ranges: Ranges, rng: np.random.Generator) -> Scene:
             shade = 1.0 + ranges.number("object_shade") * float(rng.uniform(-1.0, 1.0))
             red, green, blue, alpha = body.rgba
             body = replace(body, rgba=(min(1.0, shade * red), min(1.0, shade * green), min(1.0, shade * blue), alpha))
-        elif body.name in ("table", "floor"):
+        elif body.name in ("table", "floor") or body.name.startswith("wall"):
             body = _other_surface(body, ranges, rng)
         bodies.append(body)
     return replace(scene, bodies=tuple(bodies), light=_other_light(scene.light, ranges, rng))

@@ -60,10 +60,7 @@ def log_bodies(
 def _visible(body: Body, episode: PlayedEpisode, tint: Rgba | None) -> rr.Mesh3D:
     if body.shape.kind == "box" and body.texture is not None:
         return _textured_box(np.array(body.shape.size), body.texture)
-    color = body.rgba
-    if body.texture is not None:
-        first, second = body.texture.colors
-        color = (*((a + b) / 2 for a, b in zip(first, second, strict=True)), 1.0)  # type: ignore[assignment]
+    color = body.mean_color
     if body.shape.kind not in ("mesh", "urdf"):
         return as_mesh3d(_primitive_mesh(body.shape).placed(Pose(), np.ones(3), color), tint)
     mesh = _installed_mesh(body.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import colorsys
 import math
 from collections import Counter
 from dataclasses import replace
@@ -13,11 +14,12 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 from support.commands import exit_code
+from support.present import present
 from support.sim import body_index, episode, run
 
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Pose
-from demorec.core.tables import OBJECTS
+from demorec.core.tables import OBJECTS, RENDERERS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.episode.variation import Ranges
 from demorec.loop import ScriptAgent, Session, make_world
@@ -25,6 +27,7 @@ from demorec.objects.antipodal import Hand, antipodal_grasps
 from demorec.objects.folder import load_shelf, on_steadiest_side, read_solid
 from demorec.objects.shelf import Kind
 from demorec.objects.solids import dish
+from demorec.render.painter import Painter
 from demorec.robots.assets import data_folder
 from demorec.sim.parts import with_parts
 from demorec.sim.resting import at_rest
@@ -221,7 +224,7 @@ def test_fingers_sink_into_a_light_thing_no_deeper_than_their_stiffness_gives() 
         if made.info.scene.body(made.info.scene.goals[0].object).mass < 0.022
     )
     scene = made.info.scene
-    few = replace(scene, physics=replace(scene.physics, solver_iterations=50))
+    few = replace(scene, physics=replace(scene.physics, grip_iterations=0))
     deepest, reason = {}, {}
     for each in (scene, few):
         prepared = replace(made, info=made.info.with_simulation(scene=each))
@@ -234,6 +237,39 @@ def test_fingers_sink_into_a_light_thing_no_deeper_than_their_stiffness_gives() 
     assert deepest[False] == pytest.approx(20.0 / 120e3, abs=1e-4)
     assert deepest[True] > 1e-3
     assert (reason[False], reason[True]) == ("", "crush")
+
+
+def test_things_wear_the_texture_of_their_material_in_tints_of_their_colour() -> None:
+    worn: dict[str, set[str]] = {}
+    for number in range(40):
+        for body in episode(number, task="pick_anything").info.scene.movable:
+            worn.setdefault(body.name.partition("_")[2], set()).add(body.texture.pattern if body.texture else "plain")
+            hues = [colorsys.rgb_to_hsv(*color[:3])[:2] for color in (body.rgba, body.mean_color)]
+            assert hues[0] == pytest.approx(hues[1])
+    assert worn["cube"] == worn["arch"] == {"wood"}
+    assert worn["apple"] == {"noise"}
+    assert worn["glass"] == {"plain"}
+    assert len(worn["mug"] | worn["can"]) >= 3
+
+
+def test_a_room_stands_around_the_table_and_other_tasks_have_none() -> None:
+    made = episode(0, task="pick_anything", variation="full", width=160, height=120, cameras=("front",))
+    scene, (camera,) = made.info.scene, made.info.scene.cameras
+    walls = [body for body in scene.bodies if body.name.startswith("wall")]
+    assert len({body.texture or body.rgba for body in walls}) == 3
+    with make_world(made.info) as world, RENDERERS.load("raster")() as renderer:
+        world.reset(scene)
+        painter = Painter(renderer, scene.cameras, depth=True, segmentation=True)
+        painter.setup(world)
+        seen = painter.images()[camera.name]
+        assert (present(seen.segmentation) >= 0).all()  # no sky is left
+        assert body_index(world, "wall_back") in present(seen.segmentation)
+        farthest = float(present(seen.depth).max())
+        # Nothing that the arm could reach: the walls are farther from its base than it is long.
+        for body in walls:
+            closest = np.abs(body.world_from_body.inverse().position)[0] - 0.01
+            assert 1.2 < closest < farthest
+    assert not [body for body in episode(0, task="pick_place").info.scene.bodies if body.name.startswith("wall")]
 
 
 def test_a_dish_is_hollow_for_physics_too() -> None:
@@ -266,13 +302,19 @@ def test_what_may_lie_at_any_yaw_can_be_put_down_all_around_from_the_present_yaw
         np.testing.assert_allclose((place @ hand.inverse() @ pose).position, wanted.position, atol=1e-9)
 
 
-def test_tasks_with_things_of_their_own_refuse_shelves() -> None:
+def test_tasks_with_things_of_their_own_refuse_shelves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ConfigError, match="--objects was given"):
         episode(task="stack", objects=("blocks",))
     with pytest.raises(ConfigError, match="--object-split was given"):
         episode(task="stack", object_split="train")
     with pytest.raises(ConfigError, match=r"Unknown shelf 'houshold'.*household"):
         episode(task="pick_anything", objects=("houshold",))
+    (tmp_path / "config.json").write_text('{"type": "act", "input_features": {}}')
+    words = ("evaluate", "--policy", tmp_path, "--action", "joint", "--workers", "1", "--out", tmp_path / "out")
+    assert exit_code(*words, "--object-split", "eval") == 1
+    assert "--object-split was given, but the task 'pick_place'" in capsys.readouterr().err
+    assert exit_code(*words, "--task", "pick_anything", "--objects", "houshold") == 2
+    assert "Unknown shelf 'houshold'" in capsys.readouterr().err
 
 
 def export(mesh: trimesh.Trimesh, path: Path) -> Path:

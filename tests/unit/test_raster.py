@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from support import render as scenes
 from support.present import present
 
 from demorec.core.geometry import Pose, look_at
+from demorec.episode.mesh import SolidMesh
 from demorec.episode.scene import Light, Texture
 from demorec.render.painter import Painter
 from demorec.render.raster import RasterRenderer
@@ -119,6 +122,29 @@ def test_procedural_textures_are_drawn(client: Any) -> None:
     dark = (checked.color[top].max(-1) < 0.5 * plain.color[top].max(-1)).mean()
     assert abs(dark - 0.5) < 0.06
     assert texture_pixels(texture).mean() == pytest.approx(127.5, abs=1)
+
+
+def test_each_face_of_a_solid_wears_the_texture_as_seen_along_its_axis(client: Any, tmp_path: Path) -> None:
+    size = np.array([0.4, 0.3, 0.2])
+    box = trimesh.creation.box(extents=size)
+    solid = SolidMesh(points=np.array(box.vertices), faces=np.array(box.faces), parts=())
+    (tmp_path / "solid.obj").write_text(solid.surface_obj())
+    body = scenes.add(client, "mesh", (1.0, 1.0, 1.0), fileName=str(tmp_path / "solid.obj"), rgbaColor=[1, 1, 1, 1])
+    camera = scenes.camera(256, 256)
+    texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=8.0)
+    seen = image(client, camera, textures={body: texture}, antialias=False)
+    origin, direction = scenes.rays(camera, Pose())
+    depth = scenes.cast_box(size, origin, direction)
+    point = origin + np.where(np.isfinite(depth), depth, 0.0)[..., None] * direction
+    cells = (point + size / 2) / 0.4 * 8.0  # the texture is as wide as the longest side
+    faced = np.argmax(np.abs(point) / size, axis=-1)
+    for axis in range(3):
+        sides = [other for other in range(3) if other != axis]
+        inside = np.abs(cells - np.round(cells))[..., sides].min(axis=-1) > 0.15
+        shown = (faced == axis) & inside & (seen.segmentation == body)
+        assert shown.sum() > 300
+        dark = np.floor(cells)[..., sides].sum(axis=-1) % 2 == 0  # the first row of its pixels is above
+        assert np.array_equal(seen.color[shown].max(axis=-1) < 20, dark[shown])
 
 
 def test_distant_textures_turn_to_their_mean(client: Any) -> None:

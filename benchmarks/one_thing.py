@@ -1,0 +1,35 @@
+"""pick_anything with a single thing, whose poses and extents a policy can see as numbers: does it take unseen things?
+
+    cd benchmarks; flags="--task one_thing:OneThing --split train --object-split train --cameras none --no-export"
+    generate-dataset $flags --num-episodes 500 --out ../outputs/things
+    demorec export lerobot ../outputs/things --out ../outputs/things/policy_data --repo-id me/things --privileged \
+        --features observation.environment_state --action ee_delta
+    demorec train --config_path=../examples/act_numbers.json --dataset.root=../outputs/things/policy_data \
+        --dataset.repo_id=me/things --steps=5000 --scheduler.num_decay_steps=5000 --output_dir=../outputs/act_things
+    for split in train eval; do demorec evaluate --policy ../outputs/act_things --task one_thing:OneThing \
+        --object-split $split --num-episodes 100 --allow one_thing --out ../outputs/on_$split; done
+
+Both evaluations put the thing where no demonstration had it, `eval` shapes that none had either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from demorec.tasks.anything import PickAnything
+from demorec.tasks.placing import Layout
+from demorec.tasks.sampling import Sampler
+
+
+class OneThing(PickAnything):
+    """As `PickAnything`, without anything else on the table; the thing is called "thing".
+
+    Its yaw is told up to half a turn, which is all that two fingers care for.
+    """
+
+    summary = "a single thing to a mark, a tray, a bowl or a plate"
+
+    def layout(self, sampler: Sampler) -> Layout:
+        """Draw it."""
+        (target, wanted, *_), (goal,) = super().layout(sampler)
+        return [target, replace(wanted, name="thing", color_name="", yaw_symmetry=2)], [replace(goal, object="thing")]
