@@ -16,6 +16,8 @@ from demorec.robots.urdf import UrdfShape, read_links
 
 NEAR = 0.002
 """Gap between a finger and an object, metres, from which on there is something to measure."""
+_PARALLEL = 1e-3
+"""Sine of the angle below which two edges are parallel."""
 _RING = 64
 """Corners of a cylinder's end: its outline is met within 30 micrometres at a radius of 25 mm."""
 
@@ -66,10 +68,24 @@ class Convex:
 def depth_in(a: Convex, world_from_a: Array, b: Convex, world_from_b: Array) -> Array:
     """(T,) how deep two bodies (poses (T, 4, 4)) are in each other, metres; negative: how far apart they are at least.
 
-    The shortest way out along one of their axes: exact where a face is involved, else a little more than the shortest
-    way of all.
+    The shortest way out along one of their axes or, where they are in each other, across two of their edges: exact for
+    boxes, else a little more than the shortest way of all.
     """
     axes = np.concatenate([world_from_a[:, :3, :3] @ a.axes, world_from_b[:, :3, :3] @ b.axes], axis=2)  # (T, 3, K)
+    depth = _overlap(a, world_from_a, b, world_from_b, axes)
+    rows = np.flatnonzero(depth > 0)
+    if len(rows):
+        of_a, of_b = np.split(axes[rows], [a.axes.shape[1]], axis=2)
+        across = np.cross(of_a[:, :, :, None], of_b[:, :, None, :], axis=1).reshape(len(rows), 3, -1)
+        length = np.linalg.norm(across, axis=1, keepdims=True)
+        # Of parallel edges the first axis again, which is known.
+        across = np.where(length > _PARALLEL, across / np.maximum(length, _PARALLEL), of_a[:, :, :1])
+        depth[rows] = np.minimum(depth[rows], _overlap(a, world_from_a[rows], b, world_from_b[rows], across))
+    return depth
+
+
+def _overlap(a: Convex, world_from_a: Array, b: Convex, world_from_b: Array, axes: Array) -> Array:
+    """(T,) the least overlap of two bodies along any of the axes (T, 3, K) of the world, metres."""
     low_a, high_a = _reach(a, world_from_a, axes)
     low_b, high_b = _reach(b, world_from_b, axes)
     return np.asarray(np.minimum(high_a - low_b, high_b - low_a).min(axis=1))

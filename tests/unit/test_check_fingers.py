@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -48,6 +49,19 @@ def test_a_pad_against_the_side_of_a_body(kind: ShapeKind, size: tuple[float, ..
     """`reach`: from the middle of the body to its side."""
     pad = at(y=reach + PAD.size[1] / 2 - deep)
     assert depth(PAD, pad, Shape(kind=kind, size=size), Pose()) == pytest.approx(deep, abs=1e-12)
+
+
+@pytest.mark.parametrize("deep", [-0.002, 0.001, 0.003])
+def test_an_edge_across_an_edge(deep: float) -> None:
+    """Each cube stands on an edge: they meet where the two edges cross."""
+    side, sine, cosine = 0.02, math.sin(math.pi / 8), math.cos(math.pi / 8)
+    cube = Shape(kind="box", size=(side, side, side))
+    below = Pose(quat_xyzw=np.array([sine, 0.0, 0.0, cosine]))  # by 45 degrees about x
+    above = Pose(
+        position=np.array([0.0, 0.0, math.sqrt(2) * side - deep]), quat_xyzw=np.array([0.0, sine, 0.0, cosine])
+    )
+    found = depth(cube, below, cube, above)
+    assert found == pytest.approx(deep, abs=1e-9) if deep > 0 else found <= 0
 
 
 @given(x=small, y=small, z=small, yaw=turn, far=turn, turned=turn)
