@@ -128,7 +128,7 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
 
 
 def _has_bfloat16(device: torch.device) -> bool:
-    """Whether a CPU computes with bfloat16 by itself: convolutions then take less than half of the time."""
+    """Whether a CPU computes with bfloat16 by itself: convolutions then take less than half the time."""
     return device.type == "cpu" and bool(torch.cpu._is_avx512_bf16_supported())
 
 
