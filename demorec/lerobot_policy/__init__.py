@@ -94,7 +94,9 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
             images: Of each camera, (B, 3, H, W) in [0, 1].
             state: (B, S).
         """
-        with torch.autocast(state.device.type, enabled=False):  # bfloat16 has 8 bits, too few for a place
+        # Places are computed in float32: bfloat16 has 8 bits. That maps have no more moves a place by little: between
+        # CPUs with and without it, the next keyframe by 0.02 mm in the median, 0.14 mm for 99 of 100 frames.
+        with torch.autocast(state.device.type, enabled=False):
             found = [self._keypoints(camera, image.float()) for camera, image in enumerate(images)]
             keypoints = torch.cat(found, dim=1)
             targets: torch.Tensor = self.targets(torch.cat([keypoints, self.normalized(state)], dim=1))
@@ -116,8 +118,7 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
     def _keypoints(self, camera: int, image: torch.Tensor) -> torch.Tensor:
         """(B, 3 K): expected x, expected y, and height, of the maps of one camera."""
         image = (image - self.image_mean[camera]) / self.image_std[camera]
-        is_faster = self.training and _has_bfloat16(image.device)
-        with torch.autocast(image.device.type, torch.bfloat16, enabled=is_faster):
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=_has_bfloat16(image.device)):
             maps = self.eyes[camera](image.contiguous(memory_format=torch.channels_last)).float()
         height, width = maps.shape[2:]
         weight = (maps.flatten(2) * self.temperature[camera].exp()[:, None]).softmax(2).unflatten(2, (height, width))
@@ -127,7 +128,7 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
 
 
 def _has_bfloat16(device: torch.device) -> bool:
-    """Whether a CPU computes with bfloat16 by itself: convolutions then learn in less than half of the time."""
+    """Whether a CPU computes with bfloat16 by itself: convolutions then take less than half the time."""
     return device.type == "cpu" and bool(torch.cpu._is_avx512_bf16_supported())
 
 

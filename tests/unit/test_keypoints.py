@@ -26,6 +26,28 @@ def test_a_keypoint_is_where_the_map_is_high() -> None:
     assert targets.shape == (1, 3)
 
 
+def test_a_place_is_the_same_in_any_batch_and_nearly_so_on_any_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Convolutions in bfloat16, where a CPU has it, move keypoints by a twentieth of a pixel, none by a whole one."""
+    import demorec.lerobot_policy as policy
+
+    torch.manual_seed(0)
+    encoder = policy.KeypointEncoder(num_cameras=1, state_dim=2, num_keypoints=16, channels=16, num_targets=3).eval()
+    torch.nn.init.constant_(encoder.temperature, 5.0)  # maps that point somewhere
+    image = torch.rand(32, 3, 12, 16).repeat_interleave(8, 2).repeat_interleave(8, 3)
+    found = {}
+    for has_bfloat16 in (False, True):
+        monkeypatch.setattr(policy, "_has_bfloat16", lambda device, has=has_bfloat16: has)
+        with torch.no_grad():
+            found[has_bfloat16] = encoder([image], torch.zeros(32, 2))[0]
+            alone = torch.cat([encoder([image[k : k + 1]], torch.zeros(1, 2))[0] for k in range(4)])
+        torch.testing.assert_close(alone, found[has_bfloat16][:4], rtol=0, atol=1e-3)
+    places = {has: keypoints[:, :32] for has, keypoints in found.items()}  # x and y of each map
+    assert places[False].std() > 0.01
+    moved, pixel = (places[True] - places[False]).abs(), 2 / image.shape[3]
+    assert 0 < moved.median() < pixel / 20
+    assert moved.max() < pixel
+
+
 class Policy:
     """Counts the frames that it encodes; what it makes of one depends on nothing else."""
 

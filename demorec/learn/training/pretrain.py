@@ -150,7 +150,8 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
         missing = f"an action {_OPENING}" if pose else f"{_TCP[0]} to {_TCP[-1]} in {_EE_POSE} or {_STATE}"
         raise ConfigError(
             f"The dataset does not tell where the hand will grasp, it lacks {missing}: demorec export lerobot "
-            f"--state joint_ee has both: {dataset.root}"
+            "--state joint_ee has both; of recordings from elsewhere, a mapping's `names` tell which numbers they are: "
+            f"{dataset.root}"
         )
     places = [_names(features[pose]).index(name) for name in _TCP]
     tcp = _column(dataset, pose)[:, places]
