@@ -217,6 +217,9 @@ def _peak_of_grip(episode: CheckedEpisode) -> Found:
     if rows.sum() < MIN_FRAMES or not (usual := float(np.median(force[rows]))):
         return NotMeasured(why="nothing is carried for long")
     peaks = np.where(rows, _peaks(force[:, None])[:, 0], 0.0)
+    motors = np.abs(episode.columns.joint_effort[:, episode.num_arm :]).sum(axis=1)
+    if at_work := float(np.median(motors[rows])):  # what pushes the fingers apart takes as much from both
+        peaks = np.maximum(peaks - usual / at_work * _peaks(motors[:, None])[:, 0], 0.0)
     # An arm that noise shakes has such peaks one after the other.
     around = np.max([np.roll(peaks, by) for by in (*range(-_AROUND, -1), *range(2, _AROUND + 1))], axis=0)
     return worst_frame(np.maximum(peaks - around, 0.0) / usual, "contact force")

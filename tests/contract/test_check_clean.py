@@ -39,6 +39,7 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
     [
         {"task": "pick_from_clutter", "robot": "iiwa", "fps": 60, "seed": 2026, "episode_index": 3},
         {"task": "stack", "fps": 15, "seed": 3603},
+        {"task": "line_up", "fps": 60, "seed": 4100},
         {"task": "stack", "robot": "iiwa", "variation": "full", "fps": 15, "seed": 3602},
     ],
     ids=str,
