@@ -196,14 +196,18 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     free = hand.dynamics.is_judged.copy()
     free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
     weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
-    off = np.hstack([hand.force - hand.loads_force, (hand.torque - hand.loads_torque) / _LEVER]) / weight
-    of_wrench = _peaks(off).max(axis=1)
+    measured = np.hstack([hand.force, hand.torque / _LEVER]) / weight
+    off = measured - np.hstack([hand.loads_force, hand.loads_torque / _LEVER]) / weight
+    grip = _GRIP[episode.info.robot.gripper.joint_kind] / weight * _peaks(episode.columns.contact_force[:, None])[:, 0]
+    # Of what was measured, not only of what is computed beside it; what shifts between the fingers shows, too.
+    of_wrench = np.maximum(np.minimum(_peaks(off), _peaks(measured)).max(axis=1) - grip, 0.0)
     of_motors, of_loaded = np.zeros((2, len(free)))
     for index, name in enumerate(episode.info.robot.arm_joints):
         joint = next(joint for joint in episode.urdf.joints if joint.name == name)
         torque = hand.dynamics.torque(joint)
         load = float(np.sqrt(np.median(torque[free] ** 2))) if free.any() else 0.0
-        peaks = _peaks((episode.columns.joint_effort[:, index] - torque)[:, None])[:, 0] / max(load, LEAST_LOAD)
+        effort = episode.columns.joint_effort[:, index]
+        peaks = _peaks(np.stack([effort - torque, effort], axis=1)).min(axis=1) / max(load, LEAST_LOAD)
         of_motors = np.maximum(of_motors, peaks)
         of_loaded = np.maximum(of_loaded, peaks * (load >= MIN_LOAD))
     yield worst_frame(np.where(free, np.maximum(of_wrench - of_motors, 0.0), 0.0), "wrench")
