@@ -46,6 +46,8 @@ _LATER_WEIGHT = 0.7
 """Of the errors after the first keyframe's, where the encoder's quality may be a little another one."""
 _WORST_SHARE = 0.3
 """Of its worst block's error an encoder may leave in any: at low quality a small thing's colour is lost, or is not."""
+_ONE_STEP = 4.0
+"""Levels by which a flat colour is off as a whole in an image of a little other quality."""
 _DEPTH_METRES = 0.004
 """Depth is stored in millimetres; another machine draws edges a little elsewhere."""
 
@@ -223,26 +225,27 @@ def _worst_color(sums: Array) -> tuple[float, int]:
 
     Over all images, and in each at half its weight: there the encoder's quality may be a little another one.
     """
-    each = _ratio(sums, sums[..., :1]) / 2
+    each = _ratio(sums, sums[..., :1], least=_ONE_STEP) / 2
     number = int(np.argmax(each))
     # What stands still is encoded alike in all of them: more images are no more blocks.
     most = sums[..., :1].max(axis=0, keepdims=True)
-    return max(float(_ratio(sums.sum(axis=0, keepdims=True), most)[0]), float(each[number])), number
+    return max(float(_ratio(sums.sum(axis=0, keepdims=True), most, least=1.0)[0]), float(each[number])), number
 
 
-def _ratio(sums: Array, different: Array) -> Array:
-    """(N,) of each image the largest of any colour, in units of the encoder's error, one level at least.
+def _ratio(sums: Array, different: Array, *, least: float) -> Array:
+    """(N,) of each image the largest of any colour, in units of the encoder's error.
 
     Args:
         sums: (N, 64, 7) as of `_worst_color`.
         different: (N, 64, 1) how many pixels of the colour are not those of another image once more.
+        least: Levels that the encoder's error counts at least.
     """
     pixels = np.maximum(sums[..., :1], 1)
     mean = np.abs(sums[..., 1:4]) / pixels
     own = np.sqrt(sums[..., 4:] / pixels)
     # Of a few blocks the encoder's errors do not cancel.
     weight = np.minimum(np.sqrt(different / _MANY_PIXELS), 1.0) * (different >= _LEAST_PIXELS)
-    return np.asarray((mean / np.maximum(own, 1.0) * weight).max(axis=(1, 2)))
+    return np.asarray((mean / np.maximum(own, least) * weight).max(axis=(1, 2)))
 
 
 def _error(off: Array, own: Array) -> float:
