@@ -52,6 +52,8 @@ _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
 """After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
+_LEAST_STROKE = 0.2
+"""Share of what a gripper can open by, below which its command only trembles."""
 _STILL_FRAMES = 19
 """Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
 
@@ -335,7 +337,8 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     if not steady.any():
         return NotMeasured(why="the gripper's command never lasts")
     gap = opening - command
-    is_open = command > (command.min() + command.max()) / 2
+    # Tasks may open a gripper by a part of what it can; a command that only trembles opens nothing.
+    is_open = command > command.min() + 0.5 * max(float(np.ptp(command)), _LEAST_STROKE * reach)
     holds = ~is_open
     if motion.contact is not None:
         holds = motion.contact > 0

@@ -109,9 +109,15 @@ def wrench_bears_the_hand(episode: CheckedEpisode) -> Found:
     lifted = {name: free & episode.is_carried(name, LIFTED_HEIGHT) for name in c.object_poses}
     empty = free & ~np.any([*lifted.values(), np.zeros_like(free)], axis=0)
     grips = {"nothing": empty, **lifted}
-    pressed = _GRIP[episode.info.robot.gripper.joint_kind] * c.contact_force
+    pressed = _left_of_grip(episode)
     found = [_unborne(hand, rows, pressed[rows], what) for what, rows in grips.items() if rows.sum() >= MIN_FRAMES]
     return worst(*found) or NotMeasured(why=f"the hand is free and moves smoothly in fewer than {MIN_FRAMES} frames")
+
+
+def _left_of_grip(episode: CheckedEpisode) -> Array:
+    """(T,) N of the fingers' force that count beside the weight; of an unknown kind of joint as of one that turns."""
+    share = _GRIP.get(episode.info.robot.gripper.joint_kind, _GRIP["revolute"])
+    return np.asarray(share * episode.columns.contact_force)
 
 
 def _unborne(hand: _Hand, rows: NDArray[np.bool_], grip: Array, what: str) -> Measurement:
@@ -198,7 +204,7 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
     measured = np.hstack([hand.force, hand.torque / _LEVER]) / weight
     off = measured - np.hstack([hand.loads_force, hand.loads_torque / _LEVER]) / weight
-    grip = _GRIP[episode.info.robot.gripper.joint_kind] / weight * _peaks(episode.columns.contact_force[:, None])[:, 0]
+    grip = _peaks(_left_of_grip(episode)[:, None])[:, 0] / weight
     # Of what was measured, not only of what is computed beside it; what shifts between the fingers shows, too.
     of_wrench = np.maximum(np.minimum(_peaks(off), _peaks(measured)).max(axis=1) - grip, 0.0)
     of_motors, of_loaded = np.zeros((2, len(free)))

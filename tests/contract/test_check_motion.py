@@ -297,6 +297,15 @@ def test_a_fault_of_a_strangers_hand_is_found(strange: Path, fault: str, tmp_pat
     assert level(spoilt, check) == "fail"
 
 
+def test_a_closed_command_that_trembles_opens_nothing(run: Path, tmp_path: Path) -> None:
+    """Episodes in which something was in the hand all the time, and keeps it from closing."""
+    held = tmp_path / "ds"
+    export_lerobot([run], held, ExportOptions(verify=False))
+    edit_column(held, ACTION, lambda rows: of_gripper(rows, lambda w: 1e-5 * (np.arange(len(w)) % 2)[:, None]))
+    edit_column(held, STATE, lambda rows: of_gripper(rows, lambda w: 0 * w + 0.04))
+    assert level(held, "gripper_follows") == "pass"
+
+
 def test_a_hand_in_the_frame_of_another_base_is_no_fault(strange: Path, tmp_path: Path) -> None:
     """As when the base is mounted upside down, and poses are those of a table's corner."""
 
