@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -211,10 +210,8 @@ def _goal_of(name: str, goals: Sequence[Goal], first: int) -> int | None:
 
 def _lies_at(goal: Goal, scene: Scene, columns: Columns) -> bool:
     """Whether the object is at its goal in the last frame, seen from above."""
-    onto = columns.object_poses.get(goal.onto)
-    if onto is not None:
-        wanted = Pose(position=onto[-1, :3], quat_xyzw=onto[-1, 3:]) @ goal.onto_from_goal
-    else:
-        wanted = scene.world_from_goal(goal)
-    found = columns.object_poses.get(goal.object)
-    return found is not None and math.dist(found[-1, :2].tolist(), wanted.position[:2].tolist()) <= _NEAR_ENOUGH
+    ends = {name: Pose(position=poses[-1, :3], quat_xyzw=poses[-1, 3:]) for name, poses in columns.object_poses.items()}
+    if goal.object not in ends:
+        return False
+    onto = ends[goal.onto] if goal.onto in ends else scene.body(goal.onto).world_from_body if goal.onto else Pose()
+    return goal.distance(onto, ends[goal.object]) <= _NEAR_ENOUGH

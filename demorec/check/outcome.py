@@ -12,8 +12,7 @@ import numpy as np
 from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Found, Measurement, NotMeasured, outcome_check
 from demorec.check.episode import CheckedEpisode
-from demorec.check.rows import matrices
-from demorec.core.geometry import Array
+from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
 from demorec.episode.conditions import DISTURBED, LIMITS, OPEN, PLACED
 from demorec.episode.episode import gave_up
@@ -153,24 +152,25 @@ def final_state(episode: CheckedEpisode) -> Iterator[Found]:
 def _shown(episode: CheckedEpisode, frame: int) -> Iterator[tuple[str, float]]:
     """Conditions as a frame has them."""
     c, scene = episode.columns, episode.info.scene
-    last = {name: matrices(poses[frame : frame + 1])[0] for name, poses in c.object_poses.items()}
+    rows = {name: poses[frame] for name, poses in c.object_poses.items()}
+    last = {name: Pose(position=row[:3], quat_xyzw=row[3:]) for name, row in rows.items()}
     yield OPEN, float(c.gripper_width[frame])
     for goal in scene.goals:
         suffix = f":{goal.object}" if len(scene.goals) > 1 else ""
-        wanted, pose, body = goal.onto_from_goal.matrix(), last[goal.object], scene.body(goal.object)
-        if goal.onto:
-            wanted = (last[goal.onto] if goal.onto in last else scene.body(goal.onto).world_from_body.matrix()) @ wanted
-        height = wanted[2, 3] + _half_height(body, pose) - _half_height(body, wanted)
-        yield f"distance_to_goal{suffix}", math.dist(pose[:2, 3], wanted[:2, 3])
-        yield f"height_error{suffix}", abs(float(pose[2, 3] - height))
-        yield f"tilt{suffix}", math.acos(min(1.0, float(np.abs(pose[2, :3]).max())))
+        pose, body = last[goal.object], scene.body(goal.object)
+        onto = last.get(goal.onto, scene.body(goal.onto).world_from_body if goal.onto else Pose())
+        wanted = onto @ goal.onto_from_goal
+        height = wanted.position[2] + _half_height(body, pose) - _half_height(body, wanted)
+        yield f"distance_to_goal{suffix}", goal.distance(onto, pose)
+        yield f"height_error{suffix}", abs(float(pose.position[2] - height))
+        yield f"tilt{suffix}", math.acos(min(1.0, float(np.abs(pose.rotation[2]).max())))
     for body in scene.movable:
-        yield f"{DISTURBED}:{body.name}", math.dist(last[body.name][:2, 3], body.world_from_body.position[:2])
+        yield f"{DISTURBED}:{body.name}", math.dist(last[body.name].position[:2], body.world_from_body.position[:2])
 
 
-def _half_height(body: Body, pose: Array) -> float:
+def _half_height(body: Body, pose: Pose) -> float:
     """Half the extent of the axis that is nearest to the vertical."""
-    return body.shape.extents[int(np.argmax(np.abs(pose[2, :3])))] / 2
+    return body.shape.extents[int(np.argmax(np.abs(pose.rotation[2])))] / 2
 
 
 @outcome_check(

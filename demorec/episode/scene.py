@@ -150,12 +150,24 @@ class Goal:
         onto: Name of the body that it is placed onto or into, or "" for a place in the world.
         onto_from_goal: Wanted pose of the object in that body's frame (in the world for "").
         yaw_symmetry: As `Body.yaw_symmetry`, for the wanted yaw; 0 when any yaw will do.
+        area: Least x and y, greatest x and y in that body's frame, metres: the object's origin may be anywhere in it,
+            as in a tray; None where it shall be at the wanted pose.
     """
 
     object: str
     onto: str
     onto_from_goal: Pose
     yaw_symmetry: int = 4
+    area: tuple[float, float, float, float] | None = None
+
+    def distance(self, world_from_onto: Pose, world_from_object: Pose) -> float:
+        """From the object to where it shall end, seen from above, metres; the world stands for no `onto`."""
+        if self.area is None:
+            wanted = world_from_onto @ self.onto_from_goal
+            return math.dist(world_from_object.position[:2], wanted.position[:2])
+        x, y, _ = (world_from_onto.inverse() @ world_from_object).position.tolist()
+        least_x, least_y, most_x, most_y = self.area
+        return math.hypot(max(least_x - x, 0.0, x - most_x), max(least_y - y, 0.0, y - most_y))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,6 +216,7 @@ class Physics:
     grip_iterations: int = 0
 
 
+leave_out_defaults(Goal, "area")
 leave_out_defaults(Physics, "contact_breaking_threshold", "finger_stiffness", "grip_iterations")
 
 CONTACT_BREAKING_THRESHOLD = 0.05

@@ -110,6 +110,12 @@ def _scene(scene: Scene) -> Iterator[str]:
     for goal in scene.goals:
         yield from _pose("onto_from_goal", goal.onto_from_goal)
         yield from _within("yaw_symmetry of a goal", goal.yaw_symmetry, 0, 360)
+        if goal.area is not None:
+            least_x, least_y, most_x, most_y = goal.area
+            if not (
+                -_MAX_METRES <= least_x <= most_x <= _MAX_METRES and -_MAX_METRES <= least_y <= most_y <= _MAX_METRES
+            ):
+                yield f"the area of a goal is from ({least_x}, {least_y}) to ({most_x}, {most_y})"
         if goal.object not in movable:
             yield f"a goal is for {goal.object!r}, which is no movable body of the scene"
         if goal.onto and goal.onto not in known:

@@ -22,7 +22,7 @@ from demorec.tasks.furniture import COLORS, mark, walls, words_for
 from demorec.tasks.grasping import found_grasps
 from demorec.tasks.placing import Layout, TableTask
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
-from demorec.tasks.trays import TRAY_FLOOR, TRAYS, tray
+from demorec.tasks.trays import IN_TRAY, TRAY_FLOOR, TRAYS, tray
 
 BESIDE_TRAY = Region(x=(0.33, 0.68), y=(-0.30, 0.15))
 EVERYWHERE = Region(x=(0.33, 0.68), y=(-0.30, 0.30))
@@ -65,8 +65,8 @@ DISHES: Mapping[str, Dish] = {
 }
 DISH_FLOOR = 0.004
 """Height of a dish's floor above its lower face, metres."""
-FROM_MIDDLE = 0.01
-"""How far from a dish's middle something is put, metres along x and y at most."""
+BESIDE_THING = 0.015
+"""Of a dish's floor, left free about what is put on its middle, metres."""
 
 
 class PickAnything(TableTask):
@@ -75,9 +75,8 @@ class PickAnything(TableTask):
     Task: one to six things from shelves (`--objects`), each of another name or colour; a square mark, or a tray, a bowl
         or a plate at the robot's left. With `--distractors` as many more things of the same shelves, grey or black.
     Randomised: which things and their shapes (`--object-split`), places, yaws, colours, densities and frictions by
-        material; what they go to, its place and yaw; where in it (3 cm about the middle of a tray, 1 cm of a bowl or
-        a plate); the arm's initial joints.
-    Success: the thing's centre within 2 cm of the mark's, or of its place in the tray, bowl or plate, on its floor,
+        material; what they go to, its place and yaw; the arm's initial joints.
+    Success: the thing's centre within 2 cm of the mark's, or in the tray, bowl or plate, on its floor,
         standing as it stood within 5 degrees, at rest, not touched; everything else within 2 cm of where it was; the
         gripper open.
     """
@@ -153,7 +152,7 @@ def radius_of(body: Body) -> float:
 
 def _targets(wanted: Body) -> list[str]:
     """What a thing can be put to: it has to stand on the flat floor of a dish."""
-    room = radius_of(wanted) + 1.5 * FROM_MIDDLE
+    room = radius_of(wanted) + BESIDE_THING
     return ["mark", "mark", "tray", *(name for name, dish in DISHES.items() if room < dish.floor)]
 
 
@@ -243,12 +242,12 @@ def _mark_and_goal(sampler: Sampler, wanted: Body, start: tuple[float, float]) -
 def _container_and_goal(sampler: Sampler, wanted: Body, onto: str) -> tuple[Body, Goal]:
     point, yaw = sampler.point(TRAYS, what=f"the {onto}"), sampler.uniform(-0.25, 0.25)
     if onto == "tray":
-        target, floor, spread = tray("blue_tray", point, yaw, color_name="blue"), TRAY_FLOOR, (0.03, 0.02)
+        target, floor, area = tray("blue_tray", point, yaw, color_name="blue"), TRAY_FLOOR, IN_TRAY
     else:
-        target, floor, spread = _dish_body(onto, point, yaw), DISH_FLOOR, (FROM_MIDDLE, FROM_MIDDLE)
-    offset = [sampler.uniform(-most, most) for most in spread]
-    pose = _resting(wanted, offset, floor)
-    return target, Goal(object=wanted.name, onto=target.name, onto_from_goal=pose, yaw_symmetry=0)
+        half = DISHES[onto].floor / math.sqrt(2)  # of the square within the round floor
+        target, floor, area = _dish_body(onto, point, yaw), DISH_FLOOR, (-half, -half, half, half)
+    pose = _resting(wanted, (0.0, 0.0), floor)
+    return target, Goal(object=wanted.name, onto=target.name, onto_from_goal=pose, yaw_symmetry=0, area=area)
 
 
 def _dish_body(noun: str, point: tuple[float, float], yaw: float) -> Body:

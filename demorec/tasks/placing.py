@@ -81,7 +81,7 @@ class TableTask(PlacingTask):
         bodies, goals = self.layout(sampler)
         if scale != 1.0:
             bodies = [_scaled_body(body, scale) for body in bodies]
-            goals = [replace(goal, onto_from_goal=_scaled_pose(goal.onto_from_goal, scale)) for goal in goals]
+            goals = [_scaled_goal(goal, scale) for goal in goals]
         return Scene(robot=robot_at_origin(robot, sampler), bodies=(*table_and_floor(), *bodies), goals=tuple(goals))
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
@@ -129,6 +129,14 @@ def _scaled_body(body: Body, scale: float) -> Body:
         shape, size=tuple(scale * v for v in shape.size), scale=scale * shape.scale if is_file else shape.scale
     )
     return replace(body, shape=shape, mass=scale * body.mass, world_from_body=_scaled_pose(body.world_from_body, scale))
+
+
+def _scaled_goal(goal: Goal, scale: float) -> Goal:
+    area = goal.area
+    if area is not None:
+        least_x, least_y, most_x, most_y = (scale * end for end in area)
+        area = (least_x, least_y, most_x, most_y)
+    return replace(goal, onto_from_goal=_scaled_pose(goal.onto_from_goal, scale), area=area)
 
 
 def _scaled_pose(pose: Pose, scale: float) -> Pose:

@@ -22,9 +22,11 @@ from demorec.sim.world import World
 
 def goal_pose(world: World, goal: Goal) -> Pose:
     """`world_from_goal` now: it moves with the body that the goal lies on."""
-    if not goal.onto:
-        return goal.onto_from_goal
-    return world.pose(goal.onto) @ goal.onto_from_goal
+    return _support_pose(world, goal) @ goal.onto_from_goal
+
+
+def _support_pose(world: World, goal: Goal) -> Pose:
+    return world.pose(goal.onto) if goal.onto else Pose()
 
 
 def resting_half_height(body: Body, pose: Pose) -> float:
@@ -75,12 +77,13 @@ def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
     """
     suffix = f":{goal.object}" if len(world.scene.goals) > 1 else ""
     pose, wanted = world.pose(goal.object), goal_pose(world, goal)
+    distance = goal.distance(_support_pose(world, goal), pose)
     body = world.body(goal.object)
     linear, angular = world.velocity(goal.object)
     # The wanted height is that of the resting face that was meant; a cube may rest on any face.
     height = wanted.position[2] + resting_half_height(body, pose) - resting_half_height(body, wanted)
     return (
-        at_most(f"distance_to_goal{suffix}", math.dist(pose.position[:2], wanted.position[:2]), MAX_DISTANCE, "m"),
+        at_most(f"distance_to_goal{suffix}", distance, MAX_DISTANCE, "m"),
         at_most(f"height_error{suffix}", abs(pose.position[2] - height), MAX_HEIGHT_ERROR, "m"),
         at_least(f"on_support{suffix}", on_support(world, goal.object, goal.onto), 1.0, ""),
         # A box may rest on any face, a bottle may not.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Goal, Rgba, Shape
 from demorec.tasks.furniture import COLORS
@@ -14,6 +12,8 @@ from demorec.tasks.sampling import Region, Sampler
 
 TRAY_FLOOR = 0.004
 """Height of a tray's floor above its lower face, metres (tray.urdf)."""
+IN_TRAY = (-0.13, -0.10, 0.13, 0.10)
+"""The floor of a tray in its own frame: least x and y, greatest x and y, metres."""
 CUBES = Region(x=(0.35, 0.65), y=(-0.25, 0.15))
 TRAYS = Region(x=(0.40, 0.50), y=(0.36, 0.40))
 """Of the tray's middle: its far corner must be within the reach of a hand that points down."""
@@ -39,6 +39,12 @@ def tray(name: str, point: tuple[float, float], yaw: float, *, color_name: str) 
     )
 
 
+def into_tray(cube: Body, target: Body, *, along: float = 0.0) -> Goal:
+    """The goal that a cube is anywhere in a tray; it is put on the middle of the long axis, or `along` it, metres."""
+    pose = Pose.from_yaw((along, 0.0, TRAY_FLOOR + cube.shape.size[2] / 2))
+    return Goal(object=cube.name, onto=target.name, onto_from_goal=pose, area=IN_TRAY)
+
+
 def _paler(rgba: Rgba) -> Rgba:
     red, green, blue = (0.55 * channel + 0.45 * 0.92 for channel in rgba[:3])
     return (red, green, blue, rgba[3])
@@ -49,9 +55,8 @@ class PlaceInTray(TableTask):
 
     Task: one cube on the table, one shallow tray at the robot's left.
     Randomised: the cube's place (0.30 x 0.40 m), yaw, size (3-6 cm), mass (20-200 g), friction (0.4-1.2) and the
-        tray's place and yaw (within 0.25 rad); where in the tray (3 cm about its middle); the arm's initial joints.
-    Success: the cube's centre within 2 cm of the place, on the tray's floor, upright within 5 degrees, at rest, not
-        touched, the gripper open.
+        tray's place and yaw (within 0.25 rad); the arm's initial joints.
+    Success: the cube in the tray, on its floor, upright within 5 degrees, at rest, not touched, the gripper open.
     """
 
     summary = "a cube into a tray"
@@ -72,14 +77,7 @@ class PlaceInTray(TableTask):
             sampler.uniform(-0.25, 0.25),
             color_name="blue",
         )
-        offset = (sampler.uniform(-0.03, 0.03), sampler.uniform(-0.02, 0.02))
-        height = TRAY_FLOOR + body.shape.size[2] / 2
-        goal = Goal(
-            object=body.name,
-            onto=target.name,
-            onto_from_goal=Pose.from_yaw((*offset, height), sampler.uniform(-np.pi, np.pi)),
-        )
-        return [target, body], [goal]
+        return [target, body], [into_tray(body, target)]
 
 
 class SortByColor(TableTask):
@@ -88,8 +86,8 @@ class SortByColor(TableTask):
     Task: two to four cubes of two colours, two trays, one on either side.
     Randomised: how many cubes, which colours, which tray is left; places, yaws, sizes (3-4.5 cm), masses
         (20-200 g), frictions (0.4-1.2); the trays' places along the table; the arm's initial joints.
-    Success: each cube within 2 cm of its place in the tray of its colour, on the floor of the tray, upright within
-        5 degrees, at rest, not touched; the gripper open.
+    Success: each cube in the tray of its colour, on its floor, upright within 5 degrees, at rest, not touched; the
+        gripper open.
     """
 
     summary = "two to four cubes into the trays of their colours"
@@ -118,8 +116,6 @@ class SortByColor(TableTask):
                 points.append(point)
                 body = random_cube(sampler, color, point, sampler.yaw(), sides=(0.03, 0.045))
                 body = replace(body, name=f"{color}_cube_{slot + 1}")
-                offset = SLOTS[slot] if count > 1 else sampler.uniform(-0.05, 0.05)
-                place = (offset, sampler.uniform(-0.01, 0.01), TRAY_FLOOR + body.shape.size[2] / 2)
                 cubes.append(body)
-                goals.append(Goal(object=body.name, onto=target.name, onto_from_goal=Pose.from_yaw(place)))
+                goals.append(into_tray(body, target, along=SLOTS[slot] if count > 1 else 0.0))
         return [*trays, *cubes], goals

@@ -44,6 +44,8 @@ class Encodings:
     def _keep(self, index: NDArray[np.int64], places: NDArray[np.int64], batch: dict[str, Any], encode: Any) -> None:
         padded = np.resize(places, _TOGETHER)
         part = {key: value[padded] for key, value in batch.items() if key.startswith("observation.")}
+        if "task" in batch:
+            part["task"] = [batch["task"][place] for place in padded]
         made = encode(part)[: len(places)].cpu()
         if self._kept is None:
             self._kept = made.new_empty((len(self.known), made.shape[1]))

@@ -30,6 +30,7 @@ from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lo
 from demorec.learn.training.columns import numbers
 from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
 from demorec.learn.training.reader import FastDataset
+from demorec.lerobot_policy import vocabulary_of
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
 _STATE, _EE_POSE, _ACTION = "observation.state", "observation.ee_pose", "action"
@@ -167,6 +168,7 @@ class _Lessons:
         self._plan, self._dataset, self._targets = plan, dataset, targets
         torch.manual_seed(plan.seed)
         policy.num_targets = len(targets.names)
+        policy.vocabulary = vocabulary_of(_instructions(dataset))
         self._policy = make_policy(policy, ds_meta=dataset.meta)
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
@@ -244,7 +246,8 @@ class _Lessons:
     def _tell(self, rows: Rows) -> torch.Tensor:
         """(B, K) normalised targets, as the encoder has them now."""
         batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
-        _, told = self._network([batch[key] for key in self._policy.config.image_features], batch[_STATE])
+        images = [batch[key] for key in self._policy.config.image_features]
+        _, told = self._network(images, batch[_STATE], batch["task"])
         return told
 
     def _store(self, path: Path) -> None:
@@ -329,6 +332,12 @@ def _digest(dataset: FastDataset) -> str:
     """Of the dataset's statistics, by which it is known again."""
     path = Path(dataset.root) / "meta" / "stats.json"
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _instructions(dataset: FastDataset) -> list[str]:
+    """Of the episodes that are learned from."""
+    tasks = dataset.meta.tasks.index.tolist()
+    return [tasks[number] for number in np.unique(_column(dataset, "task_index"))]
 
 
 def _column(dataset: FastDataset, name: str) -> NDArray[Any]:
