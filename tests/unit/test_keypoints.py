@@ -56,7 +56,9 @@ class Policy:
         self.encoded: list[int] = []
 
     def encode(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        self.encoded += batch[STATE][:, 0].int().tolist()
+        rows = batch[STATE][:, 0].int().tolist()
+        assert batch["task"] == [f"take {row}" for row in rows]
+        self.encoded += rows
         return torch.cat([batch[STATE], 3 * batch[FRONT].mean((2, 3))], dim=1)
 
 
@@ -65,7 +67,7 @@ def batch(*index: int, is_black: Any = None) -> dict[str, Any]:
     images = rows.float().reshape(-1, 1, 1, 1).expand(-1, 3, 2, 2).clone()
     if is_black is not None:
         images[torch.from_numpy(is_black[list(index)])] = 0
-    return {"index": rows, STATE: rows.float().reshape(-1, 1), FRONT: images}
+    return {"index": rows, STATE: rows.float().reshape(-1, 1), FRONT: images, "task": [f"take {row}" for row in index]}
 
 
 def test_each_frame_is_encoded_once_and_its_image_is_not_needed_again() -> None:
@@ -79,3 +81,37 @@ def test_each_frame_is_encoded_once_and_its_image_is_not_needed_again() -> None:
     assert set(policy.encoded) == {*range(80), 99}
     assert encodings.known.sum() == 81
     assert policy.encode({key: value for key, value in batch(5).items() if key != "index"}).shape == (1, 4)
+
+
+def test_a_place_follows_the_instruction_and_not_the_other_sentences_of_a_batch() -> None:
+    """The order of words matters, capitals and marks do not; words that were not learned are all one."""
+    from demorec.lerobot_policy import KeypointEncoder, vocabulary_of
+
+    torch.manual_seed(0)
+    texts = ["put the red cube onto the blue one", "put the blue cube onto the red one"]
+    vocabulary = vocabulary_of(texts)
+    assert vocabulary == ("blue", "cube", "one", "onto", "put", "red", "the")
+    encoder = KeypointEncoder(
+        num_cameras=2, state_dim=2, num_keypoints=4, channels=4, num_targets=3, vocabulary=vocabulary
+    ).eval()
+    torch.nn.init.constant_(encoder.temperature, 5.0)
+    image = torch.rand(1, 3, 24, 32)
+
+    def places(*instructions: str) -> torch.Tensor:
+        count = len(instructions)
+        with torch.no_grad():
+            return encoder([image.expand(count, -1, -1, -1)] * 2, torch.zeros(count, 2), instructions)[0]
+
+    alone = torch.cat([places(text) for text in texts])
+    assert (alone[0] - alone[1]).abs().max() > 1e-3
+    together = places(*texts, "Put the RED cube onto the blue one!", "red", "fetch", "grasp", "")
+    torch.testing.assert_close(together[:3], alone[[0, 1, 0]], rtol=0, atol=1e-3)
+    torch.testing.assert_close(together[4], together[5], rtol=0, atol=0)
+    with pytest.raises(ValueError, match="its batches need the key 'task'"):
+        encoder([image], torch.zeros(1, 2))
+
+
+def test_where_all_instructions_are_the_same_none_is_read() -> None:
+    from demorec.lerobot_policy import vocabulary_of
+
+    assert vocabulary_of(["stack the cubes"] * 3) == vocabulary_of([]) == ()

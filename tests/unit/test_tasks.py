@@ -108,6 +108,28 @@ def test_a_cube_that_floats_moves_or_is_held_fails(finished: tuple[Episode, Worl
     world.set_state(object_poses={"red_cube": good})
 
 
+def test_into_a_tray_is_anywhere_in_it() -> None:
+    """The floor of tray.urdf is 0.26 x 0.20 m; a cube on the table beside it, or on its wall, is not in it."""
+    prepared = episode(0, task="place_in_tray")
+    with make_world(prepared.info) as world:
+        _, outcome = run(prepared, world)
+        assert outcome.success
+        [distance] = [check.value for check in outcome.checks if check.name == "distance_to_goal"]
+        assert distance == 0.0
+        cube, tray = world.pose("red_cube"), world.pose("blue_tray")
+        height, half = (tray.inverse() @ cube).position[2], max(world.body("red_cube").shape.extents) / 2
+
+        def breaks(x: float, y: float, z: float = 0.0) -> set[str]:
+            world.set_state(object_poses={"red_cube": tray @ Pose.from_yaw((x, y, height + z), 0.0)})
+            world.client.performCollisionDetection()
+            return failed(prepared, world)
+
+        for x in (-0.13 + half + 1e-3, 0.13 - half - 1e-3):
+            assert breaks(x, 0.0) == breaks(0.0, 0.0) == breaks(0.0, 0.10 - half - 1e-3) == set()
+        assert breaks(0.13, 0.0, z=0.015) == {"height_error"}
+        assert {"distance_to_goal", "on_support"} <= breaks(0.14 + half + 0.01, 0.0, z=-0.004)
+
+
 def behave(prepared: Episode, **values: float) -> Episode:
     return dataclasses.replace(prepared, behaviour=Behaviour(**values))
 
