@@ -115,11 +115,17 @@ def test_lerobot_loads_the_policy_by_its_name_and_it_acts(taught: Path) -> None:
     config = PreTrainedConfig.from_pretrained(taught)
     policy = get_policy_class(config.type).from_pretrained(taught)
     generator = torch.Generator().manual_seed(0)
-    batch = {key: torch.randn(3, *feature.shape, generator=generator) for key, feature in config.input_features.items()}
+    batch: dict[str, Any] = {
+        key: torch.randn(3, *feature.shape, generator=generator) for key, feature in config.input_features.items()
+    }
+    batch["task"] = ["put the red cube on the green target"] * 3
     actions = policy.predict_action_chunk(batch)
     assert actions.shape == (3, config.chunk_size, 7)
-    changed = {key: value + 1 if key.endswith("wrist") else value for key, value in batch.items()}
+    changed = batch | {"observation.images.wrist": batch["observation.images.wrist"] + 1}
     assert not torch.allclose(actions, policy.predict_action_chunk(changed), atol=1e-4)
+    changed = batch | {"task": ["move the red cube to the green target"] * 3}
+    assert {"put", "move", "red", "green"} <= set(config.vocabulary)
+    assert not torch.equal(actions, policy.predict_action_chunk(changed))
 
 
 def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, taught: Path, tmp_path: Path) -> None:
