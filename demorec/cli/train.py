@@ -76,7 +76,7 @@ class Pretrain:
     """Flags for lerobot-train."""
 
     def run(self) -> int:
-        """Train the encoder and report what it has learnt."""
+        """Train the encoder and report how well it predicts."""
         check_option("num_updates", self.num_updates, 1, 10_000_000)
         check_option("frames_per_update", self.frames_per_update, 2, 65_536)
         check_option("learning_rate", self.learning_rate, 1e-7, 1.0)
@@ -102,7 +102,7 @@ class Pretrain:
         )
         say(
             f"next keyframe {1000 * result.median_m:.1f} mm off (median; 9 of 10 frames within "
-            f"{1000 * result.most_m:.0f} mm) in {result.episodes} episodes left out; unseen, it is "
+            f"{1000 * result.most_m:.0f} mm) in {result.episodes} held-out episodes; without images "
             f"{1000 * result.baseline_m:.0f} mm",
             f"policy        {self.out}",
         )

@@ -1,4 +1,4 @@
-"""A policy of LeRobot that sees where things are: ACT, whose images come as keypoints.
+"""A policy of LeRobot: ACT that gets keypoints in place of images.
 
     lerobot-eval --env.discover_packages_path=demorec.lerobot_env --env.type=demorec --policy.path=...
 
@@ -47,11 +47,11 @@ class ActKeypointsConfig(ACTConfig):  # type: ignore[misc]
     Attributes:
         num_keypoints: Maps of each camera.
         encoder_channels: Of the first convolutions; the later ones have twice as many.
-        num_targets: Numbers that the encoder tells of an image beside the keypoints; set by `demorec pretrain`.
+        num_targets: Numbers that the encoder predicts beside the keypoints; set by `demorec pretrain`.
         vocabulary: Words of instructions that the encoder reads; none where all episodes have the same instruction; set
             by `demorec pretrain`.
-        normalization_mapping: The encoder normalises what it gets by what it has learnt from. LeRobot would by each
-            dataset that the policy is trained on, and its images by ImageNet.
+        normalization_mapping: The encoder normalises its inputs by the dataset that it was trained on. LeRobot would by
+            each dataset that the policy is trained on, and images by ImageNet.
     """
 
     num_keypoints: int = 32

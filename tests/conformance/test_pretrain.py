@@ -67,16 +67,16 @@ def weights(folder: Path) -> dict[str, np.ndarray[Any, Any]]:
 
 
 @pytest.fixture(scope="module")
-def taught(settings: Path) -> Path:
-    out = settings.parent / "taught"
+def pretrained(settings: Path) -> Path:
+    out = settings.parent / "pretrained"
     assert pretrain(settings, out) == 0
     return out
 
 
-def test_what_it_tells_is_what_the_left_out_episode_shows(
-    settings: Path, taught: Path, capsys: pytest.CaptureFixture[str]
+def test_the_reported_error_is_that_of_the_held_out_episode(
+    settings: Path, pretrained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The figure of an encoder that knows nothing, from the table itself; a second call does nothing and tells it."""
+    """The baseline computed from the table itself; a second call does nothing but report again."""
     import pyarrow.parquet as pq
 
     table = pq.read_table(next((settings.parent / "dataset" / "data").rglob("*.parquet")))
@@ -93,27 +93,27 @@ def test_what_it_tells_is_what_the_left_out_episode_shows(
             for opens, offset in offsets.items():
                 offset += [pose[k] - pose[i] for k in ahead if is_open[k] == opens][:1]
     baseline = np.median([np.linalg.norm(offset - np.mean(offsets[opens], axis=0)) for opens, offset in first])
-    found = json.loads((taught / "pretraining.json").read_text())["result"]
+    found = json.loads((pretrained / "pretraining.json").read_text())["result"]
     assert found["baseline_m"] == pytest.approx(baseline, abs=2e-5)
     assert found["episodes"] == 1
     assert 0 < found["median_m"] <= found["most_m"] < 2
-    before = {path: path.stat().st_mtime_ns for path in taught.glob("[!.]*")}
-    assert pretrain(settings, taught) == 0
+    before = {path: path.stat().st_mtime_ns for path in pretrained.glob("[!.]*")}
+    assert pretrain(settings, pretrained) == 0
     assert f"next keyframe {1000 * found['median_m']:.1f} mm off" in capsys.readouterr().out
-    assert {path: path.stat().st_mtime_ns for path in taught.glob("[!.]*")} == before
+    assert {path: path.stat().st_mtime_ns for path in pretrained.glob("[!.]*")} == before
     assert "unfinished.pt" not in {path.name for path in before}
 
 
-def test_lerobot_loads_the_policy_by_its_name_and_it_acts(taught: Path) -> None:
-    """What it tells of images and state goes into ACT: other images, other actions."""
+def test_lerobot_loads_the_policy_by_its_name_and_it_acts(pretrained: Path) -> None:
+    """What the encoder predicts goes into ACT: other images, other actions."""
     import torch
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
     import demorec.lerobot_env  # noqa: F401  # as --env.discover_packages_path does
 
-    config = PreTrainedConfig.from_pretrained(taught)
-    policy = get_policy_class(config.type).from_pretrained(taught)
+    config = PreTrainedConfig.from_pretrained(pretrained)
+    policy = get_policy_class(config.type).from_pretrained(pretrained)
     generator = torch.Generator().manual_seed(0)
     batch: dict[str, Any] = {
         key: torch.randn(3, *feature.shape, generator=generator) for key, feature in config.input_features.items()
@@ -128,8 +128,8 @@ def test_lerobot_loads_the_policy_by_its_name_and_it_acts(taught: Path) -> None:
     assert not torch.equal(actions, policy.predict_action_chunk(changed))
 
 
-def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, taught: Path, tmp_path: Path) -> None:
-    from demorec.learn.training import pretrain as teaching
+def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, pretrained: Path, tmp_path: Path) -> None:
+    from demorec.learn.training import pretrain as pretraining
     from demorec.learn.training.command import training_config
 
     out = tmp_path / "killed"
@@ -148,27 +148,27 @@ def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, taught: Path,
         os.kill(process.pid, signal.SIGKILL)
     assert (out / "unfinished.pt").exists()
     assert not (out / "model.safetensors").exists()
-    told: list[int] = []
-    teaching.pretrain(
+    reported: list[int] = []
+    pretraining.pretrain(
         training_config([f"--config_path={settings}"]),
-        teaching.PretrainConfig(updates=6, batch_size=4, seed=1000),
+        pretraining.PretrainConfig(updates=6, batch_size=4, seed=1000),
         out,
         frame_cache_bytes=1 << 28,
-        on_progress=lambda done, loss: told.append(done),
+        on_progress=lambda done, loss: reported.append(done),
         save_every=2,
     )
-    assert told in ([4, 6], [6])
-    one, other = weights(taught), weights(out)
+    assert reported in ([4, 6], [6])
+    one, other = weights(pretrained), weights(out)
     assert one.keys() == other.keys()
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
-def test_another_teaching_in_the_folder_is_refused(
-    settings: Path, taught: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_another_pretraining_in_the_folder_is_refused(
+    settings: Path, pretrained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert pretrain(settings, taught, "--learning-rate", "0.01") == 2
-    assert "Another encoder is taught in this folder (another learning_rate), choose another --out" in (
+    assert pretrain(settings, pretrained, "--learning-rate", "0.01") == 2
+    assert "Another encoder is pretrained in this folder (another learning_rate), choose another --out" in (
         capsys.readouterr().err
     )
     (tmp_path / "mine.txt").write_text("keep")
@@ -177,8 +177,10 @@ def test_another_teaching_in_the_folder_is_refused(
     assert {path.name for path in tmp_path.iterdir()} == {"mine.txt", ".lock"}
 
 
-def test_damage_is_told(settings: Path, tmp_path: Path, taught: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plain = json.loads((taught / "pretraining.json").read_text())
+def test_damage_is_reported(
+    settings: Path, tmp_path: Path, pretrained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = json.loads((pretrained / "pretraining.json").read_text())
     out = tmp_path / "out"
     out.mkdir()
     (out / "pretraining.json").write_text(json.dumps({"settings": plain["settings"]}))
@@ -193,7 +195,7 @@ def test_damage_is_told(settings: Path, tmp_path: Path, taught: Path, capsys: py
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--policy.type=diffusion"], "Only the encoder of one type of policy can be taught"),
+        (["--policy.type=diffusion"], "Only the encoder of one type of policy can be pretrained"),
         (["--num-updates=0"], "--num-updates is 0"),
         (["--config_path=nothing.json"], "There is no such file of settings: nothing.json"),
     ],
@@ -214,12 +216,10 @@ def test_wrong_requests(
 
 def test_one_episode_is_too_few(settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert pretrain(settings, tmp_path / "out", "--dataset.episodes=[0]") == 2
-    assert (
-        "is told to close or to open in 1 of the dataset's episodes: at least 2 are needed" in capsys.readouterr().err
-    )
+    assert "commanded to close or to open in 1 of the dataset's episodes: at least 2" in capsys.readouterr().err
 
 
-def test_a_dataset_that_does_not_tell_where_the_hand_is(
+def test_a_dataset_without_tcp_poses_or_openings_is_refused(
     settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, dataset = str(settings.parent / "run"), tmp_path / "joints"
@@ -228,7 +228,7 @@ def test_a_dataset_that_does_not_tell_where_the_hand_is(
     assert "observation.ee_pose" not in info(dataset)["features"]
     capsys.readouterr()
     assert pretrain(settings, tmp_path / "out", f"--dataset.root={dataset}") == 2
-    assert "lacks tcp.x to tcp.qw in observation.ee_pose or observation.state: demorec export lerobot --state" in (
+    assert "lacks tcp.x to tcp.qw in observation.ee_pose or observation.state, so where the hand will grasp is" in (
         capsys.readouterr().err
     )
 
@@ -253,21 +253,21 @@ def train(settings: Path, out: Path, *more: str, program: str = "demorec train")
 
 
 @pytest.mark.slow
-def test_the_encoder_stays_as_it_was_taught(settings: Path, taught: Path, tmp_path: Path) -> None:
+def test_the_encoder_stays_as_it_was_pretrained(settings: Path, pretrained: Path, tmp_path: Path) -> None:
     """Each frame is encoded once, and the losses are those of a training by LeRobot's own command, which does not."""
-    path = f"--policy.path={taught}"
+    path = f"--policy.path={pretrained}"
     kept, one = train(settings, tmp_path / "kept", path)
     afresh, _ = train(settings, tmp_path / "afresh", path, program="lerobot-train")
     assert len(kept) >= 6
     assert kept == pytest.approx(afresh, abs=2e-3)
-    before, after = weights(taught), weights(one)
+    before, after = weights(pretrained), weights(one)
     assert before.keys() == after.keys()
     encoder = [name for name in before if name.startswith("encoder.")]
     assert len(encoder) > 50
     for name in encoder:
         np.testing.assert_array_equal(before[name], after[name], err_msg=name)
     assert not np.array_equal(before["model.action_head.weight"], after["model.action_head.weight"])
-    np.testing.assert_array_equal(encoded(settings, taught), encoded(settings, one))
+    np.testing.assert_array_equal(encoded(settings, pretrained), encoded(settings, one))
 
 
 def encoded(settings: Path, folder: Path) -> np.ndarray[Any, Any]:
@@ -284,8 +284,8 @@ def encoded(settings: Path, folder: Path) -> np.ndarray[Any, Any]:
     return np.asarray(policy.encode(before(default_collate([dataset[7]]))).numpy())
 
 
-def test_the_encoder_must_have_been_taught(settings: Path, tmp_path: Path) -> None:
+def test_the_encoder_must_have_been_pretrained(settings: Path, tmp_path: Path) -> None:
     command = [str(Path(sys.executable).parent / "demorec"), "train", f"--config_path={settings}"]
     done = subprocess.run([*command, f"--output_dir={tmp_path / 'out'}"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "learns before the policy does: demorec pretrain, then --policy.path with its --out." in done.stderr
+    assert "is trained before the policy: demorec pretrain, then --policy.path with its --out." in done.stderr

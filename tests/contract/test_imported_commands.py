@@ -65,7 +65,7 @@ def test_every_documented_command_has_a_row() -> None:
     block = readme.partition("## Commands\n")[2].partition("Every command has `--help`")[0]
     commands = set(re.findall(r"^    demorec (\S+)", block, flags=re.MULTILINE))
     # `list` tells of demorec alone; training on such datasets is in tests/conformance/test_training_reader.py, and that
-    # `pretrain` refuses those that do not tell where the hand is, in test_pretrain.py there.
+    # `pretrain` refuses those that lack TCP poses, in test_pretrain.py there.
     assert commands - {row.split()[0] for row in ROWS} == {"list", "train", "pretrain"}
 
 

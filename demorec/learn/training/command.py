@@ -36,7 +36,7 @@ def train(
         on_replaced: Called when the first dataset is opened by `FastDataset`: streamed ones are not.
 
     Raises:
-        ConfigError: The limit is negative, the file of --config_path is missing, or the encoder is not taught.
+        ConfigError: The limit is negative, the file of --config_path is missing, or the encoder is not pretrained.
         TrainingError: lerobot-train ended with an error.
         MissingDependencyError: LeRobot, or what it needs for training, is not installed.
         SystemExit: lerobot-train refused its arguments (2), and said why, or printed its help (0).
@@ -133,7 +133,7 @@ def _encoding_once(opened: Sequence[FastDataset]) -> AbstractContextManager[None
             return policy
         if not policy.config.pretrained_path:
             raise ConfigError(
-                "The encoder of a policy of type act_keypoints learns before the policy does: demorec pretrain, then "
+                "The encoder of a policy of type act_keypoints is trained before the policy: demorec pretrain, then "
                 "--policy.path with its --out."
             )
         for dataset in opened:

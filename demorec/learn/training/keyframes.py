@@ -1,9 +1,9 @@
-"""What an encoder of images learns to tell before the policy is trained: where the hand will be at its next keyframes.
+"""What an image encoder learns to predict before the policy is trained: where the hand will be at its next keyframes.
 
-A keyframe is a moment at which the gripper is told to close or to open (James and Davison, "Q-attention", 2021; PerAct,
-Shridhar et al., 2022). Keyframes are read off the robot's own poses and commands, so that nothing is needed that a real
-recording does not have, poses of objects least of all; yet the next closing is where the object is, and the next
-opening where it has to go. Each stays the same from frame to frame until it has passed, which is easy to learn.
+A keyframe is a moment at which the gripper is commanded to close or to open (James and Davison, "Q-attention", 2021;
+PerAct, Shridhar et al., 2022). Keyframes follow from the robot's own poses and commands, which real recordings have,
+unlike poses of objects; yet the next closing is where the object is, and the next opening where it has to go. Each
+stays the same from frame to frame until it has passed, which is easy to learn.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KeyframeTargets:
-    """What an encoder of images learns to tell of each frame.
+    """What an image encoder learns to predict for each frame.
 
     Attributes:
-        values: (N, K) metres, and sines and cosines of angles; NaN about a keyframe that is not ahead.
+        values: (N, K) metres, and sines and cosines of angles; NaN where no such keyframe is ahead.
         names: Of the components.
         offsets: (N, 3) places of the offset from the TCP to the keyframe that comes first, base frame, x, y, z.
     """
@@ -36,7 +36,7 @@ class KeyframeTargets:
 
 
 def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The next frames at which the gripper is told to close, and to open.
+    """The next frames at which the gripper is commanded to close, and to open.
 
     Args:
         opening: (N,) commanded opening, in any unit. It is open above the middle of all that is commanded.

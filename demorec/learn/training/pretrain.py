@@ -1,8 +1,8 @@
-"""Teaching the encoder of a policy's images to see, before the policy is trained.
+"""Training the image encoder of a policy before the policy itself.
 
-    OUT/pretraining.json    what decides the result; at the end also what came out
+    OUT/pretraining.json    the settings that decide the result; at the end also the result
     OUT/unfinished.pt       weights and optimizer, until it is done
-    OUT/config.json, ...    a policy whose encoder has been taught: for --policy.path=OUT of lerobot-train
+    OUT/config.json, ...    a policy with the trained encoder: for --policy.path=OUT of lerobot-train
 
 The same command goes on where the last one stopped.
 """
@@ -45,7 +45,7 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig:
-    """How an encoder is taught.
+    """How an encoder is trained.
 
     Attributes:
         updates: Of its weights.
@@ -62,13 +62,13 @@ class PretrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainResult:
-    """What the encoder tells of the episodes that were left out, the last twentieth.
+    """How well the encoder predicts in the held-out episodes, the last twentieth.
 
     Attributes:
-        median_m, most_m: Error of the offset from the TCP to the next keyframe in metres: of half of the frames, and
-            of nine tenths.
-        baseline_m: Median error of always telling the mean offset of the closings, or of the openings.
-        episodes: That were left out.
+        median_m, most_m: Error of the offset from the TCP to the next keyframe, metres: median and 90th percentile
+            over the frames.
+        baseline_m: Median error of always predicting the mean offset of the closings, or of the openings.
+        episodes: Held out.
         cpu_seconds: Of the last call.
     """
 
@@ -95,16 +95,16 @@ def pretrain(
         plan: How.
         out: Folder of the policy.
         frame_cache_bytes: Limit of the decoded frames that are kept.
-        on_progress: Is told the updates done and the loss, smoothed.
+        on_progress: Called with the updates done and the smoothed loss.
         save_every: Updates from one to the next state that a stopped call can go on from.
 
     Raises:
-        ConfigError: The policy is of another type, the dataset has no images or does not tell where the hand is, or
+        ConfigError: The policy is of another type, the dataset has no images or no TCP poses, or
             the folder holds something else.
         DemorecError: What is in the folder is damaged.
     """
     if getattr(config.policy, "type", None) != "act_keypoints":
-        raise ConfigError("Only the encoder of one type of policy can be taught: --policy.type=act_keypoints.")
+        raise ConfigError("Only the encoder of one type of policy can be pretrained: --policy.type=act_keypoints.")
     chosen = config.dataset
     dataset = FastDataset(
         chosen.repo_id,
@@ -126,32 +126,32 @@ def pretrain(
     }
     out.mkdir(parents=True, exist_ok=True)
     with run_lock(out):
-        done = _settle(out, settings)
-        if done is not None:
-            return done
-        lessons = _Lessons(config.policy, plan, dataset, targets)
+        finished = _settle(out, settings)
+        if finished is not None:
+            return finished
+        training = _EncoderTraining(config.policy, plan, dataset, targets)
         started = time.process_time()
-        lessons.go_on(out / UNFINISHED_NAME, on_progress, save_every)
-        found = lessons.judge(time.process_time() - started)
-        lessons.save(out)
-        replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "result": asdict(found)}, indent=1))
+        training.run(out / UNFINISHED_NAME, on_progress, save_every)
+        result = training.evaluate(time.process_time() - started)
+        training.save(out)
+        replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "result": asdict(result)}, indent=1))
         (out / UNFINISHED_NAME).unlink(missing_ok=True)
-        return found
+        return result
 
 
 def read_targets(dataset: FastDataset) -> KeyframeTargets:
-    """What is to be told of each row of a dataset.
+    """What is to be predicted for each row of a dataset.
 
     Raises:
-        ConfigError: The dataset does not tell the TCP's pose or the opening that is commanded.
+        ConfigError: The dataset lacks the TCP's pose or the commanded opening.
     """
     features = dataset.meta.features
     pose = next((name for name in (_EE_POSE, _STATE) if set(_TCP) <= set(_names(features.get(name)))), None)
     if pose is None or _OPENING not in _names(features.get(_ACTION)):
         missing = f"an action {_OPENING}" if pose else f"{_TCP[0]} to {_TCP[-1]} in {_EE_POSE} or {_STATE}"
         raise ConfigError(
-            f"The dataset does not tell where the hand will grasp, it lacks {missing}: demorec export lerobot "
-            "--state joint_ee has both; of recordings from elsewhere, a mapping's `names` tell which numbers they are: "
+            f"The dataset lacks {missing}, so where the hand will grasp is unknown: demorec export lerobot "
+            "--state joint_ee has both; for recordings from elsewhere, a mapping's `names` name these numbers: "
             f"{dataset.root}"
         )
     places = [_names(features[pose]).index(name) for name in _TCP]
@@ -161,8 +161,8 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
     return keyframe_targets(tcp[:, :3], tcp[:, 3:], keyframes)
 
 
-class _Lessons:
-    """The encoder, its optimizer, and how far they are."""
+class _EncoderTraining:
+    """The encoder, its optimizer, and the updates done."""
 
     def __init__(self, policy: Any, plan: PretrainConfig, dataset: FastDataset, targets: KeyframeTargets) -> None:
         self._plan, self._dataset, self._targets = plan, dataset, targets
@@ -172,10 +172,10 @@ class _Lessons:
         self._policy = make_policy(policy, ds_meta=dataset.meta)
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
-        rows = np.flatnonzero(~np.isnan(targets.values).all(1))  # nothing is to be told after the last keyframe
-        learnt, held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1)[rows])
-        self._learnt, self._held_out = rows[learnt], rows[held_out]
-        values = targets.values[self._learnt]
+        rows = np.flatnonzero(~np.isnan(targets.values).all(1))  # after the last keyframe there is nothing to predict
+        training, held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1)[rows])
+        self._training, self._held_out = rows[training], rows[held_out]
+        values = targets.values[self._training]
         spread = np.nanstd(values, 0)
         self._mean = np.nanmean(values, 0)
         self._spread = np.where(spread > 1e-4, spread, np.inf).astype(np.float32)
@@ -186,7 +186,7 @@ class _Lessons:
         )
         self._done, self._loss = 0, math.nan
 
-    def go_on(self, unfinished: Path, on_progress: Callable[[int, float], None], save_every: int) -> None:
+    def run(self, unfinished: Path, on_progress: Callable[[int, float], None], save_every: int) -> None:
         """From where a stopped call was to the last update."""
         if unfinished.exists():
             self._load(unfinished)
@@ -199,19 +199,21 @@ class _Lessons:
                 self._store(unfinished)
                 on_progress(self._done, self._loss)
 
-    def judge(self, cpu_seconds: float) -> PretrainResult:
-        """Of the episodes that were left out."""
+    def evaluate(self, cpu_seconds: float) -> PretrainResult:
+        """On the held-out episodes."""
         rows = self._held_out[:: max(1, len(self._held_out) // _JUDGED_FRAMES)]
         self._network.eval()
-        told = []
+        outputs = []
         with torch.no_grad():
             for start in range(0, len(rows), self._plan.batch_size):
-                told.append(self._tell(rows[start : start + self._plan.batch_size]).cpu().numpy())
+                outputs.append(self._predict(rows[start : start + self._plan.batch_size]).cpu().numpy())
         spread = np.where(np.isinf(self._spread), 0, self._spread)
         true, mean = self._targets.values[rows], np.broadcast_to(self._mean, (len(rows), len(self._mean)))
-        found = np.concatenate(told) * spread + mean
-        true, found, mean = (np.take_along_axis(each, self._targets.offsets[rows], 1) for each in (true, found, mean))
-        error = np.linalg.norm(found - true, axis=1)
+        predicted = np.concatenate(outputs) * spread + mean
+        true, predicted, mean = (
+            np.take_along_axis(each, self._targets.offsets[rows], 1) for each in (true, predicted, mean)
+        )
+        error = np.linalg.norm(predicted - true, axis=1)
         return PretrainResult(
             median_m=round(float(np.median(error)), 5),
             most_m=round(float(np.quantile(error, 0.9)), 5),
@@ -228,13 +230,13 @@ class _Lessons:
     def _update(self) -> float:
         plan = self._plan
         # Which frames are seen follows from the seed and the update alone, so that a stopped call goes on as if not.
-        rows = np.random.default_rng([plan.seed, self._done]).choice(self._learnt, plan.batch_size)
+        rows = np.random.default_rng([plan.seed, self._done]).choice(self._training, plan.batch_size)
         wanted = (self._targets.values[rows] - self._mean) / self._spread
         rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / plan.updates))
         for group in self._optimizer.param_groups:
             group["lr"] = plan.learning_rate * rate
         is_known = torch.from_numpy(~np.isnan(wanted)).to(self._device)
-        error = self._tell(rows) - torch.from_numpy(np.nan_to_num(wanted)).to(self._device)
+        error = self._predict(rows) - torch.from_numpy(np.nan_to_num(wanted)).to(self._device)
         # Closings count as much as openings, which are ahead for longer.
         loss = ((error.abs() * is_known).sum(0) / is_known.sum(0).clamp(min=1)).mean()
         self._optimizer.zero_grad()
@@ -243,12 +245,12 @@ class _Lessons:
         self._optimizer.step()
         return float(loss.item())
 
-    def _tell(self, rows: Rows) -> torch.Tensor:
-        """(B, K) normalised targets, as the encoder has them now."""
+    def _predict(self, rows: Rows) -> torch.Tensor:
+        """(B, K) normalised targets, as the encoder predicts them now."""
         batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
         images = [batch[key] for key in self._policy.config.image_features]
-        _, told = self._network(images, batch[_STATE], batch["task"])
-        return told
+        _, predicted = self._network(images, batch[_STATE], batch["task"])
+        return predicted
 
     def _store(self, path: Path) -> None:
         state = {
@@ -275,7 +277,8 @@ class _Lessons:
 
 
 def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
-    """Rows that are learned from, rows of the last twentieth of the episodes (one at least), and how many these are.
+    """Training rows, held-out rows (the last twentieth of the episodes, one at least), and the number of held-out
+    episodes.
 
     Raises:
         ConfigError: There are fewer than two episodes.
@@ -283,8 +286,8 @@ def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
     numbers_of = np.unique(episode)
     if len(numbers_of) < 2:
         raise ConfigError(
-            f"The gripper is told to close or to open in {len(numbers_of)} of the dataset's episodes: at least 2 are "
-            "needed, one of which is left out."
+            f"The gripper is commanded to close or to open in {len(numbers_of)} of the dataset's episodes: at least 2 "
+            "are needed, one of which is held out."
         )
     count = max(1, round(_HELD_OUT_SHARE * len(numbers_of)))
     is_held_out = np.isin(episode, numbers_of[-count:])
@@ -292,7 +295,7 @@ def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
 
 
 def _settle(out: Path, settings: dict[str, Any]) -> PretrainResult | None:
-    """Write down what decides, or compare it with what is written there; what came out, if it is done."""
+    """Write the settings, or compare them with those that are written there; the result, if it is done."""
     path = out / RESULT_NAME
     if not path.exists():
         if strangers := [each.name for each in out.iterdir() if each.name != LOCK_NAME]:
@@ -300,26 +303,17 @@ def _settle(out: Path, settings: dict[str, Any]) -> PretrainResult | None:
         replace_text(path, json.dumps({"settings": settings}, indent=1))
         return None
     try:
-        found = read_json_object(path)
-        before = found["settings"]
-        result = _read_result(found)
-        others = sorted(name for name in settings if before.get(name) != settings[name])
+        written = read_json_object(path)
+        result = PretrainResult(**written["result"]) if "result" in written else None
+        others = sorted(name for name in settings if written["settings"].get(name) != settings[name])
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DemorecError(f"{RESULT_NAME} is damaged ({describe_error(error)}): {path}") from error
     if others:
         raise ConfigError(
-            f"Another encoder is taught in this folder (another {', another '.join(others)}), choose another --out: "
+            f"Another encoder is pretrained in this folder (another {', another '.join(others)}), choose another --out: "
             f"{out}"
         )
     return result
-
-
-def _read_result(found: dict[str, Any]) -> PretrainResult | None:
-    """What is written of a finished pretraining; older versions called it "taught", and its baseline "blind_m"."""
-    values = found.get("result") or found.get("taught")
-    if values is None:
-        return None
-    return PretrainResult(**{"baseline_m" if name == "blind_m" else name: value for name, value in values.items()})
 
 
 def _deciding(policy: Any) -> dict[str, Any]:
@@ -335,7 +329,7 @@ def _digest(dataset: FastDataset) -> str:
 
 
 def _instructions(dataset: FastDataset) -> list[str]:
-    """Of the episodes that are learned from."""
+    """Those of its episodes, each once."""
     tasks = dataset.meta.tasks.index.tolist()
     return [tasks[number] for number in np.unique(_column(dataset, "task_index"))]
 
