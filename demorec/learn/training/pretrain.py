@@ -310,8 +310,8 @@ def _settle(out: Path, settings: dict[str, Any]) -> PretrainResult | None:
         raise DemorecError(f"{RESULT_NAME} is damaged ({describe_error(error)}): {path}") from error
     if others:
         raise ConfigError(
-            f"Another encoder is pretrained in this folder (another {', another '.join(others)}), choose another --out: "
-            f"{out}"
+            f"Another encoder is pretrained in this folder (another {', another '.join(others)}), choose another "
+            f"--out: {out}"
         )
     return result
 
