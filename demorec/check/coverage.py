@@ -1,18 +1,14 @@
-"""How well the episodes cover what was randomised: the largest gaps, and an image to look at."""
+"""How well the episodes cover what was randomised: the largest gaps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
 
 from demorec.check.base import Found, Measurement, worst
-from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
-from demorec.core.replacing import IMAGE, written_whole
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, yaw_of
 
@@ -23,9 +19,6 @@ MIN_VALUES = 10
 _MAX_SHARE = 1 / 8
 """A value that more of the episodes share was chosen and not drawn."""
 _TWIN_DISTANCE = 1e-4
-_SIZE, _LEFT, _TOP = 360, 56, 32
-_PLOT_WIDTH, _PLOT_HEIGHT, _PLOT_LEFT, _PLOT_BELOW = 140, 84, 44, 48
-_COLUMNS = 3
 _UNITS = {"x": "m", "y": "m", "size": "m", "mass": "kg", "yaw": "rad"}
 """Last word of a quantity's name -> its unit."""
 
@@ -147,92 +140,3 @@ def motion_vector(joint_position: Array) -> Array:
         return np.zeros(32)
     moments = np.linspace(0, len(joint_position) - 1, 32).round().astype(int)
     return np.asarray(joint_position[moments], dtype=np.float64).reshape(-1)
-
-
-def draw_coverage(infos: Sequence[EpisodeInfo], path: Path) -> None:
-    """A PNG file: starts (dots, in the object's colour) and goals (rings) from above, and a histogram per quantity.
-
-    Raises:
-        ConfigError: The file cannot be written; then none is there, or the one that was there before.
-    """
-    columns = randomised(infos)
-    rows = -(-max(len(columns), 1) // _COLUMNS)
-    height = _TOP + max(_SIZE + _PLOT_BELOW, rows * (_PLOT_HEIGHT + _PLOT_BELOW))
-    width = _LEFT + _SIZE + min(len(columns), _COLUMNS) * (_PLOT_LEFT + _PLOT_WIDTH) + _TOP
-    image = Image.new("RGB", (width, height), "white")
-    draw = ImageDraw.Draw(image)
-    _draw_map(draw, infos)
-    for number, (name, values) in enumerate(columns.items()):
-        left = _LEFT + _SIZE + (number % _COLUMNS) * (_PLOT_LEFT + _PLOT_WIDTH) + _PLOT_LEFT
-        top = _TOP + (number // _COLUMNS) * (_PLOT_HEIGHT + _PLOT_BELOW)
-        _draw_histogram(draw, name, values, left, top)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(path, IMAGE) as part:
-            image.save(part, format="png")
-    except OSError as error:
-        raise ConfigError(f"The image cannot be written ({error.strerror or error}): {path}") from error
-
-
-def _draw_map(draw: ImageDraw.ImageDraw, infos: Sequence[EpisodeInfo]) -> None:
-    starts = [
-        (info.scene.body(g.object), info.scene.world_from_goal(g).position) for info in infos for g in info.scene.goals
-    ]
-    draw.rectangle((_LEFT, _TOP, _LEFT + _SIZE, _TOP + _SIZE), outline="grey")
-    if not starts:
-        return
-    points = np.array(
-        [[*body.world_from_body.position[:2]] for body, _ in starts] + [[*goal[:2]] for _, goal in starts]
-    )
-    low, high = points.min(axis=0), points.max(axis=0)
-    side = max(float((high - low).max()), 1e-6) * 1.1
-    middle = (low + high) / 2
-
-    def place(x: float, y: float) -> tuple[float, float]:
-        # From above, the robot at the bottom looking up: x up, y to the left.
-        return (
-            _LEFT + _SIZE / 2 - (y - middle[1]) / side * _SIZE,
-            _TOP + _SIZE / 2 - (x - middle[0]) / side * _SIZE,
-        )
-
-    for tick in ticks(middle[0] - side / 2, middle[0] + side / 2):
-        _, v = place(tick, middle[1])
-        draw.line((_LEFT - 5, v, _LEFT, v), fill="black")
-        draw.text((_LEFT - 8, v), f"{tick:g}", fill="black", anchor="rm")
-    for tick in ticks(middle[1] - side / 2, middle[1] + side / 2):
-        u, _ = place(middle[0], tick)
-        draw.line((u, _TOP + _SIZE, u, _TOP + _SIZE + 5), fill="black")
-        draw.text((u, _TOP + _SIZE + 8), f"{tick:g}", fill="black", anchor="mt")
-    draw.text((4, _TOP - 8), "x (m)", fill="black", anchor="lb")
-    draw.text((_LEFT + _SIZE / 2, _TOP + _SIZE + 26), "y (m)", fill="black", anchor="mt")
-    for body, goal in starts:
-        u, v = place(float(goal[0]), float(goal[1]))
-        draw.ellipse((u - 4, v - 4, u + 4, v + 4), outline="grey")
-        u, v = place(float(body.world_from_body.position[0]), float(body.world_from_body.position[1]))
-        color = tuple(int(255 * channel) for channel in body.rgba[:3])
-        draw.ellipse((u - 3, v - 3, u + 3, v + 3), fill=color)
-    title = f"{len(infos)} episodes from above, the robot below: starts (dots), goals (rings)"
-    draw.text((_LEFT, _TOP - 8), title, fill="black", anchor="lb")
-
-
-def ticks(low: float, high: float) -> list[float]:
-    """Three to eight round numbers in a range."""
-    rough = (high - low) / 8
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough)
-    return [round(number * step, 9) for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
-
-
-def _draw_histogram(draw: ImageDraw.ImageDraw, name: str, values: Array, left: int, top: int) -> None:
-    counts, edges = np.histogram(values, bins=14)
-    bottom, most = top + _PLOT_HEIGHT, max(int(counts.max()), 1)
-    draw.text((left, top - 6), with_unit(name), fill="black", anchor="lb")
-    draw.rectangle((left, top, left + _PLOT_WIDTH, bottom), outline="grey")
-    for number, count in enumerate(counts.tolist()):
-        bar = _PLOT_HEIGHT * count / most
-        draw.rectangle((left + 10 * number + 1, bottom - bar, left + 10 * number + 8, bottom), fill=(70, 110, 180))
-    draw.text((left, bottom + 4), f"{edges[0]:.3g}", fill="black", anchor="lt")
-    draw.text((left + _PLOT_WIDTH, bottom + 4), f"{edges[-1]:.3g}", fill="black", anchor="rt")
-    draw.text((left - 4, top), str(most), fill="black", anchor="rt")
-    draw.text((left - 4, bottom), "0", fill="black", anchor="rb")
-    draw.text((left + _PLOT_WIDTH / 2, bottom + 18), "episodes per bin", fill="grey", anchor="mt")

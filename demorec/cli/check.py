@@ -15,16 +15,14 @@ from demorec.cli.replay import demonstrations, describe_replay
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import need_paths, places_read, reading, refuse_inside, tell_unfinished
+from demorec.cli.shared.paths import need_paths, reading, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, OptionError, describe_error
-from demorec.core.replacing import IMAGE, check_replaceable
 from demorec.robots.motors import MotorUnits
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
     from demorec.check.report import CheckOptions, Subject, SubjectReport
-    from demorec.episode.info import EpisodeInfo
     from demorec.replay import ReplayReport
     from demorec.replay.deep import DeepReport
 
@@ -76,10 +74,6 @@ class Check:
     deep: bool = False
     """Also make every recording, and every episode of a dataset, again from config and seed, and compare every number
     and image; takes about as long as generating them."""
-    coverage_image: Path | None = None
-    """Draw start places, goals and ranges of all episodes into this PNG file."""
-    overwrite: bool = False
-    """Replace the image of --coverage-image, if it is there."""
     workers: int | None = None
     """Processes (auto: one for each core, or one alone where starting them would take longer than the checks)."""
     verbose: bool = False
@@ -95,11 +89,6 @@ class Check:
         need_paths(self.paths, "check")
         if self.replay < 0:
             raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
-        if (image := self.coverage_image) is not None:
-            if image.suffix.lower() != ".png":
-                raise ConfigError(f"--coverage-image writes a .png file, found the name {image.name!r}.")
-            check_replaceable(image, IMAGE, overwrite=self.overwrite, sources=places_read(self.paths))
-            refuse_inside([image])
         with reading(self.paths, self.mapping) as paths:
             return replace(self, paths=paths)._check()
 
@@ -136,8 +125,6 @@ class Check:
                 if not self.json:
                     say(describe_replay(replayed))
         remade = list(self._remade(subjects, options)) if self.deep else []
-        if self.coverage_image is not None:
-            self._draw(self.coverage_image, subjects)
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
         diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
@@ -177,34 +164,12 @@ class Check:
                     say(*deep_lines(report, verbose=self.verbose))
                 yield report
 
-    def _draw(self, path: Path, subjects: Sequence[Subject]) -> None:
-        from demorec.check.coverage import draw_coverage
-
-        infos = list(_infos(subjects))
-        draw_coverage(infos, path)
-        if not self.json:
-            say(f"Coverage of {counted(len(infos), 'episode')}: {path}")
-
 
 def _split(subjects: Sequence[Subject]) -> tuple[list[Path], list[Path]]:
     """Recordings, and datasets but for those of the runs, which hold the same episodes once more."""
     runs = [subject.path for subject in subjects if subject.kind == "run"]
     datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
     return [subject.path for subject in subjects if subject.kind == "recording"], datasets
-
-
-def _infos(subjects: Sequence[Subject]) -> Iterator[EpisodeInfo]:
-    """Of every successful episode of runs, every recording, and every episode of datasets."""
-    from demorec.check.dataset import Dataset
-    from demorec.mcap import open_recording
-
-    _, datasets = _split(subjects)
-    for subject in subjects:
-        if subject.kind == "recording" and subject.path.parent.name != "failed":
-            with open_recording(subject.path, simulated=True) as recording:
-                yield recording.info
-        elif subject.kind == "dataset" and subject.path in datasets:
-            yield from Dataset(subject.path).infos
 
 
 def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[tuple[ReplayReport, bool]]:

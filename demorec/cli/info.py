@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,6 @@ from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import Found, expect
 
 if TYPE_CHECKING:
-    from demorec.episode.info import Origin
-    from demorec.mcap.summary import CameraSummary, FeatureSummary, RecordingSummary
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
@@ -72,90 +70,87 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.core.plain import to_plain
     from demorec.mcap.summary import summarize
 
-    summary = summarize(path)
-    kind = "recording" if summary.is_simulated else "external recording"
-    return {"kind": kind, **to_plain(summary)}, _recording_lines(summary)
-
-
-def _recording_lines(summary: RecordingSummary) -> list[str]:
-    form = f"format {summary.format_version}" if summary.is_simulated else f"external, format {summary.format_version}"
+    plain = summarize(path)
+    is_simulated = plain["kind"] == "recording"
+    form = f"{'' if is_simulated else 'external, '}format {plain['format_version']}"
+    rate = f", {plain['rate']:.2f} Hz (nominal {plain['fps']} Hz)"
+    if is_simulated:
+        rate = f" at {plain['fps']} Hz (physics {plain['physics_hz']} Hz)"
     facts = [
-        ("recording", f"{summary.path} ({size_in_words(summary.bytes)}, {form})"),
-        ("instruction", summary.instruction),
-        ("episode", _episode(summary)),
-        ("outcome", _outcome(summary)),
-        ("length", f"{summary.frames} frames, {summary.seconds:.2f} s{_rate(summary)}"),
-        ("robot", summary.robot if summary.is_simulated or not summary.has_urdf else f"{summary.robot} (URDF known)"),
+        ("recording", f"{path} ({size_in_words(plain['bytes'])}, {form})"),
+        ("instruction", plain["instruction"]),
+        ("episode", _episode(plain)),
+        ("outcome", _outcome(plain)),
+        ("length", f"{plain['frames']} frames, {plain['seconds']:.2f} s{rate}"),
+        ("robot", plain["robot"] + (" (URDF known)" if plain["has_urdf"] and not is_simulated else "")),
     ]
-    if summary.is_simulated:
-        facts.append(("objects", ", ".join(summary.objects) or "none"))
-    if summary.origin:
-        facts.append(("origin", _origin(summary.origin)))
-    facts += [(f"feature {feature.name}", ", ".join(_feature(feature))) for feature in summary.features]
-    facts += [(f"camera {camera.name}", ", ".join(_camera(summary, camera))) for camera in summary.cameras]
-    facts += [(f"dropped {what}", str(count)) for what, count in summary.drops.items()]
-    for check in summary.checks:
-        verdict = "passed" if check.passed else "FAILED"
-        value = f"{check.value:.4g} {check.unit}".rstrip()
-        facts.append((f"check {check.name}", f"{verdict}: {value} (limit {check.limit:.4g})"))
-    facts.append(("digest", summary.digest[:16]))
-    versions = ", ".join(f"{name} {version}" for name, version in summary.versions.items())
+    if is_simulated:
+        facts.append(("objects", ", ".join(plain["objects"]) or "none"))
+    if origin := plain["origin"]:
+        facts.append(("origin", origin if isinstance(origin, str) else _origin(origin)))
+    facts += [(f"feature {feature['name']}", ", ".join(_feature(feature))) for feature in plain["features"]]
+    facts += [(f"camera {camera['name']}", ", ".join(_camera(camera, is_simulated))) for camera in plain["cameras"]]
+    facts += [(f"dropped {what}", str(count)) for what, count in plain["drops"].items()]
+    for check in plain["checks"]:
+        verdict = "passed" if check["passed"] else "FAILED"
+        value = f"{check['value']:.4g} {check['unit']}".rstrip()
+        facts.append((f"check {check['name']}", f"{verdict}: {value} (limit {check['limit']:.4g})"))
+    facts.append(("digest", plain["digest"][:16]))
+    versions = ", ".join(f"{name} {version}" for name, version in plain["versions"].items())
     facts.append(("made with", versions or "unknown"))
-    streams = [(stream.topic, str(stream.messages), stream.type) for stream in summary.streams]
-    return [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
+    streams = [(stream["topic"], str(stream["messages"]), stream["type"]) for stream in plain["streams"]]
+    return plain, [*aligned(facts), "", *aligned([("topic", "messages", "type"), *streams])]
 
 
-def _episode(summary: RecordingSummary) -> str:
-    if not summary.is_simulated:
-        return str(summary.episode_index)
-    attempt = f", attempt {summary.attempt}" if summary.attempt else ""
-    return f"{summary.task}, seed {summary.root_seed}, episode {summary.episode_index}{attempt}"
+def _episode(plain: Mapping[str, Any]) -> str:
+    if plain["task"] is None:
+        return str(plain["episode_index"])
+    attempt = f", attempt {plain['attempt']}" if plain["attempt"] else ""
+    return f"{plain['task']}, seed {plain['root_seed']}, episode {plain['episode_index']}{attempt}"
 
 
-def _outcome(summary: RecordingSummary) -> str:
-    if summary.is_recovered:
+def _outcome(plain: Mapping[str, Any]) -> str:
+    reason = plain["failure_reason"]
+    if plain["is_recovered"]:
         return "unknown: recovered after a crash"
-    if not summary.is_simulated:
-        return _SUCCESS_WORDS[summary.success] + (f": {summary.failure_reason}" if summary.failure_reason else "")
-    retries = f" after {summary.retries} retries" if summary.retries else ""
-    if summary.success:
+    if plain["task"] is None:
+        return _SUCCESS_WORDS[plain["success"]] + (f": {reason}" if reason else "")
+    retries = f" after {plain['retries']} retries" if plain["retries"] else ""
+    if plain["success"]:
         return f"success{retries}"
-    return f"failure in phase {summary.failure_phase or 'unknown'}: {summary.failure_reason or 'unknown'}{retries}"
+    return f"failure in phase {plain['failure_phase'] or 'unknown'}: {reason or 'unknown'}{retries}"
 
 
-def _rate(summary: RecordingSummary) -> str:
-    if summary.is_simulated:
-        return f" at {summary.fps} Hz (physics {summary.physics_hz} Hz)"
-    return f", {summary.rate:.2f} Hz (nominal {summary.fps} Hz)"
+def _origin(origin: Mapping[str, Any]) -> str:
+    return " ".join([origin["kind"], *(file["name"] for file in origin["files"])])
 
 
-def _origin(origin: str | Origin) -> str:
-    return origin if isinstance(origin, str) else " ".join([origin.kind, *(file.name for file in origin.files)])
+def _feature(feature: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{len(feature['elements'])} {feature['dtype']}"
+    yield f"at most {1000 * feature['oldest']:.3g} ms old"
+    if feature["source"]:
+        yield feature["source"]
 
 
-def _feature(feature: FeatureSummary) -> Iterator[str]:
-    yield f"{len(feature.elements)} {feature.dtype}"
-    yield f"at most {1000 * feature.oldest:.3g} ms old"
-    if feature.source:
-        yield feature.source
-
-
-def _camera(summary: RecordingSummary, camera: CameraSummary) -> Iterator[str]:
-    video = camera.video
-    yield f"{video.width}x{video.height} {video.codec}{' as it came' if camera.is_kept else ''}"
-    if summary.is_simulated:
-        yield f"quality {video.jpeg_quality}" if video.codec == "jpeg" else f"GOP {video.gop}, crf {video.crf}"
-        yield from (name for name, there in (("depth", camera.depth), ("segmentation", camera.segmentation)) if there)
+def _camera(camera: Mapping[str, Any], is_simulated: bool) -> Iterator[str]:
+    video = camera["video"]
+    yield f"{video['width']}x{video['height']} {video['codec']}{' as it came' if camera['is_kept'] else ''}"
+    if is_simulated:
+        yield (
+            f"quality {video['jpeg_quality']}"
+            if video["codec"] == "jpeg"
+            else f"GOP {video['gop']}, crf {video['crf']}"
+        )
+        yield from (name for name in ("depth", "segmentation") if camera[name])
         return
-    yield counted(camera.images, "image")
-    yield f"at most {1000 * camera.oldest:.3g} ms old"
-    if camera.frames_without:
-        yield f"{counted(camera.frames_without, 'frame')} without"
-    if camera.source:
-        yield camera.source
+    yield counted(camera["images"], "image")
+    yield f"at most {1000 * camera['oldest']:.3g} ms old"
+    if camera["frames_without"]:
+        yield f"{counted(camera['frames_without'], 'frame')} without"
+    if camera["source"]:
+        yield camera["source"]
 
 
 def _run(path: Path) -> tuple[dict[str, Any], list[str]]:

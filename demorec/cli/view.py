@@ -82,7 +82,6 @@ class View:
             return replace(self, paths=paths)._view()
 
     def _view(self) -> int:
-        from demorec.view.glyphs import drawable_source
         from demorec.view.save import numbered, save, save_comparison, save_each
         from demorec.view.sources import find_episodes, select
         from demorec.view.viewer import need_screen
@@ -112,22 +111,13 @@ class View:
                     say(f"{size_in_words(target.stat().st_size)}: {target}")
             if self.screenshot is None:
                 return 0
-        missing: set[str] = set()
-        if self.screenshot is not None:
-            sources = [drawable_source(source, missing) for source in sources]
         with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
             if self.compare:
                 files = [Path(folder) / "comparison.rrd"]
                 save_comparison(sources[0], sources[1], files[0])
             else:
                 files = save_each(sources, Path(folder))
-            code = self._show(files, sources)
-        if missing:
-            tell(
-                f"The image lacks {len(missing)} characters for which Rerun's viewer without a screen has no "
-                f"font ({''.join(sorted(missing)[:20])}); the window, --web and --save keep them."
-            )
-        return code
+            return self._show(files, sources)
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""

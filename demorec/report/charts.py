@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.coverage import ticks
 from demorec.core.geometry import Array
 from demorec.episode.info import EpisodeInfo
 from demorec.report.content import ReportedEpisode
@@ -107,7 +107,7 @@ def floor_map(members: Sequence[tuple[int, ReportedEpisode, EpisodeInfo]]) -> di
         return [[round(value, 1) for value in point] for point in found.tolist()]
 
     def grid(axis: int) -> list[tuple[float, str]]:
-        values = ticks(middle[axis] - side / 2, middle[axis] + side / 2)
+        values = _ticks(middle[axis] - side / 2, middle[axis] + side / 2)
         points = drawn(np.array([values, values]).T)
         return [(point[1 - axis], f"{value:g}") for value, point in zip(values, points, strict=True)]
 
@@ -139,3 +139,11 @@ def phase_bar(episode: ReportedEpisode, moments: int, colors: Mapping[str, str])
         title = f"{name}, frames {first} to {end - 1}"
         bars.append((title, f"{left:.6g}", f"{right - left:.6g}", colors[name]))
     return bars
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Three to eight round numbers in a range."""
+    rough = (high - low) / 8
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough)
+    return [round(number * step, 9) for number in range(math.ceil(low / step), math.floor(high / step) + 1)]

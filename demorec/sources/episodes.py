@@ -10,8 +10,7 @@ from demorec.core.plain import listed
 from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import NS, Int, Timeline
-from demorec.sources.fields import FieldError
-from demorec.sources.mapping import Episodes, SourceMapping
+from demorec.sources.mapping import SourceMapping
 from demorec.sources.streams import BagStreams, Text
 from demorec.sources.words import task_in_name
 
@@ -55,37 +54,19 @@ def windows(bag: Bag, streams: BagStreams, timelines: list[Timeline], mapping: S
         return found
     if episodes.cut == "gap":
         return _between_gaps(timelines, episodes.gap_s)
-    is_service = episodes.cut == "service"
-    markers = _calls(bag, streams, episodes) if is_service else streams.texts[episodes.topic]
+    markers = streams.texts[episodes.topic]
     if unknown := _unknown_words(markers, mapping):
         raise BagError(
-            f"{'Calls' if is_service else 'Markers'} of {episodes.topic} say {unknown}, which the mapping "
+            f"Markers of {episodes.topic} say {unknown}, which the mapping "
             f"does not know: put it into episodes.discard (the episode is left out) or episodes.ignore, or set start, "
             f"stop, success or failure: {bag.path}"
         )
-    found = _between_markers(markers, mapping)
-    if found:
+    if found := _between_markers(markers, mapping):
         return found
-    if episodes.start_topic:
-        reason = f"No call of {episodes.start_topic} is followed by one of {episodes.stop_topic}"
-    elif is_service:
-        reason = f"No call of {episodes.topic} with true (or {episodes.start!r}) in {episodes.field!r} is followed by "
-        reason += f"one with false (or {episodes.stop!r})"
-    else:
-        reason = f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}"
-    raise BagError(f"{reason}, so there is no episode: {bag.path}")
-
-
-def _calls(bag: Bag, streams: BagStreams, episodes: Episodes) -> list[Text]:
-    """The calls of services as markers."""
-    try:
-        if episodes.topic:
-            calls = streams.calls[episodes.topic].calls()
-            return [Text(time_ns=call.time_ns, value=call.value(episodes.field)) for call in calls]
-        ends = ((episodes.start_topic, episodes.start), (episodes.stop_topic, episodes.stop))
-        return [Text(time_ns=call.time_ns, value=word) for topic, word in ends for call in streams.calls[topic].calls()]
-    except FieldError as error:
-        raise BagError(f"The calls of {episodes.topic} cannot be used, since {error}: {bag.path}") from error
+    raise BagError(
+        f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}, so there is no episode: "
+        f"{bag.path}"
+    )
 
 
 def _between_gaps(timelines: list[Timeline], gap_s: float) -> list[Window]:

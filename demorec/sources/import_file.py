@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from demorec.runs.run_file import IMPORT_NAME
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import NS
 from demorec.sources.findings import NOTE, Finding, lost_in
-from demorec.sources.mapping import SourceMapping
 from demorec.sources.rows import EpisodeRows, Timelines
 
 
@@ -220,14 +220,14 @@ class ImportFile:
 
     Attributes:
         format: Of this file.
-        mapping: Of all bags.
+        mapping: Of all bags, as plain data: that of an older release may have other keys.
         mapping_digest: Of it.
         bags: What was read, in order; those that are not whole yet are missing.
         skipped: What was left out, when it was last given.
     """
 
     format: int = FORMAT
-    mapping: SourceMapping
+    mapping: Mapping[str, Any]
     mapping_digest: str
     bags: tuple[BagReport, ...] = ()
     skipped: tuple[SkippedBag, ...] = ()

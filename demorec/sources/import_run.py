@@ -16,6 +16,7 @@ import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
+from demorec.core.plain import to_plain
 from demorec.episode.info import SourceFile
 from demorec.episode.validity import find_problems
 from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
@@ -89,7 +90,7 @@ def import_bags(
     importer = _Importer(mapping, urdf_text(mapping.robot.urdf, mapping_path), video or VideoConfig())
     known = load_import_file(out)
     if known is None or not known.bags:
-        known = ImportFile(mapping=mapping, mapping_digest=mapping.digest)
+        known = ImportFile(mapping=to_plain(mapping), mapping_digest=mapping.digest)
     if known.mapping_digest != mapping.digest:
         raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
     given = list(dict.fromkeys(bag for path in paths for bag in bags_in(path)))

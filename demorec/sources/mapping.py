@@ -197,11 +197,9 @@ class Episodes:
     """Where one episode ends and another begins.
 
     Attributes:
-        cut: A bag is an episode; or markers, calls of a service, a gap in the rows' streams, or a list of times cut it.
-        topic: Of the markers, or of the service's events: "/record/_service_event".
-        field: Of the text, number or boolean in a marker, or in the request of a call.
-        start_topic, stop_topic: In place of topic: of the events of two services, a call of one beginning an episode
-            and a call of the other ending it.
+        cut: A bag is an episode; or markers, a gap in the rows' streams, or a list of times cut it.
+        topic: Of the markers.
+        field: Of the text, number or boolean in a marker.
         start, stop: Texts of markers that begin and end an episode (text only; a boolean does both).
         success, failure: Texts of markers that say how it ended. Of an HDF5 file, success is an attribute of the
             episode that says whether it is one, or a dataset whose last row is above 0 then.
@@ -213,11 +211,9 @@ class Episodes:
         times_s: [begin, end] of each episode, seconds from the bag's first message.
     """
 
-    cut: Literal["file", "marker", "service", "gap", "times"] = _bag("file")
+    cut: Literal["file", "marker", "gap", "times"] = _bag("file")
     topic: str = _bag("")
     field: str = _bag("data")
-    start_topic: str = _bag("")
-    stop_topic: str = _bag("")
     start: str = _bag("start")
     stop: str = _bag("stop")
     success: str = "success"
@@ -228,11 +224,6 @@ class Episodes:
     times_s: tuple[tuple[float, float], ...] = _bag(())
     group: str = _hdf5("")
     mask: str = _hdf5("")
-
-    @property
-    def services(self) -> frozenset[str]:
-        """Topics of the events of services that cut."""
-        return frozenset({self.topic, self.start_topic, self.stop_topic} - {""} if self.cut == "service" else ())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,6 +254,8 @@ class SourceMapping:
         said = _said(self, self.kind)
         del said[KIND]
         said["clock"]["fps"] = self.clock.fps or None  # as it was when runs were begun that may be continued
+        if self.kind == "bag":
+            said["episodes"] |= {"start_topic": "", "stop_topic": ""}  # the same
         return digest(said)
 
     @property
@@ -278,7 +271,7 @@ class SourceMapping:
         }
         if self.episodes.cut == "marker":
             named.add(self.episodes.topic)
-        return frozenset(named - {""}) | self.episodes.services
+        return frozenset(named - {""})
 
     def leaves_out(self, dataset: str) -> bool:
         """Whether it says that a dataset, or a group that holds it, shall not be imported."""

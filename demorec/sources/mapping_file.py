@@ -176,11 +176,6 @@ def _bag_problems(mapping: SourceMapping) -> Iterator[str]:
         yield f"subtasks.field is {mapping.subtasks.field!r}, but another field of the same topic is taken for texts"
     if episodes.cut == "marker" and not episodes.topic:
         yield 'episodes.cut = "marker" needs episodes.topic'
-    given = (bool(episodes.topic), bool(episodes.start_topic), bool(episodes.stop_topic))
-    if episodes.cut == "service" and given not in ((True, False, False), (False, True, True)):
-        yield 'episodes.cut = "service" needs either episodes.topic, or start_topic and stop_topic'
-    if episodes.cut != "service" and any(given[1:]):
-        yield 'episodes.start_topic and stop_topic are for episodes.cut = "service" alone'
     if episodes.cut == "times" and not episodes.times_s:
         yield 'episodes.cut = "times" needs episodes.times_s'
     if any(not begin < end for begin, end in episodes.times_s):

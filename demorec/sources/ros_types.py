@@ -128,9 +128,7 @@ _parsed: dict[tuple[str, str, bytes], Types] = {}
 
 def _parsed_types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Types:
     try:
-        if "/srv/" in name:
-            parsed = _service_event(name, schema.decode(), steps)
-        elif schema_encoding in ("ros2msg", "ros1msg"):
+        if schema_encoding in ("ros2msg", "ros1msg"):
             parsed = _from_msg(schema.decode(), name, steps)
         elif schema_encoding == "ros2idl":
             parsed = {}
@@ -163,29 +161,3 @@ def _field_type(name: str, description: Any) -> FieldType:
     if inner not in (Nodetype.BASE, Nodetype.NAME):
         raise ValueError("it has lists of lists, which are not read")
     return FieldType(name, of[0] if inner == Nodetype.BASE else of, True, length if kind == Nodetype.ARRAY else None)
-
-
-def _service_event(name: str, text: str, steps: Budget) -> dict[str, Any]:
-    """The types of a service's events: rosbag2 writes the definition of the service, from which they follow.
-
-    It has a line of "=", "SRV: " and the name in front, and requests and responses apart by "---".
-    """
-    package, _, event = name.split("/", 2)
-    service = event.removesuffix("_Event")
-    if not text.strip():
-        raise ValueError(f"it comes without the definition of the service {package}/srv/{service}")
-    first, *others = [part for part in text.split(_SEPARATOR) if part.strip()]
-    head, _, body = first.partition("\n")
-    if event == service or head.strip() != f"SRV: {package}/srv/{service}":
-        raise ValueError(f"its definition is not that of the service {package}/srv/{service}")
-    request, _, response = f"\n{body}".partition("\n---")
-    types: dict[str, Any] = {}
-    for part, fields in (("Request", request), ("Response", response)):
-        types |= _from_msg(_SEPARATOR.join([f"{fields}\n", *others]), f"{package}/msg/{service}_{part}", steps)
-    event_type = "service_msgs/ServiceEventInfo info\n" + "".join(
-        f"{package}/{service}_{part}[<=1] {part.lower()}\n" for part in ("Request", "Response")
-    )
-    ((_, definition),) = _from_msg(event_type, f"{package}/msg/{event}", steps).items()
-    known = get_typestore(Stores.ROS2_JAZZY).fielddefs
-    info = "service_msgs/msg/ServiceEventInfo"
-    return {**types, info: known[info], name: definition}

@@ -26,7 +26,6 @@ from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import (
-    FieldError,
     OtherPublisherError,
     SourceLayout,
     SourceReader,
@@ -41,7 +40,6 @@ from demorec.sources.fields import (
 from demorec.sources.image_messages import ImageHeads, image_head
 from demorec.sources.mapping import Source, SourceMapping
 from demorec.sources.ros_types import Budgets
-from demorec.sources.service_calls import CallReader
 from demorec.sources.words import quoted
 
 NO_STAMP = -(2**63)
@@ -216,7 +214,6 @@ class BagStreams:
         cameras: Name of a camera -> its stream.
         infos: Name of a camera -> its first calibration message.
         texts: Topic -> its texts.
-        calls: Topic of a service's events -> its calls.
         problems: Why parts of the bag could not be read.
         num_bytes: As given.
     """
@@ -247,8 +244,6 @@ class BagStreams:
             self._fields[mapping.episodes.topic] = mapping.episodes.field
         self._fields.pop("", None)
         self.texts: dict[str, list[Text]] = {topic: [] for topic in self._fields}
-        by_header = mapping.clock.stamp == "header"
-        self.calls = {topic: CallReader(by_header=by_header) for topic in mapping.episodes.services}
         self.infos: dict[str, Values] = {}
         self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
         self._wanted = mapping.topics
@@ -274,22 +269,17 @@ class BagStreams:
         except (ValueError, RecursionError, OverflowError, TypeError) as error:
             for stream in streams:
                 stream.malformed(str(error))
-            if topic in self.texts or topic in self.calls:
+            if topic in self.texts:
                 self._refused[topic] = describe_error(error)
             return
         checksum = zlib.crc32(message.data)
         for stream in streams:
             stream.add(number, message, values, checksum)
-        if (topic in self.texts or topic in self.calls) and not self._decoder.may_keep(message):
-            self._refused[topic] = "it holds too much to be kept in memory"
-            return
         if topic in self.texts:
+            if not self._decoder.may_keep(message):
+                self._refused[topic] = "it holds too much to be kept in memory"
+                return
             self._add_text(topic, message, values)
-        if topic in self.calls:
-            try:
-                self.calls[topic].add(values, message.log_ns)
-            except FieldError as error:
-                self._refused[topic] = str(error)
         if topic in self._info_topics:
             kept = {key: values[key] for key in _INFO_FIELDS if key in values} | {"frame_id": frame_id_of(values)}
             self.infos.setdefault(self._info_topics[topic], kept)

@@ -125,7 +125,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action])]
-    lines += [*_services(topics), *_subtasks(topics), *_features(state, action, others)]
+    lines += [*_subtasks(topics), *_features(state, action, others)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
         lines += [] if topics[topic].has_stamp else [_LOG]
@@ -321,13 +321,6 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Se
 def _is_depth(topic: _Topic) -> bool:
     head = _head(topic.values[0]) if topic.values else None
     return head is not None and head.encoding in DEPTH_UNITS
-
-
-def _services(topics: Mapping[str, _Topic]) -> Iterator[str]:
-    """Services whose calls may begin and end episodes."""
-    for name in (name for name in sorted(topics) if name.endswith("/_service_event")):
-        yield from ("", "# [episodes]", '# cut = "service"  # calls of it cut the bag, by a boolean in their requests')
-        yield f"# topic = {quoted(name)}"
 
 
 def _features(state: Sequence[Vector], action: Sequence[Vector], others: Sequence[Vector]) -> Iterator[str]:

@@ -454,9 +454,7 @@ def test_view_saves_over_rerun_files_only(place: Path, capsys: pytest.CaptureFix
     assert files_of(place.parent) == before
 
 
-@pytest.mark.parametrize("command", ["view", "check"])
-def test_images_replace_images_only(place: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
-    flag = {"view": "--screenshot", "check": "--coverage-image"}[command]
+def test_screenshots_replace_images_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "thesis.png").write_text("years of work")
     (place / "link.png").symlink_to(place / "alone.mcap")
     frame = place / "dataset" / "images" / "front" / "episode-000000" / "frame-000000.png"
@@ -469,9 +467,9 @@ def test_images_replace_images_only(place: Path, capsys: pytest.CaptureFixture[s
         ("alone.mcap", "link.png", "this command reads it"),
         ("dataset", frame, "it lies in what this command reads"),
     ):
-        assert exit_code(command, place / source, flag, place / target, "--overwrite") == 2
+        assert exit_code("view", place / source, "--screenshot", place / target, "--overwrite") == 2
         assert word in capsys.readouterr().err
-    assert exit_code(command, place / "alone.mcap", flag, place / "photo.png") == 2
+    assert exit_code("view", place / "alone.mcap", "--screenshot", place / "photo.png") == 2
     assert "--overwrite to replace it" in capsys.readouterr().err
     assert files_of(place.parent) == before
 
@@ -487,7 +485,7 @@ def test_an_empty_file_is_not_replaced(place: Path, capsys: pytest.CaptureFixtur
         "hdf5": ("export", "hdf5", recording, "--out", target),
         "rrd": ("view", recording, "--save", target),
         "html": ("report", recording, "--out", target),
-        "png": ("check", place / "runs/run", "--coverage-image", target),
+        "png": ("view", recording, "--screenshot", target),
     }
     for flags in ((), ("--overwrite",)):
         assert exit_code(*commands[suffix], *flags) == 2
@@ -535,8 +533,7 @@ def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixtu
 
 INSIDE: dict[str, Sequence[str]] = {
     "view --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/v.rrd", "dataset/data/v.rrd"),
-    "view --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png"),
-    "check --coverage-image": ("runs/other/episodes/v.png", "dataset/v.png"),
+    "view --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png", "dataset/v.png"),
     "report --out": ("runs/other/episodes/v.html", "dataset/v.html"),
     "render --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
     "replay --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),

@@ -54,7 +54,7 @@ info_topic = "/info"
 _EXTRAS = (
     '[episodes]\ncut = "marker"\ntopic = "/text"\n', '[episodes]\ncut = "gap"\ngap_s = 0.01\n',
     '[episodes]\ncut = "times"\ntimes_s = [[0.0, 0.2], [0.1, 0.3]]\n', '[subtasks]\ntopic = "/text"\n',
-    '[episodes]\ncut = "service"\ntopic = "/text"\n', "",
+    "",
 )  # fmt: skip
 
 

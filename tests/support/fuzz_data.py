@@ -196,7 +196,7 @@ class FuzzedData:
         commands = (
             ["info", path], ["info", path, "--json"], ["check", path],
             ["report", path, "--out", self.folder / "out.html"],
-            ["check", path, "--no-images", "--coverage-image", self.folder / "out.png"],
+            ["check", path, "--no-images"],
             ["view", path, "--save", self.folder / "out.rrd"],
             ["view", path, self._good, "--compare", "--save", self.folder / "out.rrd"],
             [*lerobot, "--privileged"], [*lerobot, "--action", "ee_delta"],
