@@ -161,11 +161,10 @@ class ContentReader:
             sets = video.parameter_sets()
         except ExportError:  # packets that cannot be told apart by episode; whether there are any, decoding shows
             return None
-        assert isinstance(video.samples, bytes)
         head = (
             f"{video.codec} {video.width} {video.height} {video.lead} {video.tail} {video.sizes.tolist()} {len(sets)}"
         )
-        return hashlib.sha256(b"".join((head.encode(), sets, video.samples))).digest()
+        return hashlib.sha256(b"".join((head.encode(), sets, video.read()))).digest()
 
 
 def _values(array: Any, feature: DatasetFeature, root: Path) -> NDArray[Any]:

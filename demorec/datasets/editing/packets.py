@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo, FilePosition
-from demorec.datasets.lerobot.mp4 import EncodedVideo
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Stored
 from demorec.datasets.lerobot.mp4_index import Mp4Index, mp4_index
 from demorec.datasets.lerobot.reader import EpisodePlace
 from demorec.datasets.lerobot.videos import access_units, codec_of, opened_video
@@ -56,8 +56,11 @@ class _VideoFile:
         """The images of the frames from one to before another."""
         return self.order[np.searchsorted(self._sorted, begin) : np.searchsorted(self._sorted, end)]
 
-    def first_image(self, sample: bytes) -> bytes:
+    def first_image(self, begin: int, size: int) -> bytes:
         """A first image as it was encoded: behind the parameter sets, which of H.264 and HEVC are those of the file."""
+        if self.codec != "av1" and self._head:
+            return self._head
+        sample = Stored(path=self.path, spans=((begin, size),)).read()
         if self.codec == "av1":
             return b"\x12\x00" + sample
         if not self._head:
@@ -123,13 +126,13 @@ class PacketCutter:
         lead, count = begin - int(file.frames[keys[-1]]), last - first
         shifts = places - np.arange(len(places))
         sizes = file.index.sizes[part]
-        samples = _read(path, file.index.offsets[part], sizes)
+        spans = _spans(file.index.offsets[part], sizes)
         return EncodedVideo(
             codec=_MP4_NAMES.get(file.codec, file.codec),
             width=file.size[0],
             height=file.size[1],
-            first=file.first_image(samples[: int(sizes[0])]),
-            samples=samples,
+            first=file.first_image(spans[0][0], int(sizes[0])),
+            samples=Stored(path=path, spans=spans),
             sizes=sizes,
             is_keyframe=file.index.is_keyframe[part],
             lead=lead,
@@ -153,13 +156,9 @@ def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np
         end += 1
 
 
-def _read(path: Path, offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> bytes:
-    with path.open("rb") as file:
-        if np.array_equal(offsets[1:], (offsets + sizes)[:-1]):
-            file.seek(int(offsets[0]))
-            return file.read(int(sizes.sum()))
-        pieces = []
-        for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
-            file.seek(offset)
-            pieces.append(file.read(size))
-        return b"".join(pieces)
+def _spans(offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
+    """(begin, bytes) of the parts of a file in which images lie one behind the other."""
+    ends = offsets + sizes
+    begins = np.flatnonzero(np.append(True, offsets[1:] != ends[:-1]))
+    lasts = np.append(begins[1:], len(offsets)) - 1
+    return tuple(zip(offsets[begins].tolist(), (ends[lasts] - offsets[begins]).tolist(), strict=True))
