@@ -46,7 +46,7 @@ from demorec.loop import Episode, ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.robots.kinematics import ArmKinematics
 
-SEED, ATTEMPTS = 31, 9
+SEED, ATTEMPTS = 31, 40
 TASK, THINGS = "pick_place", Ranges(distractors=(1, 1))
 PAUSE, LATE, NOISE = (2.0, 6.0), (0.2, 0.6), (0.01, 0.04)
 """Of hesitations and late actions, seconds; standard deviations of the noise in labels, rad."""
