@@ -59,12 +59,14 @@ class Demonstration:
 
 
 class Clumsy:
-    """The expert with one fault, which happens at a random time of a phase."""
+    """The expert with one fault, which happens at a random time of a phase; a hesitation lasts `pause` seconds."""
 
     num_retries, happened = 0, False
 
-    def __init__(self, inner: ScriptAgent, kind: str, rng: np.random.Generator) -> None:
-        self._inner, self._kind, self._rng = inner, kind, rng
+    def __init__(
+        self, inner: ScriptAgent, kind: str, rng: np.random.Generator, pause: tuple[float, float] = (0.8, 2.0)
+    ) -> None:
+        self._inner, self._kind, self._rng, self._pause = inner, kind, rng, pause
         self._phase = "transport" if kind == "slip" else str(rng.choice(["approach", "transport"]))
         self._after = int(rng.integers(4, 12))
 
@@ -92,7 +94,7 @@ class Clumsy:
 
     def _fault(self, world: World, decision: Decision) -> Iterator[Decision]:
         rng, hold = self._rng, world.hold()
-        seconds = float(rng.uniform(0.8, 2.0) if self._kind == "hesitation" else rng.uniform(1.2, 2.5))
+        seconds = float(rng.uniform(*self._pause) if self._kind == "hesitation" else rng.uniform(1.2, 2.5))
         way = np.zeros(len(hold.joint_target))
         if self._kind == "detour":
             way[0], way[1] = rng.choice([-1, 1]) * rng.uniform(0.2, 0.5), -rng.uniform(0.0, 0.2)

@@ -17,6 +17,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from demorec.core.errors import ConfigError, ExportError
 from demorec.core.replacing import ReplaceableKind, check_replaceable
@@ -26,6 +27,7 @@ _AT_FDCWD = -100
 _RENAME_SWAP_MACOS = 2
 _MARK = b"demorec export\n"
 """What the lock file of a workshop holds."""
+_AT_ONCE = 1 << 22
 NEW, OLD, CODED, _LOCK = "new", "old", "coded", "lock"
 """All that a workshop holds: the folder in the making, the one that it replaces, images of the export's processes."""
 
@@ -148,3 +150,23 @@ def sync_file(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def copy_bytes(source: IO[bytes], begin: int, count: int, target: IO[bytes]) -> None:
+    """Append a part of a file to another, both without a buffer: by the kernel, where it can.
+
+    Raises:
+        OSError: The part is not there, or cannot be written.
+    """
+    copy = getattr(os, "copy_file_range", None)  # only in Linux
+    while count:
+        try:
+            done = copy(source.fileno(), target.fileno(), count, begin) if copy else 0
+        except OSError as error:
+            if error.errno not in (errno.EXDEV, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.EPERM):
+                raise
+            copy, done = None, 0
+        done = done or target.write(os.pread(source.fileno(), min(count, _AT_ONCE), begin))
+        if not done:
+            raise OSError(errno.EIO, "the file ends before it should", source.name)
+        begin, count = begin + done, count - done

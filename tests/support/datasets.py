@@ -38,11 +38,11 @@ def write_with_lerobot(root: Path, *, video: bool = True, episodes: int = 6, **a
     return root
 
 
-def items(root: Path) -> list[list[dict[str, Any]]]:
+def items(root: Path, backend: str = "pyav") -> list[list[dict[str, Any]]]:
     """Every episode's frames as LeRobot reads them, less the counters: numbers, decoded images, task."""
     from lerobot.datasets import LeRobotDataset
 
-    dataset = LeRobotDataset("local/test", root=root, video_backend="pyav", return_uint8=True)
+    dataset = LeRobotDataset("local/test", root=root, video_backend=backend, return_uint8=True)
     found: list[list[dict[str, Any]]] = []
     for index in range(len(dataset)):
         item = {name: np.asarray(value) for name, value in dataset[index].items()}

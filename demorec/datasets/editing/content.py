@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.editing.packets import PacketCutter
+from demorec.datasets.editing.packets import PacketCutter, VideoFiles
 from demorec.datasets.editing.plan import Source
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
@@ -108,8 +108,9 @@ class ContentReader:
         self._stored = [name for name in shared.cameras if not features[self._own[name]].is_video]
         columns = [self._own[name] for name in (*shared.columns, *self._stored)]
         self._rows = RowStream(source.root, source.info, columns)
+        files = VideoFiles()
         self._cutters = {
-            name: PacketCutter(source.root, source.info, self._own[name])
+            name: PacketCutter(source.root, source.info, self._own[name], files)
             for name in shared.cameras
             if features[self._own[name]].is_video
         }
@@ -161,11 +162,10 @@ class ContentReader:
             sets = video.parameter_sets()
         except ExportError:  # packets that cannot be told apart by episode; whether there are any, decoding shows
             return None
-        assert isinstance(video.samples, bytes)
         head = (
             f"{video.codec} {video.width} {video.height} {video.lead} {video.tail} {video.sizes.tolist()} {len(sets)}"
         )
-        return hashlib.sha256(b"".join((head.encode(), sets, video.samples))).digest()
+        return hashlib.sha256(b"".join((head.encode(), sets, video.read()))).digest()
 
 
 def _values(array: Any, feature: DatasetFeature, root: Path) -> NDArray[Any]:

@@ -8,9 +8,8 @@ from pathlib import Path
 from demorec.datasets.editing.beside import has_stages, poses_are_kept, progress_is_kept
 from demorec.datasets.editing.plan import Plan
 from demorec.datasets.lerobot.boxes import BOXES_DIR
-from demorec.datasets.lerobot.card import SECOND_CARD_PATH, THUMBNAILS_PATH
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH
-from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR, is_dataset_file
+from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, THUMBNAILS_PATH, is_dataset_file
 
 ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes")
 """Files that are copied from a single source."""

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo, FilePosition
-from demorec.datasets.lerobot.mp4 import EncodedVideo
-from demorec.datasets.lerobot.mp4_index import Mp4Index, mp4_index
+from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Stored
+from demorec.datasets.lerobot.mp4_index import mp4_index
 from demorec.datasets.lerobot.reader import EpisodePlace
 from demorec.datasets.lerobot.videos import access_units, codec_of, opened_video
 
@@ -28,7 +28,7 @@ class _VideoFile:
 
     Attributes:
         path: Of it.
-        index: Of its images.
+        offsets, sizes, is_keyframe: (N,) of its images.
         frames: (N,) int64, number of the frame at which each is shown.
         order: (N,) by which these rise.
         keys: (K,) numbers of the keyframes.
@@ -37,11 +37,11 @@ class _VideoFile:
 
     def __init__(self, path: Path, fps: int) -> None:
         self.path = path
-        self.index: Mp4Index = mp4_index(path)
-        self.frames: NDArray[np.int64] = np.rint(self.index.times * fps).astype(np.int64)
+        index = mp4_index(path)
+        self.offsets, self.sizes, self.is_keyframe = index.offsets, index.sizes, index.is_keyframe
+        self.frames: NDArray[np.int64] = np.rint(index.times * fps).astype(np.int64)
         self.order = np.argsort(self.frames, kind="stable")
-        self._sorted = self.frames[self.order]
-        self.keys = np.flatnonzero(self.index.is_keyframe)
+        self.keys = np.flatnonzero(self.is_keyframe)
         with opened_video(path) as (_, stream):
             context = stream.codec_context
             self.codec = codec_of(stream)
@@ -54,10 +54,14 @@ class _VideoFile:
 
     def shown(self, begin: int, end: int) -> NDArray[np.intp]:
         """The images of the frames from one to before another."""
-        return self.order[np.searchsorted(self._sorted, begin) : np.searchsorted(self._sorted, end)]
+        first, last = np.searchsorted(self.frames, (begin, end), sorter=self.order)
+        return self.order[first:last]
 
-    def first_image(self, sample: bytes) -> bytes:
+    def first_image(self, begin: int, size: int) -> bytes:
         """A first image as it was encoded: behind the parameter sets, which of H.264 and HEVC are those of the file."""
+        if self.codec != "av1" and self._head:
+            return self._head
+        sample = Stored(path=self.path, spans=((begin, size),)).read()
         if self.codec == "av1":
             return b"\x12\x00" + sample
         if not self._head:
@@ -66,23 +70,31 @@ class _VideoFile:
         return self._head
 
 
-class PacketCutter:
-    """The videos of one camera feature of a dataset; what some files contain is kept, for episodes in any order."""
+class VideoFiles:
+    """The mp4 files of any number of datasets; what some of them contain is kept, for episodes in any order."""
 
-    def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
-        self._root, self._info, self._key = root, info, key
-        self._files: dict[FilePosition, _VideoFile] = {}
+    def __init__(self) -> None:
+        self._files: dict[Path, _VideoFile] = {}
 
-    def _open(self, place: EpisodePlace) -> _VideoFile:
-        position, _ = place.videos[self._key]
-        file = self._files.pop(position, None)
-        if file is None:
-            path = self._root / position.path(self._info.video_path or VIDEO_PATH, self._key)
-            file = _VideoFile(path, self._info.fps)
-        self._files[position] = file
+    def open(self, path: Path, fps: int) -> _VideoFile:
+        """One of them; ExportError when it cannot be read."""
+        file = self._files[path] = self._files.pop(path, None) or _VideoFile(path, fps)
         if len(self._files) > _MOST_FILES:
             del self._files[next(iter(self._files))]
         return file
+
+
+class PacketCutter:
+    """The videos of one camera feature of a dataset."""
+
+    def __init__(self, root: Path, info: DatasetInfo, key: str, files: VideoFiles) -> None:
+        self._root, self._info, self._key, self._files = root, info, key, files
+
+    def _open(self, place: EpisodePlace) -> _VideoFile:
+        position, _ = place.videos[self._key]
+        return self._files.open(
+            self._root / position.path(self._info.video_path or VIDEO_PATH, self._key), self._info.fps
+        )
 
     def stream_info(self, place: EpisodePlace) -> dict[str, Any]:
         """What a dataset states about how its images are encoded."""
@@ -122,16 +134,16 @@ class PacketCutter:
             raise ExportError(f"Two images of {self._key} are shown at one time, or none at some: {path}")
         lead, count = begin - int(file.frames[keys[-1]]), last - first
         shifts = places - np.arange(len(places))
-        sizes = file.index.sizes[part]
-        samples = _read(path, file.index.offsets[part], sizes)
+        sizes = file.sizes[part]
+        spans = _spans(file.offsets[part], sizes)
         return EncodedVideo(
             codec=_MP4_NAMES.get(file.codec, file.codec),
             width=file.size[0],
             height=file.size[1],
-            first=file.first_image(samples[: int(sizes[0])]),
-            samples=samples,
+            first=file.first_image(spans[0][0], int(sizes[0])),
+            samples=Stored(path=path, spans=spans),
             sizes=sizes,
-            is_keyframe=file.index.is_keyframe[part],
+            is_keyframe=file.is_keyframe[part],
             lead=lead,
             tail=len(places) - lead - count,
             shifts=shifts if shifts.any() else None,
@@ -153,13 +165,9 @@ def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np
         end += 1
 
 
-def _read(path: Path, offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> bytes:
-    with path.open("rb") as file:
-        if np.array_equal(offsets[1:], (offsets + sizes)[:-1]):
-            file.seek(int(offsets[0]))
-            return file.read(int(sizes.sum()))
-        pieces = []
-        for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
-            file.seek(offset)
-            pieces.append(file.read(size))
-        return b"".join(pieces)
+def _spans(offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
+    """(begin, bytes) of the parts of a file in which images lie one behind the other."""
+    ends = offsets + sizes
+    begins = np.flatnonzero(np.append(True, offsets[1:] != ends[:-1]))
+    lasts = np.append(begins[1:], len(offsets)) - 1
+    return tuple(zip(offsets[begins].tolist(), (ends[lasts] - offsets[begins]).tolist(), strict=True))

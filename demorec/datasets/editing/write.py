@@ -17,7 +17,7 @@ from PIL import Image
 from demorec.core.errors import ExportError
 from demorec.datasets.editing.beside import Beside
 from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
-from demorec.datasets.editing.packets import PacketCutter
+from demorec.datasets.editing.packets import PacketCutter, VideoFiles
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
@@ -76,7 +76,8 @@ def write_plan(
     """
     roots = [source.root for source in plan.sources]
     with staged_folder(out, DATASET, replace=overwrite, sources=roots) as folder:
-        readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
+        videos = VideoFiles()
+        readers = [_Reader(plan, number, videos, decode=decode) for number in range(len(plan.sources))]
         with (
             DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
             Beside(plan, folder) as beside,
@@ -114,7 +115,7 @@ def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
 class _Reader:
     """The episodes of one source as the plan wants them."""
 
-    def __init__(self, plan: Plan, number: int, *, decode: bool) -> None:
+    def __init__(self, plan: Plan, number: int, videos: VideoFiles, *, decode: bool) -> None:
         self.source: Source = plan.sources[number]
         self.num_decoded = 0
         self._features, self._fps = plan.info.features, plan.info.fps
@@ -124,7 +125,8 @@ class _Reader:
         names = {take.feature for take in self._takes.values() if take.feature}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
         self._rows = RowStream(self.source.root, info, [*self._names, "task_index"])
-        self._cutters = {key: PacketCutter(self.source.root, info, key) for key in info.video_keys if key in names}
+        keys = [key for key in info.video_keys if key in names]
+        self._cutters = {key: PacketCutter(self.source.root, info, key, videos) for key in keys}
         stored = [name for name in self._names if info.features[name].dtype == "image"]
         self._stored = {key: StoredImages(self.source.root, info, key) for key in stored}
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])

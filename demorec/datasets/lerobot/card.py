@@ -24,7 +24,7 @@ from demorec.datasets.lerobot.files import read_table
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
+from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, THUMBNAILS_PATH
 from demorec.datasets.lerobot.reader import episode_places, read_tasks
 from demorec.datasets.lerobot.robots import ROBOTS_DIR
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
@@ -42,10 +42,6 @@ from demorec.episode.features import (
     ActionKind,
 )
 from demorec.episode.sensed import SENSED
-
-SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
-"""Where the card goes if the dataset has a README.md that demorec did not write."""
-
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """The last line of a card: with it a card that was edited is known from one that was not."""
@@ -93,7 +89,6 @@ _BESIDE_SIMULATED = (
     "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
     "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
 )
-THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
 _EPISODES, _MOMENTS, _SIDE, _LABEL, _GAP = 4, 5, 160, 18, 2
 
 

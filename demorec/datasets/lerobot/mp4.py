@@ -1,8 +1,8 @@
 """Mp4 files written from encoded images as they are: no image is decoded or encoded anew.
 
-A file has one video track at a constant rate, every image presented in coding order, the index (`moov`) in front
-so that it can be read over a network (ISO/IEC 14496-12). LeRobot's own writer copies the whole file for every
-episode; here the images of an episode are appended and the index is written once, at the end.
+A file has one video track at a constant rate, the index (`moov`) in front so that it can be read over a network
+(ISO/IEC 14496-12). LeRobot's own writer copies the whole file for every episode; here the images of an episode are
+appended, images that lie in other files are copied once, by the kernel, and the index is written once, at the end.
 """
 
 from __future__ import annotations
@@ -12,24 +12,43 @@ import io
 import os
 import struct
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import accumulate, pairwise
+from itertools import accumulate, groupby, pairwise
+from operator import itemgetter
 from pathlib import Path
 from typing import IO
 
 import av
 import numpy as np
-from av.container import OutputContainer
-from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.datasets.staging import sync_file
+from demorec.datasets.lerobot.mp4_index import mp4_head
+from demorec.datasets.staging import copy_bytes, sync_file
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stored:
+    """Encoded images in a file.
+
+    Attributes:
+        path: Of the file.
+        spans: (begin, bytes) of its parts, one behind the other.
+        is_own: The file has nothing else, and is deleted once they are written.
+    """
+
+    path: Path
+    spans: tuple[tuple[int, int], ...]
+    is_own: bool = False
+
+    def read(self) -> bytes:
+        """All of them; OSError where the file cannot be read."""
+        with self.path.open("rb", buffering=0) as file:
+            return b"".join(os.pread(file.fileno(), count, begin) for begin, count in self.spans)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,7 +58,7 @@ class EncodedVideo:
     Attributes:
         codec: "h264", "hevc" or "av1".
         first: The first image as it was encoded, a keyframe.
-        samples: All images back to back, as an mp4 file stores them; or a file of them that is deleted once written.
+        samples: All images back to back, as an mp4 file stores them, or where they lie.
         sizes: (lead + T + tail,) int64, bytes of each in `samples`.
         is_keyframe: (lead + T + tail,) bool, which ones can be decoded by themselves.
         digest: SHA-256 of T samples, those of the images, hex; with a tail, of those that are stored in their place. ""
@@ -54,7 +73,7 @@ class EncodedVideo:
     width: int
     height: int
     first: bytes
-    samples: bytes | Path
+    samples: bytes | Stored
     sizes: NDArray[np.int64]
     is_keyframe: NDArray[np.bool_]
     digest: str = ""
@@ -83,10 +102,9 @@ class EncodedVideo:
         return video.with_digest()
 
     def with_digest(self) -> EncodedVideo:
-        """The same with its digest, if its `samples` are bytes."""
-        assert isinstance(self.samples, bytes)
+        """The same with its digest."""
         begin, end = (int(self.sizes[:count].sum()) for count in (self.lead, self.lead + self.num_frames))
-        return replace(self, digest=hashlib.sha256(memoryview(self.samples)[begin:end]).hexdigest())
+        return replace(self, digest=hashlib.sha256(memoryview(self.read())[begin:end]).hexdigest())
 
     @property
     def num_frames(self) -> int:
@@ -104,16 +122,15 @@ class EncodedVideo:
         return int(self.sizes.sum())
 
     def put_aside(self, folder: Path) -> EncodedVideo:
-        """The same with its `samples`, bytes so far, in a new file in `folder`: cheap to hand to another process."""
-        assert isinstance(self.samples, bytes)
+        """The same with its `samples` in a new file in `folder`: cheap to hand to another process."""
         handle, name = tempfile.mkstemp(dir=folder)
         with os.fdopen(handle, "wb") as file:
-            file.write(self.samples)
-        return replace(self, samples=Path(name))
+            file.write(self.read())
+        return replace(self, samples=Stored(path=Path(name), spans=((0, self.num_bytes),), is_own=True))
 
-    def opened(self) -> IO[bytes]:
-        """`samples`, to be read one after the other."""
-        return self.samples.open("rb") if isinstance(self.samples, Path) else io.BytesIO(self.samples)
+    def read(self) -> bytes:
+        """All images back to back; OSError where a file cannot be read."""
+        return self.samples if isinstance(self.samples, bytes) else self.samples.read()
 
     def parameter_sets(self) -> bytes:
         """Of the first image; ExportError if that is no keyframe that stands alone."""
@@ -125,8 +142,9 @@ class EncodedVideo:
 class Mp4Writer:
     """One mp4 file; episodes are appended, `close` puts the index in front and makes the file durable.
 
-    Until then it has another name, so that an unfinished file is never taken for a finished one. All methods raise
-    OSError when the file cannot be written, and ExportError for images that libav does not understand.
+    Images that lie in files are copied from there by `close`, others wait in a file beside. Until then the file has
+    another name, so that an unfinished one is never taken for a finished one. All methods raise OSError when the file
+    cannot be written, and ExportError for images that libav does not understand.
     """
 
     def __init__(self, path: Path, first: EncodedVideo, *, fps: int) -> None:
@@ -135,87 +153,88 @@ class Mp4Writer:
         self.num_images = 0
         self.num_bytes = 0
         self._path = path
-        self._unfinished = path.with_suffix(".unfinished")
-        self._is_open = True
+        try:
+            self._template = _first_image_file(first, fps)
+        except av.FFmpegError as error:
+            raise ExportError(f"The video cannot be written as mp4 ({error.strerror}): {path}") from error
+        self._videos: list[EncodedVideo] = []
+        self._spans: list[tuple[Path, int, int]] = []
+        self._waiting, self._unfinished = path.with_suffix(".waiting"), path.with_suffix(".unfinished")
         path.parent.mkdir(parents=True, exist_ok=True)
-        # The protocol is named since libav takes what is before a colon for one. The bit rate would be that of the
-        # first image, and without `bitexact` the file would name the version of libav.
-        self._container = av.open(
-            f"file:{self._unfinished}",
-            "w",
-            format="mp4",
-            container_options={"movflags": "faststart", "write_btrt": "0", "fflags": "bitexact"},
-        )
-        with self._muxing():
-            self._stream = _add_stream(self._container, first)
-            self._stream.time_base = Fraction(1, fps)
-            self._container.start_encoding()
-        # A frame, in the unit that libav has chosen now.
-        self._ticks = int(1 / (fps * self._stream.time_base))
+        self._own: IO[bytes] | None = self._waiting.open("wb", buffering=0)
 
     def add(self, video: EncodedVideo) -> None:
-        """Append the images of an episode; if they are in a file, it is deleted."""
-        time = self.num_images * self._ticks
-        shifts = [0] * len(video.sizes) if video.shifts is None else video.shifts.tolist()
-        with video.opened() as samples, self._muxing():
-            for size, is_keyframe, shift in zip(video.sizes.tolist(), video.is_keyframe.tolist(), shifts, strict=True):
-                packet = av.Packet(samples.read(size))
-                packet.stream = self._stream
-                packet.pts = time + shift * self._ticks
-                packet.dts = time - self.delay * self._ticks
-                packet.duration = self._ticks
-                packet.is_keyframe = is_keyframe
-                self._container.mux_one(packet)
-                time += self._ticks
-        if isinstance(video.samples, Path):
-            video.samples.unlink()
+        """Append the images of an episode; if they are in a file of their own, it is deleted."""
+        assert self._own is not None
+        samples = video.samples
+        if isinstance(samples, Stored) and not samples.is_own:
+            self._spans += [(samples.path, *span) for span in samples.spans]
+        else:
+            self._spans.append((self._waiting, self._own.tell(), video.num_bytes))
+            self._own.write(video.read())
+            if isinstance(samples, Stored):
+                samples.path.unlink()
+        self._videos.append(replace(video, first=b"", samples=b""))
         self.num_images += len(video.sizes)
         self.num_bytes += video.num_bytes
 
     def close(self) -> None:
-        """Write the index and give the file its name; harmless when called twice."""
-        if self._is_open:
-            with self._muxing():
-                self._container.close()
-            sync_file(self._unfinished)
-            self._unfinished.rename(self._path)
-            self._is_open = False
+        """Write the file and give it its name; harmless when called twice."""
+        if self._own is None:
+            return
+        self._own.close()
+        sizes = np.concatenate([video.sizes for video in self._videos])
+        keys = np.concatenate([video.is_keyframe for video in self._videos])
+        shifts = [np.zeros(len(v.sizes), np.int64) if v.shifts is None else v.shifts for v in self._videos]
+        with self._unfinished.open("wb", buffering=0) as file:
+            file.write(mp4_head(self._template, sizes, keys, np.concatenate(shifts) + self.delay))
+            for path, spans in groupby(self._spans, key=itemgetter(0)):
+                with path.open("rb", buffering=0) as source:
+                    for _, begin, count in spans:
+                        copy_bytes(source, begin, count, file)
+        sync_file(self._unfinished)
+        self._unfinished.rename(self._path)
+        self._waiting.unlink()
+        self._own = None
 
     def abort(self) -> None:
         """Drop what was gathered; nothing after `close`."""
-        if self._is_open:
-            self._is_open = False
-            with suppress(av.FFmpegError):  # libav writes the index even so, which fails again on a full disk
-                self._container.close()
+        if self._own is not None:
+            self._own.close()
+            self._own = None
             self._unfinished.unlink(missing_ok=True)
-
-    @contextmanager
-    def _muxing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError:  # libav's errors of the file system are of this type
-            raise
-        except av.FFmpegError as error:
-            raise ExportError(f"The video cannot be written as mp4 ({error.strerror}): {self._path}") from error
+            self._waiting.unlink(missing_ok=True)
 
 
-def _add_stream(container: OutputContainer, first: EncodedVideo) -> VideoStream:
-    """A stream for samples like those of `first`, as libav describes them in a file of its first image."""
-    buffer = io.BytesIO()
+def _first_image_file(video: EncodedVideo, fps: int) -> bytes:
+    """A file of the first image alone, as libav writes it."""
+    described, buffer = io.BytesIO(), io.BytesIO()
     with (
-        av.open(io.BytesIO(first.first), format=_DEMUXERS[first.codec]) as source,
-        av.open(buffer, "w", format="mp4") as target,
+        av.open(io.BytesIO(video.first), format=_DEMUXERS[video.codec]) as source,
+        av.open(described, "w", format="mp4") as target,
     ):
-        packet = av.Packet(first.first)
+        packet = av.Packet(video.first)
         packet.stream = target.add_stream_from_template(source.streams.video[0], opaque=True)
         packet.pts = packet.dts = 0
         packet.is_keyframe = True
         target.mux_one(packet)
-    buffer.seek(0)
-    with av.open(buffer, format="mp4") as described:
-        stream = container.add_stream_from_template(described.streams.video[0], opaque=True)
-    stream.codec_context.thread_count = 1  # nothing is decoded: no threads for it
-    return stream
+    described.seek(0)
+    # The bit rate would be that of the first image, and without `bitexact` the file would name the version of libav.
+    options = {"write_btrt": "0", "fflags": "bitexact"}
+    with (
+        av.open(described, format="mp4") as source,
+        av.open(buffer, "w", format="mp4", container_options=options) as target,
+    ):
+        stream = target.add_stream_from_template(source.streams.video[0], opaque=True)
+        stream.codec_context.thread_count = 1  # nothing is decoded: no threads for it
+        stream.time_base = Fraction(1, fps)
+        target.start_encoding()
+        ticks = int(1 / (fps * stream.time_base))  # a frame, in the unit that libav has chosen now
+        packet = next(source.demux())
+        packet.stream, packet.time_base = stream, stream.time_base
+        packet.pts, packet.dts, packet.duration = 0, -video.delay * ticks, ticks
+        target.mux_one(packet)
+    return buffer.getvalue()
 
 
 _AV1_SEQUENCE_HEADER = 1

@@ -11,6 +11,9 @@ INFO_PATH = "meta/info.json"
 CARD_PATH = "README.md"
 SIDECAR_DIR = "demorec"
 """Folder inside the dataset for what LeRobot has no place for."""
+SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
+"""Where the card goes if the dataset has a README.md that demorec did not write."""
+THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
 
 
 def is_dataset(path: Path) -> bool:

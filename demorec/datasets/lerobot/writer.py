@@ -240,7 +240,10 @@ class DatasetWriter:
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
         """The statistics of a camera in an episode, which those of all episodes take in."""
         if isinstance(pixels, Statistics):
-            self._unseen.setdefault(key, []).append(pixels)
+            unseen = self._unseen.setdefault(key, [])
+            unseen.append(pixels)
+            if len(unseen) >= _EPISODES_PER_TABLE:
+                unseen[:] = [merge_statistics(unseen)]
             return pixels
         self._pixels[key] = self._pixels[key] + pixels if key in self._pixels else pixels
         return pixels.statistics()
