@@ -8,6 +8,7 @@ adds its weight. That is exact enough where nothing is hit and the motion is smo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -73,6 +74,9 @@ class Dynamics:
             acceleration[1:-1] = (point[2:] - 2 * point[1:-1] + point[:-2]) * fps**2
             joints = frozenset(joint.name for joint in urdf.path_to(name))
             self.loads.append(Load(point, mass * (acceleration - gravity), joints))
+        self._forces = np.stack([load.force for load in self.loads])  # (loads, T, 3)
+        self._moments = np.cross(np.stack([load.point for load in self.loads]), self._forces)
+        self._torques: dict[str, Array] = {}
         # Its acceleration comes from the frames around; the two frames at either end have too few.
         acceleration = np.diff(links(tip)[:, :3, 3], 2, axis=0) * fps**2
         change = np.linalg.norm(np.diff(acceleration, axis=0), axis=1)
@@ -80,16 +84,18 @@ class Dynamics:
         smooth[2:-2] = np.maximum(change[:-1], change[1:]) < MAX_CHANGE
         self.is_judged = smooth if free is None else smooth & free
 
-    def below(self, joint: str) -> list[Load]:
-        """What a joint bears."""
-        return [load for load in self.loads if joint in load.joints]
+    def borne(self, joint: str) -> tuple[Array, Array]:
+        """What a joint bears: (T, 3) N, and its (T, 3) N m about the origin."""
+        below = [joint in load.joints for load in self.loads]
+        return self._forces[below].sum(axis=0), self._moments[below].sum(axis=0)
 
     def torque(self, joint: UrdfJoint) -> Array:
         """(T,) N m of a joint's motor."""
-        pose = self._links(joint.child)
-        axis = pose[:, :3, :3] @ np.array(joint.axis)
-        arms = [np.cross(load.point - pose[:, :3, 3], load.force) for load in self.below(joint.name)]
-        return np.asarray((axis * np.sum(arms, axis=0)).sum(axis=1))
+        if joint.name not in self._torques:
+            pose, (force, moment) = self._links(joint.child), self.borne(joint.name)
+            axis = pose[:, :3, :3] @ np.array(joint.axis)
+            self._torques[joint.name] = (axis * (moment - np.cross(pose[:, :3, 3], force))).sum(axis=1)
+        return self._torques[joint.name]
 
     def compare(self, joints: Sequence[str], effort: Array) -> Found:
         """Efforts (T, n) of some joints ("" for what is none) against the torques that the motion needs."""
@@ -120,6 +126,9 @@ def masses_of(model: str) -> dict[str, tuple[float, Array]]:
         SceneError: The model is not to be had, or says no masses.
     """
     try:
-        return link_masses(model if "<" in model else asset_path(model).read_text())
+        return _masses(model if "<" in model else asset_path(model).read_text())
     except (OSError, ValueError) as error:
         raise SceneError(as_reason(error)) from error
+
+
+_masses = lru_cache(maxsize=8)(link_masses)  # all recordings of a robot have the same

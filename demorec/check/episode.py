@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import cached_property
@@ -18,10 +18,10 @@ from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import ImageKind, correlation
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, strays
 from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
-from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size
+from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size, drawable_world
 from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
 from demorec.check.films import Films, films_of_recording, likeness_of_films
-from demorec.check.full_size import FullSize, compare_full_size, encoded_again, frames_to_compare, share_off, with_lead
+from demorec.check.full_size import FullSize, compare_with_encoder, frames_to_compare, share_off, with_lead
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.check.summary import ImageSummary, summarise
@@ -35,6 +35,7 @@ from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
+from demorec.render.recorded import RecordedWorld
 from demorec.robots.urdf import Urdf
 
 
@@ -271,11 +272,24 @@ class CheckedEpisode(ExitStack):
         labels: tuple[ImageKind, ...] = ("labels",) if self.recording.has_segmentation(camera) else ()
         return ("color", *depth, *labels)
 
+    @cached_property
+    def keyframes(self) -> Mapping[str, NDArray[np.int64]]:
+        """Camera -> frames whose colour images are decoded without others."""
+        names = [camera.name for camera in self.cameras]
+        return {name: np.flatnonzero([packet.is_keyframe for packet in self.recording.packets(name)]) for name in names}
+
     def images(self, camera: SceneCamera, kind: ImageKind = "color") -> ImageSummary:
         """What the checks need of a camera's decoded images; decoded once."""
         if (camera.name, kind) not in self._images:
-            keep = () if kind == "color" else self.sampled[camera.name].tolist()[::2]
-            self._images[camera.name, kind] = summarise(self.recording, camera, kind, keep)
+            keep: Iterable[int] = ()
+            with suppress(
+                RecordingError
+            ):  # of colours all but those of the most unusual keyframe, which decoding shows
+                if kind != "color":
+                    keep = self.sampled[camera.name].tolist()[::2]
+                else:
+                    keep = with_lead(frames_to_compare(self.keyframes[camera.name], self.num_frames)).tolist()
+            self._images[camera.name, kind] = summarise(self.recording, camera, kind, set(keep))
         return self._images[camera.name, kind]
 
     @cached_property
@@ -301,13 +315,18 @@ class CheckedEpisode(ExitStack):
                 yield f"{camera.name} and {other.name}", correlation(first[:count], second[:count])
 
     @cached_property
+    def _world(self) -> RecordedWorld:
+        """What is drawn; SceneError where a model is missing."""
+        return drawable_world(self.info, self.columns)
+
+    @cached_property
     def _drawn(self) -> DrawnEpisode | NotMeasured:
         """The images as the recorded numbers make them; each single one where some are coded without loss."""
         kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
         is_exact = any(of_camera != ("color",) for of_camera in kinds.values())
         try:
             colors = {camera.name: self.images(camera).cells for camera in self.cameras}
-            return draw_episode(self.info, self.columns, kinds, colors, draw_each=is_exact)
+            return draw_episode(self.info, self._world, kinds, colors, draw_each=is_exact)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
@@ -326,10 +345,8 @@ class CheckedEpisode(ExitStack):
         """Camera -> frames that are compared at their full size."""
         found = {}
         for camera in self.cameras:
-            packets = self.recording.packets(camera.name)
-            keyframes = np.array([packet.frame_index for packet in packets if packet.is_keyframe], dtype=np.int64)
             detail = self.images(camera).detail
-            found[camera.name] = frames_to_compare(keyframes, len(detail), detail)
+            found[camera.name] = frames_to_compare(self.keyframes[camera.name], len(detail), detail)
         return found
 
     @cached_property
@@ -337,7 +354,7 @@ class CheckedEpisode(ExitStack):
         """(camera, kind) -> frame -> image, as it was before it was encoded."""
         kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
         try:
-            return draw_full_size(self.info, self.columns, kinds, self.sampled)
+            return draw_full_size(self._world, kinds, self.sampled)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
@@ -362,16 +379,11 @@ class CheckedEpisode(ExitStack):
         if len(frames) < 2:
             return NotMeasured(why=f"camera {camera.name} has {len(frames)} images")
         if camera.name not in self._full_sizes:
-            wanted = with_lead(frames).tolist()
-            seen = dict(zip(wanted, self.recording.images_at(camera.name, wanted), strict=True))
-            images = np.stack([drawn[frame] for frame in frames.tolist()])
-            recorded = np.stack([seen[frame] for frame in frames.tolist()])
+            kept = self.images(camera).kept
+            missing = [frame for frame in with_lead(frames).tolist() if frame not in kept]
+            seen = {**kept, **dict(zip(missing, self.recording.images_at(camera.name, missing), strict=True))}
             settings = self.recording.video_settings(camera.name)
-            for tries_qualities in (False, True):  # which takes long, and is seldom needed
-                expected = encoded_again(settings, list(images), frames, seen, tries_qualities=tries_qualities)
-                self._full_sizes[camera.name] = found = compare_full_size(recorded, expected, images, frames)
-                if found.is_clear:
-                    break
+            self._full_sizes[camera.name] = compare_with_encoder(settings, frames, seen, drawn)
         return self._full_sizes[camera.name]
 
     def pixels_off(self, camera: SceneCamera, kind: ImageKind) -> tuple[Array, NDArray[np.intp]] | NotMeasured:

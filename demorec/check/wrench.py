@@ -81,13 +81,13 @@ def _hand(episode: CheckedEpisode) -> _Hand | NotMeasured | Lacking:
         return dynamics
     pose = episode.world_from_link(episode.info.robot.hand_link)
     rotation, origin = pose[:, :3, :3], pose[:, :3, 3]
-    loads = dynamics.below(_mount(episode))
+    force, moment = dynamics.borne(_mount(episode))
     return _Hand(
         dynamics=dynamics,
         force=np.einsum("tij,tj->ti", rotation, wrench[:, :3]),
         torque=np.einsum("tij,tj->ti", rotation, wrench[:, 3:]),
-        loads_force=np.sum([load.force for load in loads], axis=0),
-        loads_torque=np.sum([np.cross(load.point - origin, load.force) for load in loads], axis=0),
+        loads_force=force,
+        loads_torque=moment - np.cross(origin, force),
         origin=origin,
         rotation=rotation,
     )
@@ -250,11 +250,10 @@ def _of_joint(episode: CheckedEpisode, hand: _Hand, name: str) -> tuple[Array, A
     """
     joint = next(joint for joint in episode.urdf.joints if joint.name == name)
     pose = episode.world_from_link(joint.child)
-    below = hand.dynamics.below(_mount(episode))
-    total = hand.torque + np.cross(hand.origin - pose[:, :3, 3], hand.force)
-    for load in hand.dynamics.below(name):
-        if not any(load is other for other in below):
-            total = total + np.cross(load.point - pose[:, :3, 3], load.force)
+    force, moment = hand.dynamics.borne(name)  # of the links between the two joints, what bears no hand
+    moment = moment - hand.loads_torque - np.cross(hand.origin, hand.loads_force)
+    total = hand.torque + np.cross(hand.origin, hand.force) + moment
+    total -= np.cross(pose[:, :3, 3], hand.force + force - hand.loads_force)
     needed = ((pose[:, :3, :3] @ np.array(joint.axis)) * total).sum(axis=1)
     index = episode.info.robot.arm_joints.index(name)
     position = episode.columns.joint_position[:, index]
