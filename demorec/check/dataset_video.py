@@ -68,16 +68,18 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
 def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
     """(rows, columns, 3) mean colours of the parts of every image, 0 to 255."""
     import av
+    from av.video.reformatter import VideoReformatter
 
     check_video(path)
     height, width = shape[:2]
     columns, rows = part_counts(width, height)
+    reformatter = VideoReformatter()  # a frame's own would be set up anew for each
     try:
         with av.open(str(path), format="mp4") as container:
             for stream in container.streams.video:  # a few bytes can announce images of gigabytes
                 stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
             for frame in container.decode(video=0):
-                small = frame.reformat(width=columns, height=rows, format="rgb24", interpolation="AREA")
+                small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
                 yield cast("NDArray[np.uint8]", small.to_ndarray())
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error

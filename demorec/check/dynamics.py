@@ -2,12 +2,17 @@
 
 The model's masses, each at its link's centre of mass, accelerated as the recorded joints say, give the torque of every
 arm joint and the force on the hand (Newton and d'Alembert, without the links' own rotational inertia). What is carried
-adds its weight. That is exact enough where nothing is hit and the motion is smooth: medians and the gain are reported.
+adds its weight.
+
+From the frames around a frame its acceleration is known where nothing is hit and the motion is smooth. Where the servo
+is known, it tells the joints in the two physics steps before each frame, and by these the acceleration in that frame,
+however noise on the commands shakes the arm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +21,7 @@ from numpy.typing import NDArray
 from demorec.check.base import Found, Measurement, NotMeasured, worst
 from demorec.core.errors import SceneError, as_reason
 from demorec.core.geometry import Array
+from demorec.episode.scene import POSITION_GAIN
 from demorec.robots.assets import asset_path
 from demorec.robots.inertials import link_masses
 from demorec.robots.urdf import Urdf, UrdfJoint
@@ -30,6 +36,18 @@ MAX_CHANGE = 2.0
 one of them (noise on the commands shakes the arm within a frame). This leaves a fifth of gravity unknown at most."""
 
 
+FREE, SERVED = 0.65, 0.005
+"""Share of a motor's torque from which on it may not have done in the step before what the servo asked for; rad/s by
+which it did not in the frame itself."""
+_MOST_ACCELERATION = 50.0
+"""m/s^2 of the TCP: what is faster hits something, or a motor is at its limit, and no servo moved it."""
+_AFTER_A_HIT = 3
+"""Frames before and after that say nothing either."""
+
+Links = Callable[[str], Array]
+"""Poses (T, 4, 4) of a link, in a frame that does not accelerate."""
+
+
 class Load(NamedTuple):
     """A mass with its way: `point` (T, 3) metres, `force` (T, 3) N that it needs, and the joints that bear it."""
 
@@ -38,58 +56,111 @@ class Load(NamedTuple):
     joints: frozenset[str]
 
 
+class Carried(NamedTuple):
+    """What moves with the hand: `mass` (T,) kg, 0 where it does not, and its `point` (T, 3), metres."""
+
+    mass: Array
+    point: Array
+
+
+class Steps(NamedTuple):
+    """What a servo makes of its targets: the joints (T, n) in the physics step `before` each frame, and in the `first`
+    of two before it, and (T,) by how much, rad/s, the velocity in the frame is another one than the servo asked for."""
+
+    before: Array
+    first: Array
+    off: Array
+
+    @classmethod
+    def of_servo(
+        cls, position: Array, velocity: Array, command: Array, *, start: Array, substeps: int, step_s: float
+    ) -> Steps:
+        """Targets go linearly from one command to the next; each step takes a joint by a share of what is left to its.
+
+        Args:
+            position, velocity: (T, n) in each frame: rad, rad/s.
+            command: (T, n) sent after it.
+            start: (n,) the target before the first.
+            substeps: Physics steps from frame to frame.
+            step_s: Seconds of a step.
+        """
+        sent = np.vstack([start, start, command[:-1]])
+        target = sent[1:] - np.diff(sent, axis=0) / substeps
+        before = position - step_s * velocity
+        first = (before - POSITION_GAIN * target) / (1 - POSITION_GAIN)
+        asked = POSITION_GAIN / step_s * (sent[1:] - before)
+        return cls(before, first, np.abs(velocity - asked).max(axis=1))
+
+
 class Dynamics:
     """Inverse dynamics of an episode with point masses.
 
     Args:
-        links: Poses of the links, (T, 4, 4) each, in a frame that does not accelerate.
+        links: Poses of the links in each frame; where they are known also one and two steps before it.
         urdf: The joint tree.
         masses: Link -> mass, kg, and centre of mass in the link's frame, metres.
         gravity: (3,) m/s^2 in the same frame.
-        fps: Frames per second.
-        tip: The link whose motion has to be smooth.
+        step_s: Seconds from one step to the next, or from frame to frame.
+        tip: The link whose motion has to be smooth where only frames are known.
         carried: What else the arm bears.
         free: (T,) frames in which the hand touches nothing but what it carries.
     """
 
     def __init__(
         self,
-        links: Callable[[str], Array],
+        links: Sequence[Links],
         urdf: Urdf,
         masses: Mapping[str, tuple[float, Array]],
         *,
         gravity: Array,
-        fps: float,
+        step_s: float,
         tip: str,
-        carried: Sequence[Load] = (),
+        carried: Sequence[Carried] = (),
         free: NDArray[np.bool_] | None = None,
     ) -> None:
-        self._links, self._urdf = links, urdf
-        self.loads = [*carried]
+        self._links, self._urdf, self._step_s = links[0], urdf, step_s
+        self.loads = []
         for name, (mass, centre) in masses.items():
-            pose = links(name)
-            point = pose[:, :3, :3] @ centre + pose[:, :3, 3]
-            acceleration = np.zeros_like(point)
-            acceleration[1:-1] = (point[2:] - 2 * point[1:-1] + point[:-2]) * fps**2
+            points = [pose[:, :3, :3] @ centre + pose[:, :3, 3] for pose in (of(name) for of in links)]
             joints = frozenset(joint.name for joint in urdf.path_to(name))
-            self.loads.append(Load(point, mass * (acceleration - gravity), joints))
-        # Its acceleration comes from the frames around; the two frames at either end have too few.
-        acceleration = np.diff(links(tip)[:, :3, 3], 2, axis=0) * fps**2
-        change = np.linalg.norm(np.diff(acceleration, axis=0), axis=1)
-        smooth = np.zeros(len(links(tip)), dtype=np.bool_)
-        smooth[2:-2] = np.maximum(change[:-1], change[1:]) < MAX_CHANGE
-        self.is_judged = smooth if free is None else smooth & free
+            self.loads.append(Load(points[0], mass * (self._acceleration(points) - gravity), joints))
+        of_tip = self._acceleration([of(tip)[:, :3, 3] for of in links])
+        joints = frozenset(joint.name for joint in urdf.path_to(tip))
+        # From frame to frame hardly anything is left of how a hand that shakes accelerates.
+        with_hand = of_tip if len(links) > 1 else np.zeros_like(of_tip)
+        self.loads += [Load(point, mass[:, None] * (with_hand - gravity), joints) for mass, point in carried]
+        self._forces = np.stack([load.force for load in self.loads])  # (loads, T, 3)
+        self._moments = np.cross(np.stack([load.point for load in self.loads]), self._forces)
+        self._torques: dict[str, Array] = {}
+        if len(links) > 1:
+            hit = np.linalg.norm(of_tip, axis=1) > _MOST_ACCELERATION
+            judged: NDArray[np.bool_] = np.convolve(hit, np.ones(2 * _AFTER_A_HIT + 1), mode="same") == 0
+        else:  # the two frames at either end have too few around them
+            change = np.linalg.norm(np.diff(of_tip[1:-1], axis=0), axis=1)
+            judged = np.zeros(len(of_tip), dtype=np.bool_)
+            judged[2:-2] = np.maximum(change[:-1], change[1:]) < MAX_CHANGE
+        self.is_judged = judged if free is None else judged & free
 
-    def below(self, joint: str) -> list[Load]:
-        """What a joint bears."""
-        return [load for load in self.loads if joint in load.joints]
+    def _acceleration(self, points: Sequence[Array]) -> Array:
+        """(T, 3) m/s^2 of a point by its places in a frame and in the steps before, or in the frames around."""
+        if len(points) > 1:
+            return np.asarray((points[0] - 2 * points[1] + points[2]) / self._step_s**2)
+        found = np.zeros_like(points[0])
+        found[1:-1] = np.diff(points[0], 2, axis=0) / self._step_s**2
+        return found
+
+    def borne(self, joint: str) -> tuple[Array, Array]:
+        """What a joint bears: (T, 3) N, and its (T, 3) N m about the origin."""
+        below = [joint in load.joints for load in self.loads]
+        return self._forces[below].sum(axis=0), self._moments[below].sum(axis=0)
 
     def torque(self, joint: UrdfJoint) -> Array:
         """(T,) N m of a joint's motor."""
-        pose = self._links(joint.child)
-        axis = pose[:, :3, :3] @ np.array(joint.axis)
-        arms = [np.cross(load.point - pose[:, :3, 3], load.force) for load in self.below(joint.name)]
-        return np.asarray((axis * np.sum(arms, axis=0)).sum(axis=1))
+        if joint.name not in self._torques:
+            pose, (force, moment) = self._links(joint.child), self.borne(joint.name)
+            axis = pose[:, :3, :3] @ np.array(joint.axis)
+            self._torques[joint.name] = (axis * (moment - np.cross(pose[:, :3, 3], force))).sum(axis=1)
+        return self._torques[joint.name]
 
     def compare(self, joints: Sequence[str], effort: Array) -> Found:
         """Efforts (T, n) of some joints ("" for what is none) against the torques that the motion needs."""
@@ -120,6 +191,9 @@ def masses_of(model: str) -> dict[str, tuple[float, Array]]:
         SceneError: The model is not to be had, or says no masses.
     """
     try:
-        return link_masses(model if "<" in model else asset_path(model).read_text())
+        return _masses(model if "<" in model else asset_path(model).read_text())
     except (OSError, ValueError) as error:
         raise SceneError(as_reason(error)) from error
+
+
+_masses = lru_cache(maxsize=8)(link_masses)  # all recordings of a robot have the same

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, cast
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import ImageKind, correlation
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, strays
-from demorec.check.dynamics import LIFTED_HEIGHT, Dynamics, Load, masses_of
-from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size
+from demorec.check.dynamics import FREE, LIFTED_HEIGHT, SERVED, Carried, Dynamics, Links, Steps, masses_of
+from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size, drawable_world
 from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
 from demorec.check.films import Films, films_of_recording, likeness_of_films
-from demorec.check.full_size import FullSize, compare_full_size, encoded_again, frames_to_compare, share_off, with_lead
+from demorec.check.full_size import FullSize, compare_with_encoder, frames_to_compare, share_off, with_lead
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.check.summary import ImageSummary, summarise
@@ -35,6 +35,7 @@ from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
+from demorec.render.recorded import RecordedWorld
 from demorec.robots.urdf import Urdf
 
 
@@ -159,27 +160,42 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def dynamics(self) -> Dynamics | NotMeasured:
         """Of its robot, with what the hand carries."""
+        return self._dynamics([self.world_from_link], np.ones(self.num_frames, dtype=np.bool_), 1 / self.info.fps)
+
+    @cached_property
+    def exact_dynamics(self) -> Dynamics | NotMeasured:
+        """The same by what the servo did in the physics steps before each frame, where it alone moved the arm."""
+        c, n, info = self.columns, self.num_arm, self.info
+        start, step_s = np.array(info.scene.robot.joint_position), 1 / info.physics_hz
+        arm = c.joint_position[:, :n], c.joint_velocity[:, :n], c.command_joint_target
+        steps = Steps.of_servo(*arm, start=start, substeps=max(info.physics_hz // info.fps, 1), step_s=step_s)
+        is_free = (np.abs(c.joint_effort[:, :n]) < FREE * np.array(info.robot.torque_limit)).all(axis=1)
+        is_free &= steps.off < SERVED
+        fingers = c.joint_position[:, n:]
+        links = [self.kinematics(np.hstack([joints, fingers])) for joints in (steps.before, steps.first)]
+        before = [partial(self.world_from_link, kinematics=each) for each in links]
+        return self._dynamics([self.world_from_link, *before], is_free, step_s)
+
+    def _dynamics(self, links: Sequence[Links], is_free: NDArray[np.bool_], step_s: float) -> Dynamics | NotMeasured:
         gravity, robot = np.array(self.info.scene.physics.gravity), self.info.robot
         if not gravity.any():
             return NotMeasured(why="there is no gravity")
-        joints = frozenset(joint.name for joint in self.urdf.path_to(robot.tcp_link))
         carried, free = [], self.columns.contact_force == 0
         for body in self.info.scene.movable:
             is_carried = self.is_carried(body.name, LIFTED_HEIGHT)
-            force: Array = is_carried[:, None] * (-body.mass * gravity)
-            carried.append(Load(self.columns.object_poses[body.name][:, :3], force, joints))
+            carried.append(Carried(body.mass * is_carried, self.columns.object_poses[body.name][:, :3]))
             free = free | is_carried
         scale = self.info.scene.robot.scale
         try:
             return Dynamics(
-                self.world_from_link,
+                links,
                 self.urdf,
                 {name: (mass, scale * centre) for name, (mass, centre) in masses_of(robot.urdf).items()},
                 gravity=gravity,
-                fps=self.info.fps,
+                step_s=step_s,
                 tip=robot.tcp_link,
                 carried=carried,
-                free=free,
+                free=free & is_free,
             )
         except (SceneError, KeyError) as error:
             return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
@@ -236,9 +252,9 @@ class CheckedEpisode(ExitStack):
         """(1, 4, 4)."""
         return self.info.scene.robot.world_from_base.matrix()[None]
 
-    def world_from_link(self, link: str) -> Array:
-        """(T, 4, 4) by forward kinematics of the recorded joints; RecordingError: unknown link."""
-        return np.asarray(self.world_from_base @ self.base_from_link(link))
+    def world_from_link(self, link: str, kinematics: LinkMatrices | None = None) -> Array:
+        """(T, 4, 4), by default of the recorded joints; RecordingError: unknown link."""
+        return np.asarray(self.world_from_base @ self.base_from_link(link, kinematics))
 
     @cached_property
     def world_from_tcp(self) -> Array:
@@ -271,11 +287,24 @@ class CheckedEpisode(ExitStack):
         labels: tuple[ImageKind, ...] = ("labels",) if self.recording.has_segmentation(camera) else ()
         return ("color", *depth, *labels)
 
+    @cached_property
+    def keyframes(self) -> Mapping[str, NDArray[np.int64]]:
+        """Camera -> frames whose colour images are decoded without others."""
+        names = [camera.name for camera in self.cameras]
+        return {name: np.flatnonzero([packet.is_keyframe for packet in self.recording.packets(name)]) for name in names}
+
     def images(self, camera: SceneCamera, kind: ImageKind = "color") -> ImageSummary:
         """What the checks need of a camera's decoded images; decoded once."""
         if (camera.name, kind) not in self._images:
-            keep = () if kind == "color" else self.sampled[camera.name].tolist()[::2]
-            self._images[camera.name, kind] = summarise(self.recording, camera, kind, keep)
+            keep: Iterable[int] = ()
+            with suppress(
+                RecordingError
+            ):  # of colours all but those of the most unusual keyframe, which decoding shows
+                if kind != "color":
+                    keep = self.sampled[camera.name].tolist()[::2]
+                else:
+                    keep = with_lead(frames_to_compare(self.keyframes[camera.name], self.num_frames)).tolist()
+            self._images[camera.name, kind] = summarise(self.recording, camera, kind, set(keep))
         return self._images[camera.name, kind]
 
     @cached_property
@@ -301,13 +330,18 @@ class CheckedEpisode(ExitStack):
                 yield f"{camera.name} and {other.name}", correlation(first[:count], second[:count])
 
     @cached_property
+    def _world(self) -> RecordedWorld:
+        """What is drawn; SceneError where a model is missing."""
+        return drawable_world(self.info, self.columns)
+
+    @cached_property
     def _drawn(self) -> DrawnEpisode | NotMeasured:
         """The images as the recorded numbers make them; each single one where some are coded without loss."""
         kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
         is_exact = any(of_camera != ("color",) for of_camera in kinds.values())
         try:
             colors = {camera.name: self.images(camera).cells for camera in self.cameras}
-            return draw_episode(self.info, self.columns, kinds, colors, draw_each=is_exact)
+            return draw_episode(self.info, self._world, kinds, colors, draw_each=is_exact)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
@@ -326,10 +360,8 @@ class CheckedEpisode(ExitStack):
         """Camera -> frames that are compared at their full size."""
         found = {}
         for camera in self.cameras:
-            packets = self.recording.packets(camera.name)
-            keyframes = np.array([packet.frame_index for packet in packets if packet.is_keyframe], dtype=np.int64)
             detail = self.images(camera).detail
-            found[camera.name] = frames_to_compare(keyframes, len(detail), detail)
+            found[camera.name] = frames_to_compare(self.keyframes[camera.name], len(detail), detail)
         return found
 
     @cached_property
@@ -337,7 +369,7 @@ class CheckedEpisode(ExitStack):
         """(camera, kind) -> frame -> image, as it was before it was encoded."""
         kinds = {camera.name: self.kinds(camera.name) for camera in self.cameras}
         try:
-            return draw_full_size(self.info, self.columns, kinds, self.sampled)
+            return draw_full_size(self._world, kinds, self.sampled)
         except NOT_DRAWABLE as error:
             return NotMeasured(why=f"the recording cannot be drawn here: {error}")
 
@@ -362,16 +394,11 @@ class CheckedEpisode(ExitStack):
         if len(frames) < 2:
             return NotMeasured(why=f"camera {camera.name} has {len(frames)} images")
         if camera.name not in self._full_sizes:
-            wanted = with_lead(frames).tolist()
-            seen = dict(zip(wanted, self.recording.images_at(camera.name, wanted), strict=True))
-            images = np.stack([drawn[frame] for frame in frames.tolist()])
-            recorded = np.stack([seen[frame] for frame in frames.tolist()])
+            kept = self.images(camera).kept
+            missing = [frame for frame in with_lead(frames).tolist() if frame not in kept]
+            seen = {**kept, **dict(zip(missing, self.recording.images_at(camera.name, missing), strict=True))}
             settings = self.recording.video_settings(camera.name)
-            for tries_qualities in (False, True):  # which takes long, and is seldom needed
-                expected = encoded_again(settings, list(images), frames, seen, tries_qualities=tries_qualities)
-                self._full_sizes[camera.name] = found = compare_full_size(recorded, expected, images, frames)
-                if found.is_clear:
-                    break
+            self._full_sizes[camera.name] = compare_with_encoder(settings, frames, seen, drawn)
         return self._full_sizes[camera.name]
 
     def pixels_off(self, camera: SceneCamera, kind: ImageKind) -> tuple[Array, NDArray[np.intp]] | NotMeasured:

@@ -45,9 +45,19 @@ class DrawnEpisode:
     shift: Mapping[str, Array]
 
 
+def drawable_world(info: EpisodeInfo, columns: Columns) -> RecordedWorld:
+    """An episode as its recorded numbers make it, its cameras as in `drawable_scene`.
+
+    Raises:
+        SceneError: A model is not there.
+    """
+    joints, objects = columns.joint_position, columns.object_poses
+    return RecordedWorld(info.robot, drawable_scene(info), joint_position=joints, object_poses=objects)
+
+
 def draw_episode(
     info: EpisodeInfo,
-    columns: Columns,
+    world: RecordedWorld,
     kinds: Mapping[str, Iterable[ImageKind]],
     colors: Mapping[str, Cells] | None = None,
     *,
@@ -56,7 +66,8 @@ def draw_episode(
     """The images of an episode, as the recorded numbers make them.
 
     Args:
-        info, columns: Of the recording.
+        info: Of the recording.
+        world: Its `drawable_world`.
         kinds: Camera name -> what is to be drawn of it.
         colors: Camera name -> its recorded colour images, by which turns are found and frames chosen.
         draw_each: Whether every frame is drawn, also those that can be told from their neighbours.
@@ -66,14 +77,12 @@ def draw_episode(
     """
     # The recorded images' grid: the small ones' own may have a row more or less.
     counts = {camera.name: cell_counts(camera.width, camera.height) for camera in info.scene.cameras}
-    scene = drawable_scene(info)
-    world = RecordedWorld(info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses)
     turns = {} if colors is None else _turns(info, world, counts, colors)
-    cameras = tuple(_turned_back(camera, turns.get(camera.name)) for camera in scene.cameras)
+    cameras = tuple(_turned_back(camera, turns.get(camera.name)) for camera in world.scene.cameras)
     if draw_each or colors is None:
-        frames: NDArray[np.int64] = np.arange(columns.num_frames)
+        frames: NDArray[np.int64] = np.arange(len(world.all_poses))
     else:
-        frames = frames_to_draw(colors.values(), world.all_poses[: columns.num_frames])
+        frames = frames_to_draw(colors.values(), world.all_poses)
     return DrawnEpisode(
         images=draw(world, cameras, frames, kinds, counts),
         shift={
@@ -85,22 +94,20 @@ def draw_episode(
 
 
 def draw_full_size(
-    info: EpisodeInfo,
-    columns: Columns,
+    world: RecordedWorld,
     kinds: Mapping[str, Iterable[ImageKind]],
     frames: Mapping[str, NDArray[np.int64]],
 ) -> dict[tuple[str, ImageKind], dict[int, NDArray[Any]]]:
-    """(camera, kind) -> frame -> its image before it was encoded, of some frames of each camera.
+    """(camera, kind) -> frame -> its image before it was encoded, of some frames of each camera of a `drawable_world`.
 
     Raises:
-        SceneError, RenderError: A model is not there, or cannot be drawn.
+        SceneError, RenderError: A model cannot be drawn.
     """
-    scene, wanted = drawable_scene(info), {kind for of_camera in kinds.values() for kind in of_camera}
-    world = RecordedWorld(info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses)
+    wanted = {kind for of_camera in kinds.values() for kind in of_camera}
     found: dict[tuple[str, ImageKind], dict[int, NDArray[Any]]] = {
         (name, kind): {} for name in kinds for kind in kinds[name]
     }
-    painter = Painter(warm_renderer(), scene.cameras, depth="depth" in wanted, segmentation="labels" in wanted)
+    painter = Painter(warm_renderer(), world.scene.cameras, depth="depth" in wanted, segmentation="labels" in wanted)
     painter.setup(world)
     for world.frame in sorted({int(frame) for of_camera in frames.values() for frame in of_camera}):
         for name, image in painter.images().items():

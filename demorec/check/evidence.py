@@ -103,7 +103,12 @@ def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:
     robot = info.robot
     n = len(robot.arm_joints)
     nothing, inf = np.full((c.num_frames, 1), np.nan), (math.inf,)
-    sensors = {"velocities": c.joint_velocity, "efforts": c.joint_effort[:, :n], "EE pose": c.base_from_tcp, **c.sensed}
+    sensors = {
+        "velocities": c.joint_velocity[:, :n],
+        "efforts": c.joint_effort[:, :n],
+        "EE pose": c.base_from_tcp,
+        **c.sensed,
+    }
     return Motion(
         where="",
         fps=info.fps,

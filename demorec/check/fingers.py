@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -55,6 +56,16 @@ class Convex:
                 half = np.array([0.0, 0.0, shape.size[1] / 2])
                 return cls(points=np.concatenate([ring - half, ring + half]), axes=np.eye(3))
         raise ValueError(f"a shape of kind {shape.kind!r} is no solid")
+
+    @cached_property
+    def centre(self) -> Array:
+        """(3,) middle of its points."""
+        return np.asarray(self.points.mean(axis=0))
+
+    @cached_property
+    def reach(self) -> float:
+        """How far from its centre it ends, metres."""
+        return float(np.linalg.norm(self.points - self.centre, axis=1).max()) + self.radius
 
     def moved(self, transform: Array) -> Convex:
         """The same in another frame, given its (4, 4) transform."""
@@ -111,23 +122,26 @@ def finger_depth(episode: CheckedEpisode) -> Iterator[Found]:
     The fingers are those of the recorded description, within a tenth of a millimetre. Not measured where no finger
     comes within two millimetres of an object.
     """
-    robot = episode.info.robot
-    links = {link.name: link for link in read_links(episode.description)}
-    for name in robot.gripper.finger_links:
-        finger = episode.world_from_link(name)
-        parts = [Convex.of_shape(shape).moved(shape.link_from_shape.matrix()) for shape in links[name].visuals]
-        reach = max((float(np.linalg.norm(part.points, axis=1).max()) + part.radius for part in parts), default=0.0)
+    for name in episode.info.robot.gripper.finger_links:
+        finger, parts = episode.world_from_link(name), _parts(episode.description, name)
         for body in episode.info.scene.movable:
             if body.shape.kind not in ("box", "sphere", "cylinder", "capsule"):
                 continue
-            pose = episode.world_from_object(body.name)
-            distance = np.linalg.norm(pose[:, :3, 3] - finger[:, :3, 3], axis=1)
-            near = np.flatnonzero(distance < reach + math.hypot(*body.shape.extents) / 2 + NEAR)
-            if not parts or not len(near):
-                continue
-            solid = Convex.of_shape(body.shape)
-            depth = np.max([depth_in(part, finger[near], solid, pose[near]) for part in parts], axis=0)
+            solid, pose = Convex.of_shape(body.shape), episode.world_from_object(body.name)
+            depth = np.full(len(finger), -np.inf)
+            for part in parts:
+                centre = finger[:, :3, :3] @ part.centre + finger[:, :3, 3]
+                distance = np.linalg.norm(pose[:, :3, 3] - centre, axis=1)
+                near = np.flatnonzero(distance < part.reach + solid.reach + NEAR)
+                if len(near):
+                    depth[near] = np.maximum(depth[near], depth_in(part, finger[near], solid, pose[near]))
             row = int(np.argmax(depth))
             if depth[row] > -NEAR:
-                value = max(float(depth[row]), 0.0)
-                yield Measurement(value=value, frame=int(near[row]), detail=f"{name} in {body.name}")
+                yield Measurement(value=max(float(depth[row]), 0.0), frame=row, detail=f"{name} in {body.name}")
+
+
+@lru_cache(maxsize=8)  # all recordings of a robot have the same
+def _parts(description: str, link: str) -> tuple[Convex, ...]:
+    """What a link of a URDF shows, in its frame."""
+    shapes = next(found.visuals for found in read_links(description) if found.name == link)
+    return tuple(Convex.of_shape(shape).moved(shape.link_from_shape.matrix()) for shape in shapes)

@@ -8,7 +8,7 @@ frames before, which are taken from the recording. Depth and labels are stored w
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from demorec.check.cells import CellGrid
 from demorec.check.limits import limit_table
 from demorec.core.config import VideoConfig
 from demorec.core.geometry import Array
-from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, make_encoder
+from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe, make_encoder
 
 BLOCK = 8
 """Pixels a side of the parts of an image that are judged by themselves: those of a transform in H.264."""
@@ -88,21 +88,25 @@ class FullSize:
         return all(value < _CLEAR * limits[check].warn for check, value in found.items())
 
 
-def frames_to_compare(keyframes: NDArray[np.int64], count: int, detail: NDArray[np.float32]) -> NDArray[np.int64]:
+def frames_to_compare(
+    keyframes: NDArray[np.int64], count: int, detail: NDArray[np.float32] | None = None
+) -> NDArray[np.int64]:
     """(N,) the first two frames, two later ones, and those around the keyframe whose detail is most unusual.
 
     Args:
         keyframes: In order.
         count: Frames that there are.
-        detail: (count,) how much fine structure each image has.
+        detail: (count,) how much fine structure each image has; None where that is not known yet.
     """
     starts = keyframes[keyframes <= count - _PAIR]
     if not len(starts):
         return np.arange(min(count, _PAIR))
-    amount = np.log(np.maximum(detail[starts], 1e-3))
-    usual = np.array([np.median(amount[max(n - _NEAR, 0) : n + _NEAR + 1]) for n in range(len(starts))])
-    odd = starts[int(np.argmax(np.abs(amount - usual)))]
-    chosen = np.unique([starts[0], starts[len(starts) // 2], starts[-1], odd])
+    chosen = [starts[0], starts[len(starts) // 2], starts[-1]]
+    if detail is not None:
+        amount = np.log(np.maximum(detail[starts], 1e-3))
+        usual = np.array([np.median(amount[max(n - _NEAR, 0) : n + _NEAR + 1]) for n in range(len(starts))])
+        chosen.append(starts[int(np.argmax(np.abs(amount - usual)))])
+    chosen = np.unique(chosen)
     return np.asarray(np.unique((chosen[:, None] + np.arange(_PAIR)).reshape(-1)))
 
 
@@ -115,7 +119,7 @@ def encoded_again(
     settings: VideoSettings,
     drawn: Sequence[Rgb],
     frames: NDArray[np.int64],
-    seen: dict[int, Rgb],
+    seen: Mapping[int, Rgb],
     *,
     tries_qualities: bool,
 ) -> NDArray[np.uint8]:
@@ -183,11 +187,36 @@ def _encoded(settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb]
     """What an encoder makes of the last `count` of some images."""
     encoder = make_encoder(config, settings.width, settings.height, settings.fps)
     data = [packet for image in images for packet in encoder.encode(image)]
+    data += encoder.finish()
+    # From the last keyframe on that they need.
+    first = next((n for n in range(len(data) - count, 0, -1) if is_keyframe(config.codec, data[n])), 0)
     packets = [
-        VideoPacket(frame_index=n, time_ns=0, data=packet, is_keyframe=n == 0)
-        for n, packet in enumerate([*data, *encoder.finish()])
+        VideoPacket(frame_index=n, time_ns=0, data=data[n], is_keyframe=n == first) for n in range(first, len(data))
     ]
     return list(deque(decode(settings, packets), maxlen=count))
+
+
+def compare_with_encoder(
+    settings: VideoSettings, frames: NDArray[np.int64], seen: Mapping[int, Rgb], drawn: Mapping[int, Rgb]
+) -> FullSize:
+    """Compare some recorded frames with what their encoder makes of the drawn ones.
+
+    Args:
+        settings: Of the encoder.
+        frames: (N,) as of `frames_to_compare`.
+        seen: Frame -> recorded image, of those `with_lead`.
+        drawn: Frame -> image.
+
+    Raises:
+        ConfigError: This build of FFmpeg lacks the encoder.
+    """
+    images, recorded = (np.stack([of[frame] for frame in frames.tolist()]) for of in (drawn, seen))
+    for tries_qualities in (False, True):  # which takes long, and is seldom needed
+        expected = encoded_again(settings, list(images), frames, seen, tries_qualities=tries_qualities)
+        found = compare_full_size(recorded, expected, images, frames)
+        if found.is_clear:
+            break
+    return found
 
 
 def compare_full_size(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -14,6 +15,8 @@ CARRIED_HEIGHT = 0.03
 """Metres above its start from which on an object counts as carried."""
 _FIRST = 9
 """Frames after the first of a way."""
+_OPENS = 0.6
+"""Of its opening, a second: fingers that open faster are on their way."""
 _MOST_LAG = 4
 """Frames up to which contact force and fingers are shifted against each other."""
 _PRESSES, _APART, _STANDS = 0.25, 0.02, 0.15
@@ -91,11 +94,13 @@ def contact_lag(episode: CheckedEpisode) -> Found:
 
 
 @physics_check(
-    measures="contact force while there is nothing within reach",
+    measures="contact force while there is nothing within reach, or of fingers that open, beyond that of their motors",
     unit="N",
 )
-def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
-    """Fingers far above all supports and away from all objects touch nothing but each other."""
+def touches_nothing(episode: CheckedEpisode) -> Iterator[Found]:
+    """Fingers far above all supports and away from all objects touch nothing but each other; and they press on nothing
+    while they open, but with what force their motors have for it."""
+    yield _pressed_while_opening(episode)
     c, scene = episode.columns, episode.info.scene
     tcp = episode.world_from_tcp[:, :3, 3]
     alone = tcp[:, 2] > max((top_of(body) for body in scene.fixed if body.collides), default=-math.inf) + 0.06
@@ -104,9 +109,20 @@ def touches_nothing(episode: CheckedEpisode) -> Measurement | None:
         alone &= np.linalg.norm(c.object_poses[body.name][:, :3] - tcp, axis=1) > reach
     # Closed fingers press on each other.
     alone &= c.gripper_width > episode.info.robot.gripper.min_width + 0.005
-    if not alone.any():
+    if alone.any():
+        yield worst_frame(np.where(alone, np.abs(c.contact_force), 0.0), f"{int(alone.sum())} frames alone")
+
+
+def _pressed_while_opening(episode: CheckedEpisode) -> Found:
+    c, robot = episode.columns, episode.info.robot
+    if not (presses := c.contact_force > 0).any():
         return None
-    return worst_frame(np.where(alone, np.abs(c.contact_force), 0.0), f"{int(alone.sum())} frames alone")
+    motors = np.abs(c.joint_effort[:, episode.num_arm :]).sum(axis=1)
+    at_work = float(np.median(motors[presses]))
+    speed = np.diff(c.gripper_width, prepend=c.gripper_width[:1]) * episode.info.fps
+    allowed = float(np.median(c.contact_force[presses])) * motors / at_work if at_work else np.full(len(motors), np.inf)
+    beyond = np.where(speed > _OPENS * robot.gripper.open_width, c.contact_force - allowed, 0.0)
+    return worst_frame(np.maximum(beyond, 0.0), "while the fingers open")
 
 
 @physics_check(

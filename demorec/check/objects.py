@@ -21,12 +21,15 @@ _TUMBLES = 1.5
 """Times as fast as two frames before or after a thing may turn that tumbles."""
 _RESTS = 0.02
 """m/s, 0.1 of them for each rad/s, below which a thing is at rest."""
+_LIES, _LAIN_SECONDS = 0.005, 0.15
+"""m/s below which a thing lies still, and for how long before it counts as lying there."""
 _GAP = 0.005
 """Metres above a support from which on it bears nothing."""
 _CARRIED = 0.01
 """Metres above its start from which on a hand may carry something."""
-_PRESSED, _IN_HAND = 0.002, 0.05
-"""Metres by which a hand presses what it lowers into a support at most, and of what it holds from its TCP."""
+_PRESSED, _PRESSED_BLINDLY, _IN_HAND = 0.002, 0.004, 0.05
+"""Metres by which a hand presses what it lowers into a support at most, the same in an attempt that failed (2.6 mm were
+seen), and of what it holds from its TCP."""
 SOLID = ("box", "sphere", "cylinder", "capsule")
 """Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 
@@ -94,14 +97,25 @@ def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     unit="m/s",
 )
 def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
-    """An object moves or turns only when touched, or for a moment after it (falling, rolling, tipping).
+    """An object moves or turns only when touched, or for a moment after it (falling, rolling, tipping). What lies still
+    is woken by a force on the fingers, also in the hand's reach, or by another object.
 
     0.1 m/s are counted for each rad/s.
     """
+    fps, force = episode.info.fps, episode.columns.contact_force
+    speeds = {
+        name: displacement(pose[1:], pose[:-1]) * fps
+        for name, pose in ((name, episode.world_from_object(name)) for name in episode.columns.object_poses)
+    }
+    quiet = np.zeros(max(len(force) - 1, 0), dtype=np.bool_)  # in the frames before and after a step and around these
+    quiet[1:-1] = np.max([force[:-3], force[1:-2], force[2:-1], force[3:]], axis=0) == 0 if len(force) > 3 else False
+    moving = {name: speed > _LIES for name, speed in speeds.items()}
+    lain = max(3, round(_LAIN_SECONDS * fps))
     for name, touched in _touched(episode).items():
-        pose = episode.world_from_object(name)
-        speed = displacement(pose[1:], pose[:-1]) * episode.info.fps
-        yield worst_frame(np.where(touched, 0.0, speed), name, first=1)
+        lies = np.zeros_like(quiet)
+        lies[lain:] = ~held_for(moving[name], lain - 1)[lain - 1 : -1]
+        asleep = lies & quiet & ~np.any([rows for other, rows in moving.items() if other != name] or [~quiet], axis=0)
+        yield worst_frame(np.where(touched & ~asleep, 0.0, speeds[name]), name, first=1)
 
 
 @physics_check(
@@ -168,11 +182,14 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules).
 
     A hand that lowers something feels the support a frame late, and presses it, and what is below, by what it went down
-    since, or less.
+    since, or less. One that failed may have pressed on without noticing, and says that it failed.
     """
     scene, c = episode.info.scene, episode.columns
     tcp = episode.world_from_tcp[:, :3, 3]
-    pressed = np.clip(-np.diff(tcp[:, 2], prepend=tcp[:1, 2]), 0.0, _PRESSED) * (c.contact_force > 0)
+    pressed = np.clip(-np.diff(tcp[:, 2], prepend=tcp[:1, 2]), 0.0, _PRESSED)
+    if episode.outcome is not None and not episode.outcome.success:
+        pressed = np.full_like(pressed, _PRESSED_BLINDLY)
+    pressed *= c.contact_force > 0
     movable = [body for body in scene.movable if body.shape.kind in SOLID]
     still = [b for b in scene.bodies if b.collides and not b.movable and b.shape.kind in SOLID]
     for number, body in enumerate(movable):

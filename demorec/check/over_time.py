@@ -25,6 +25,8 @@ _REACH_S = 0.7
 """How far apart in time motions of images and state are compared, seconds."""
 _SHOWN = 0.35
 """The least usual correlation from which anything is concluded."""
+_BACKWARDS = 0.5
+"""The least correlation with the state's course from its end on that is none by chance."""
 _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
 _OTHER_VIEW = 0.7
@@ -126,28 +128,30 @@ def images_follow_state(subject: Filmed) -> Iterator[Found]:
     """Images move when the robot does: catches those of another episode, late, backwards or frozen ones.
 
     How much an image changes is correlated with the speed of the state. What counts is how far that is below the
-    camera's usual correlation (of few episodes nobody knows it) and below that at another lag, added.
+    camera's usual correlation (of few episodes nobody knows it) and below that at another lag, or backwards, added.
     """
     for camera, films in subject.films.items():
         known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
         if not known:
             continue
         scale = np.concatenate([state for _, state in known]).std(axis=0) + 1e-3
-        tables: list[tuple[Film, Array]] = []
+        tables: list[tuple[Film, Array, float]] = []
         for film, state in known:
             reach = max(2, round(_REACH_S * film.fps))
             speed = np.linalg.norm(np.diff(state / scale, axis=0), axis=1)
             if len(speed) >= 4 * reach and (np.diff(film.frames) == 1).all():
-                tables.append((film, _correlations(film.step, speed, reach)))
-        usual = float(np.median([_near(table) for _, table in tables])) if tables else 0.0
+                table, backwards = (_correlations(film.step, course, reach) for course in (speed, speed[::-1]))
+                clearly = [backwards.max()] if backwards.max() > _BACKWARDS else []
+                tables.append((film, table, float(max([table.max(), *clearly]))))
+        usual = float(np.median([_near(table) for _, table, _ in tables])) if tables else 0.0
         if len(tables) < _FEWEST_EPISODES:
-            usual = max((float(table.max()) for _, table in tables), default=0.0)
+            usual = max((best for _, _, best in tables), default=0.0)
         if usual < _SHOWN:
             yield NotMeasured(why=f"{camera} hardly shows when the robot moves")
             continue
-        for film, table in tables:
+        for film, table, best in tables:
             below = max(usual - _near(table), 0.0) if len(tables) >= _FEWEST_EPISODES else 0.0
-            yield Measurement(value=below + float(table.max()) - _near(table), detail=film.where)
+            yield Measurement(value=below + best - _near(table), detail=film.where)
 
 
 def _correlations(steps: Array, speed: Array, reach: int) -> Array:

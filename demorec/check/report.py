@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -106,8 +107,16 @@ class CheckOptions:
 
     def checks(self, *forms: Form) -> list[Check]:
         """Those of some forms, in the order of the table."""
-        loaded = [CHECKS.load(name) for name in CHECKS.names() if not self.only or name in self.only]
-        return [check for check in loaded if set(forms) & set(check.on)]
+        wanted = set(forms)
+        return [
+            check for check in _all_checks() if wanted & set(check.on) and (not self.only or check.name in self.only)
+        ]
+
+
+@cache
+def _all_checks() -> tuple[Check, ...]:
+    """Of the table."""
+    return tuple(CHECKS.load(name) for name in CHECKS.names())
 
 
 @dataclass(frozen=True, kw_only=True)

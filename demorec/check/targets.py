@@ -7,7 +7,18 @@ from functools import partial
 
 import numpy as np
 
-from demorec.check.base import ACTIONS, GRIPPER, URDF, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.base import (
+    ACTIONS,
+    GRIPPER,
+    URDF,
+    VELOCITIES,
+    Found,
+    Lacking,
+    Measurement,
+    NotMeasured,
+    check,
+    worst_entry,
+)
 from demorec.check.evidence import Motion
 from demorec.check.motion import FEWEST, Moving, correlations
 from demorec.check.rows import finest_lag
@@ -27,6 +38,8 @@ _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
 """rad, m: by how much a state that stays changes at most, and an action that goes on at least; how often."""
+_ANY_OTHER = 2.0
+"""Times the second largest difference of a step from its velocities, beyond which the largest is a jump."""
 _NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
 
 target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
@@ -130,6 +143,33 @@ def state_reaches_action(subject: Moving) -> Found:
         return NotMeasured(why="no joint is known whose action stays where it is for a while")
     name = max(least, key=lambda key: least[key])
     return Measurement(value=least[name], detail=name)
+
+
+@check(
+    group="physics",
+    on=("external", "dataset"),  # of simulated recordings `velocity_follows_servo` judges each frame
+    measures="a single step of a joint that its velocities do not tell, beyond twice any other, of the joint's range",
+    warn=0.02,
+    fail=0.04,
+    needs=VELOCITIES,
+)
+def steps_as_velocities(subject: Moving) -> Iterator[Found]:
+    """No joint jumps: catches an encoder that slips, a single wrong value, and frames that are missing.
+
+    Velocities that are coarse, late or of another unit differ from the steps everywhere, and tell nothing.
+    """
+    for motion in subject.motions.all:
+        if motion.velocity is None:
+            yield Lacking(need=VELOCITIES)
+            return
+        if len(motion.state) < FEWEST:
+            continue
+        told = (motion.velocity[1:] + motion.velocity[:-1]) / 2 * motion.steps_s[:, None]
+        off = np.sort(np.abs(np.diff(motion.state, axis=0) - told), axis=0)[-2:]
+        beyond = np.maximum(off[1] - _ANY_OTHER * off[0], 0.0) / np.maximum(np.ptp(motion.state, axis=0), _GOES)
+        known = np.isfinite(beyond)
+        if known.any():
+            yield worst_entry(beyond[None, known], motion.labels(known))
 
 
 @target_check(

@@ -61,7 +61,7 @@ def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
             detail = f"camera {camera.name}: {len(times)} images for {len(expected)} frames"
             yield Measurement(value=number, frame=frame, detail=detail)
             continue
-        keyframes = [packet.frame_index for packet in episode.recording.packets(camera.name) if packet.is_keyframe]
+        keyframes = episode.keyframes[camera.name].tolist()
         gaps = np.diff([*keyframes, len(expected)]) if keyframes else np.array([len(expected)])
         late = (0 if keyframes[:1] == [0] else 1) + int((gaps > settings.gop).sum())
         place = keyframes[int(np.argmax(gaps))] if late and keyframes else None

@@ -19,7 +19,7 @@ from demorec.check.base import (
     worst,
     worst_frame,
 )
-from demorec.check.dynamics import LEAST_LOAD, LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics
+from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics
 from demorec.check.episode import CheckedEpisode
 from demorec.check.gripper import CARRIED_HEIGHT
 from demorec.core.geometry import Array
@@ -35,6 +35,8 @@ _LEAST_TORQUE = 0.012
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
 _STOP = 2e-3
 """Radians before its limit at which a joint is at its stop."""
+_OFTEN, _OWN_INERTIA = 0.9, 0.15
+"""Share of the frames by whose worst efforts are judged; of a motor's peak that its links' own inertia may make."""
 _AROUND = 6
 """Frames before and after a peak of the contact force in which it must be the only one."""
 _LOST_SHARE = 0.5
@@ -81,13 +83,13 @@ def _hand(episode: CheckedEpisode) -> _Hand | NotMeasured | Lacking:
         return dynamics
     pose = episode.world_from_link(episode.info.robot.hand_link)
     rotation, origin = pose[:, :3, :3], pose[:, :3, 3]
-    loads = dynamics.below(_mount(episode))
+    force, moment = dynamics.borne(_mount(episode))
     return _Hand(
         dynamics=dynamics,
         force=np.einsum("tij,tj->ti", rotation, wrench[:, :3]),
         torque=np.einsum("tij,tj->ti", rotation, wrench[:, 3:]),
-        loads_force=np.sum([load.force for load in loads], axis=0),
-        loads_torque=np.sum([np.cross(load.point - origin, load.force) for load in loads], axis=0),
+        loads_force=force,
+        loads_torque=moment - np.cross(origin, force),
         origin=origin,
         rotation=rotation,
     )
@@ -182,42 +184,79 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
 
 
 @physics_check(
+    measures="torques of the joints that bear the arm against those that the servo's motion needs, difference that a "
+    "tenth of the frames exceed, of the usual torque",
+)
+def effort_in_each_frame(episode: CheckedEpisode) -> Found:
+    """The motors give in each frame what the arm's weight and its acceleration in that frame need, also where noise
+    shakes it: catches torques that are late, filtered or made up. The links' own inertia is left out."""
+    dynamics, found = episode.exact_dynamics, list[Found]()
+    if isinstance(dynamics, NotMeasured):
+        return dynamics
+    rows = dynamics.is_judged
+    if rows.sum() < MIN_FRAMES:
+        return NotMeasured(why=f"the servo alone moves the free hand in {int(rows.sum())} frames")
+    for index, torque in _of_loaded(episode, dynamics):
+        off = np.abs(episode.columns.joint_effort[rows, index] - torque[rows])
+        share = float(np.quantile(off, _OFTEN) / np.sqrt((torque[rows] ** 2).mean()))
+        found.append(
+            Measurement(value=share, detail=f"{episode.info.robot.arm_joints[index]}, {int(rows.sum())} frames")
+        )
+    return worst(*found) or NotMeasured(why="no joint bears the arm")
+
+
+def _of_loaded(episode: CheckedEpisode, dynamics: Dynamics) -> Iterator[tuple[int, Array]]:
+    """Number of each joint that bears weight, and the torque (T,) that it needs, N m."""
+    known = {joint.name: joint for joint in episode.urdf.joints}
+    for index, name in enumerate(episode.info.robot.arm_joints):
+        torque = dynamics.torque(known[name])
+        if np.median(np.abs(torque[dynamics.is_judged])) >= MIN_LOAD:
+            yield index, torque
+
+
+@physics_check(
     measures="peak of a single frame in wrench or efforts that the other does not show, or of the force on what is "
     "carried, in units of what is borne",
 )
 def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     """No single frame is far from both of its neighbours, or empty: catches lost values and glitches of an amplifier.
 
-    Where the hand is free and moves smoothly, what an impact adds shows in wrench and motors alike; of the motors,
-    those count that bear weight. The force on what is carried is that of the gripper's motors in each frame.
+    Wrench and efforts are those that the servo's motion needs, in each frame in which it alone moves the free hand; of
+    the motors those count that bear weight. The force on what is carried is that of the gripper's motors in each frame.
     """
     yield _peak_of_grip(episode)
     for name, table in (("wrench", episode.columns.sensed.get("wrench")), ("efforts", episode.columns.joint_effort)):
         if table is not None and (lost := (table == 0).all(axis=1)).mean() < _LOST_SHARE:  # weight is always there
             yield worst_frame(lost.astype(np.float64), f"{name} of zero")
-    hand = episode.shared(_hand)
-    if not isinstance(hand, _Hand):
-        yield hand
+    hand, dynamics = episode.shared(_hand), episode.exact_dynamics
+    if not isinstance(hand, _Hand) or isinstance(dynamics, NotMeasured):
+        yield None if isinstance(hand, _Hand) else hand
         return
-    free = hand.dynamics.is_judged.copy()
+    free = dynamics.is_judged.copy()
     free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
-    weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
-    measured = np.hstack([hand.force, hand.torque / _LEVER]) / weight
-    off = measured - np.hstack([hand.loads_force, hand.loads_torque / _LEVER]) / weight
-    grip = _peaks(_left_of_grip(episode)[:, None])[:, 0] / weight
-    # Of what was measured, not only of what is computed beside it; what shifts between the fingers shows, too.
-    of_wrench = np.maximum(np.minimum(_peaks(off), _peaks(measured)).max(axis=1) - grip, 0.0)
-    of_motors, of_loaded = np.zeros((2, len(free)))
-    for index, name in enumerate(episode.info.robot.arm_joints):
-        joint = next(joint for joint in episode.urdf.joints if joint.name == name)
-        torque = hand.dynamics.torque(joint)
-        load = float(np.sqrt(np.median(torque[free] ** 2))) if free.any() else 0.0
-        effort = episode.columns.joint_effort[:, index]
-        peaks = _peaks(np.stack([effort - torque, effort], axis=1)).min(axis=1) / max(load, LEAST_LOAD)
-        of_motors = np.maximum(of_motors, peaks)
-        of_loaded = np.maximum(of_loaded, peaks * (load >= MIN_LOAD))
+    of_wrench, of_motors = _peaks_of_wrench(episode, hand, dynamics), np.zeros(len(free))
+    for index, torque in _of_loaded(episode, dynamics):
+        peaks = _unexplained(episode.columns.joint_effort[:, index, None], torque[:, None])
+        of_motors = np.maximum(of_motors, peaks / np.sqrt((torque[dynamics.is_judged] ** 2).mean()))
+    # What accelerates the arm otherwise than the servo, as an impact does, shows in both.
     yield worst_frame(np.where(free, np.maximum(of_wrench - of_motors, 0.0), 0.0), "wrench")
-    yield worst_frame(np.where(free, np.maximum(of_loaded - of_wrench, 0.0), 0.0), "efforts")
+    yield worst_frame(np.where(free, np.maximum(of_motors - of_wrench, 0.0), 0.0), "efforts")
+
+
+def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, dynamics: Dynamics) -> Array:
+    """(T,) of force and torque, in units of the hand's weight; what shifts between the fingers shows, too."""
+    force, moment = dynamics.borne(_mount(episode))
+    weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
+    needed = np.hstack([force, (moment - np.cross(hand.origin, force)) / _LEVER]) / weight
+    peaks = _unexplained(np.hstack([hand.force, hand.torque / _LEVER]) / weight, needed)
+    return np.maximum(peaks - _peaks(_left_of_grip(episode)[:, None])[:, 0] / weight, 0.0)
+
+
+def _unexplained(measured: Array, needed: Array) -> Array:
+    """(T,) largest peak of what is measured (T, n) beyond what is needed, less what own inertia may make of it."""
+    return np.asarray(
+        (_peaks(measured - needed) - _OWN_INERTIA * _peaks(needed).max(axis=1, keepdims=True)).max(axis=1)
+    )
 
 
 def _peak_of_grip(episode: CheckedEpisode) -> Found:
@@ -250,11 +289,10 @@ def _of_joint(episode: CheckedEpisode, hand: _Hand, name: str) -> tuple[Array, A
     """
     joint = next(joint for joint in episode.urdf.joints if joint.name == name)
     pose = episode.world_from_link(joint.child)
-    below = hand.dynamics.below(_mount(episode))
-    total = hand.torque + np.cross(hand.origin - pose[:, :3, 3], hand.force)
-    for load in hand.dynamics.below(name):
-        if not any(load is other for other in below):
-            total = total + np.cross(load.point - pose[:, :3, 3], load.force)
+    force, moment = hand.dynamics.borne(name)  # of the links between the two joints, what bears no hand
+    moment = moment - hand.loads_torque - np.cross(hand.origin, hand.loads_force)
+    total = hand.torque + np.cross(hand.origin, hand.force) + moment
+    total -= np.cross(pose[:, :3, 3], hand.force + force - hand.loads_force)
     needed = ((pose[:, :3, :3] @ np.array(joint.axis)) * total).sum(axis=1)
     index = episode.info.robot.arm_joints.index(name)
     position = episode.columns.joint_position[:, index]

@@ -18,6 +18,7 @@ from typing import Literal, Protocol, cast
 
 import av
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
@@ -259,6 +260,7 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
     # A few bytes can announce images of gigabytes; encoded images are whole blocks of at most 128 pixels.
     context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
     num_packets = num_images = 0
+    reformatter = VideoReformatter()  # one for all images: a frame's own is set up anew for it, as long as it decodes
     try:
         for packet in packets:
             raw = av.Packet(packet.data)
@@ -266,10 +268,10 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
             num_packets += 1
             for frame in context.decode(raw):
                 num_images += 1
-                yield cast(Rgb, frame.to_ndarray(format="rgb24"))
+                yield cast(Rgb, reformatter.reformat(frame, format="rgb24").to_ndarray())
         for frame in context.decode(None):
             num_images += 1
-            yield cast(Rgb, frame.to_ndarray(format="rgb24"))
+            yield cast(Rgb, reformatter.reformat(frame, format="rgb24").to_ndarray())
     except (av.FFmpegError, ValueError) as error:
         raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_images}.") from error
     if num_images != num_packets:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -125,11 +127,16 @@ def _load_body(body: Body) -> tuple[VisualBody, BulletBody | None]:
 def _load_urdf(urdf: str, scale: float, *, name: str, is_fixed: bool) -> tuple[VisualBody, BulletBody]:
     path = asset_path(urdf)
     try:
-        text = path.read_text()
-        model = BulletBody(text, scale=scale)
-        links = {link.name: link for link in read_links(text, scale=scale)}
+        return _body_of(path.read_text(), path.parent, scale, name=name, is_fixed=is_fixed)
     except (OSError, ValueError) as error:
         raise SceneError(f"The model of {name!r} cannot be read from {urdf!r} ({describe_error(error)}).") from error
+
+
+@lru_cache(maxsize=64)  # all recordings of a robot have the same
+def _body_of(text: str, folder: Path, scale: float, *, name: str, is_fixed: bool) -> tuple[VisualBody, BulletBody]:
+    """Of a URDF's text, whose meshes are named from a folder; ValueError: it is broken."""
+    model = BulletBody(text, scale=scale)
+    links = {link.name: link for link in read_links(text, scale=scale)}
     visuals = []
     for number, link in enumerate(model.link_names, start=-1):
         for shape in links[link].seen:
@@ -139,7 +146,7 @@ def _load_urdf(urdf: str, scale: float, *, name: str, is_fixed: bool) -> tuple[V
                     link=number,
                     kind=shape.kind,
                     size=shape.size,
-                    file=str(mesh_path(path.parent, shape.file)) if shape.kind == "mesh" else "",
+                    file=str(mesh_path(folder, shape.file)) if shape.kind == "mesh" else "",
                     link_from_shape=pose if number >= 0 else model.base_from_inertial.inverse() @ pose,
                     rgba=_WHITE if shape.rgba is None else _in_single(shape.rgba),
                 )

@@ -10,7 +10,7 @@ from support.check import simulate
 
 from demorec.check.cells import ImageKind
 from demorec.check.episode import CheckedEpisode
-from demorec.check.episode_drawn import draw_episode
+from demorec.check.episode_drawn import draw_episode, drawable_world
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_plain
 from demorec.episode.info import EpisodeInfo
@@ -34,7 +34,8 @@ def test_the_found_turn_is_the_true_one(size: int, tmp_path: Path) -> None:
         made = prepare(EpisodePlan(config=config, episode_index=0, attempt=episode.info.attempt))
         colors = {camera.name: episode.images(camera).cells for camera in episode.cameras}
         kinds: dict[str, tuple[ImageKind, ...]] = dict.fromkeys(colors, ("color",))
-        shift = draw_episode(older(episode.info), episode.columns, kinds, colors, draw_each=False).shift
+        info = older(episode.info)
+        shift = draw_episode(info, drawable_world(info, episode.columns), kinds, colors, draw_each=False).shift
         for camera in episode.cameras:
             x, y, _, _ = made.true_from_recorded[camera.name].quat_xyzw
             # A camera turned to the right (about y, which is down) by a sees everything farther left by tan(a).
@@ -49,5 +50,6 @@ def test_what_is_turned_farther_than_told_stays_so(tmp_path: Path) -> None:
     with CheckedEpisode(path) as episode:
         colors = {"front": np.roll(episode.images(episode.cameras[0]).cells, 1, axis=2)}  # one of 32 cells: 1.4 deg
         info = older(episode.info)
-        drawn = draw_episode(info, episode.columns, {"front": ("color",)}, colors, draw_each=False)
+        world = drawable_world(info, episode.columns)
+        drawn = draw_episode(info, world, {"front": ("color",)}, colors, draw_each=False)
         assert drawn.shift == {}

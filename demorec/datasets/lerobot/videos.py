@@ -18,6 +18,7 @@ import av
 import numpy as np
 import pyarrow as pa
 from av.bitstream import BitStreamFilterContext
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -193,8 +194,9 @@ class EpisodeVideo:
 
     def images(self, begin: int = 0) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of every frame from one on, which may be one of the lead (below 0)."""
+        reformatter = VideoReformatter()  # a frame's own would be set up anew for each
         for frame in self._frames(begin):
-            yield cast("Rgb", frame.to_ndarray(format="rgb24"))
+            yield cast("Rgb", reformatter.reformat(frame, format="rgb24").to_ndarray())
 
     @cached_property
     def depth_scale(self) -> DepthScale:
