@@ -30,17 +30,11 @@ class Render:
     """Render recordings again with other cameras, sizes, renderers or looks; all numbers stay the same.
 
     Writes new recordings that name their origin. With the recording's own cameras and looks, the images are bit-exact,
-    which is checked (exit code 1 if they are not). Run the same command again to continue where it stopped. Cameras can
-    be described in a TOML file, one table each:
-
-      [side]
-      position = [0.5, 0.9, 0.5]
-      look_at = [0.5, 0.0, 0.1]
-      fov_y_degrees = 45
+    which is checked (exit code 1 if they are not). Run the same command again to continue where it stopped.
 
     Examples:
       demorec render recordings/cubes --out large --width 640 --height 480
-      demorec render a.mcap --out side --cameras side --camera-file cameras.toml
+      demorec render a.mcap --out corner --cameras front my_cameras:CORNER
       demorec render recordings/cubes --out looks_1 --looks 1 --depth
     """
 
@@ -49,10 +43,7 @@ class Render:
     out: Path
     """Folder for the new recordings, or the name of one (.mcap)."""
     cameras: tuple[str, ...] = ()
-    """Names from the recording, the camera file or `demorec list cameras`, or my_package.my_module:MY_CAMERA; default:
-    the recorded ones and all of the file."""
-    camera_file: Path | None = None
-    """TOML file that describes cameras by pose and field of view."""
+    """Names from the recording or `demorec list cameras`, or my_package.my_module:MY_CAMERA (auto: as recorded)."""
     width: int | None = None
     """Image width in pixels (auto: as recorded)."""
     height: int | None = None
@@ -117,7 +108,6 @@ class Render:
 
     def _options(self) -> RerenderOptions:
         from demorec.core.tables import RENDERERS
-        from demorec.replay.free_camera import read_cameras
         from demorec.replay.rerender import RerenderOptions
 
         if self.renderer is not None:
@@ -129,10 +119,8 @@ class Render:
             if getattr(self, name) is not None
         }
         replace(VideoConfig(), **changes).validate()
-        free = {} if self.camera_file is None else read_cameras(self.camera_file)
         return RerenderOptions(
             cameras=self.cameras or None,
-            free_cameras=free,
             width=self.width,
             height=self.height,
             renderer=self.renderer,

@@ -30,6 +30,8 @@ _MAX_DIGITS = 20
 """Of a whole number: 64 bits need no more."""
 _LENGTH = re.compile(r"^(Not enough|Too many) values in .* to structure as (.*)$", re.DOTALL)
 """What cattrs says of a list that is not as long as it must be."""
+_CHOICE = re.compile(r"^(.*) not in literal typing\.Literal\[(.*)\]$", re.DOTALL)
+"""What cattrs says of a value that is none of those allowed."""
 MAX_LISTED = 8
 """Mistakes that are listed at once; a hostile file may have hundreds of thousands."""
 
@@ -220,6 +222,8 @@ def _in_words(error: BaseException, type_: type | None) -> str:
     words = str(error)
     if isinstance(error, ValueError) and (length := _LENGTH.search(words)):
         return f"{length[1].lower()} values, expected {length[2]}"
+    if choice := _CHOICE.search(words):
+        return f"{reprlib.repr(choice[1])} is none of {choice[2]}"
     return words if isinstance(error, ValueError) and " is no " in words else format_exception(error, type_)
 
 

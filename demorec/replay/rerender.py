@@ -31,7 +31,6 @@ from demorec.mcap.recording import frames_of
 from demorec.render import Renderer
 from demorec.render.painter import Painter, WarmRenderer
 from demorec.render.recorded import RecordedWorld
-from demorec.replay.free_camera import FreeCamera
 from demorec.robots.assets import allow_models
 from demorec.tasks.vary import vary_looks
 
@@ -41,9 +40,8 @@ class RerenderOptions:
     """What the new images shall be; None keeps what was recorded.
 
     Attributes:
-        cameras: Names: of the recording, of `free_cameras`, of the cameras' table, or "module:CAMERA" of one's own.
-        free_cameras: Cameras by pose and field of view.
-        width, height: Pixels, of every camera that does not say its own.
+        cameras: Names: of the recording, of the cameras' table, or "module:CAMERA" of one's own.
+        width, height: Pixels.
         renderer: Row of the renderers' table.
         antialias: Whether edges are smoothed.
         depth, segmentation: Whether these are recorded too.
@@ -53,7 +51,6 @@ class RerenderOptions:
     """
 
     cameras: tuple[str, ...] | None = None
-    free_cameras: Mapping[str, FreeCamera] = field(default_factory=dict)
     width: int | None = None
     height: int | None = None
     renderer: str | None = None
@@ -142,7 +139,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
         ConfigError: An unknown camera, or an image size that cannot be coded.
     """
     old = recorded_view(info, options.allowed)
-    names = options.cameras or tuple(dict.fromkeys((*(c.name for c in info.scene.cameras), *options.free_cameras)))
+    names = options.cameras or tuple(camera.name for camera in info.scene.cameras)
     if not names:
         raise ConfigError("The recording has no cameras: name some with --cameras.")
     if len(set(names)) != len(names):
@@ -152,16 +149,14 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     width, height = _default_size(info, options)
     believed_cameras, true_cameras = [], []
     for name in names:
-        if name in options.free_cameras:
-            believed = actual = options.free_cameras[name].camera(name, width=width, height=height)
-        elif name in recorded:
+        if name in recorded:
             w, h = options.width or recorded[name].width, options.height or recorded[name].height
             believed, actual = (replace(c, width=w, height=h) for c in (recorded[name], true[name]))
         elif name in CAMERAS.rows or split_name(name) is not None:
             preset = CAMERAS.load(name, options.allowed)
             believed = actual = preset.camera(camera_name(name), info.robot, width=width, height=height)
         else:
-            known = tuple(dict.fromkeys((*recorded, *options.free_cameras, *CAMERAS.rows)))
+            known = tuple(dict.fromkeys((*recorded, *CAMERAS.rows)))
             raise ConfigError(f"Unknown camera {name!r}.{nearest_match(name, known)} Allowed: {', '.join(known)}.")
         _check_size(believed)
         believed_cameras.append(believed)
@@ -172,8 +167,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
             root_seed=options.looks, episode_index=info.episode_index, attempt=info.attempt, purpose="looks"
         )
         scene = vary_looks(scene, resolve("full", Ranges()), rng)
-    of_recording = set(names) - options.free_cameras.keys()
-    kept = {name: error for name, error in old.true_from_recorded.items() if name in of_recording}
+    kept = {name: error for name, error in old.true_from_recorded.items() if name in names}
     return SceneView(scene=scene, true_cameras=tuple(true_cameras), true_from_recorded=kept)
 
 

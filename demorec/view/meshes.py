@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import tempfile
+import zipfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import fast_simplification
 import numpy as np
-import platformdirs
 import trimesh
 from numpy.typing import NDArray
 
+from demorec.core.cache import cache_folder, write_whole
 from demorec.core.errors import DemorecError, RecordingError, describe_error
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
@@ -32,6 +33,7 @@ _CREASE = np.radians(35.0)
 _ROD_RADIUS, _SHORTEST_ROD = 0.015, 1e-3
 """Metres."""
 _CACHE_VERSION = b"2"
+_ARRAYS = ("vertices", "normals", "triangles", "colors")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,26 +146,15 @@ def mesh_file(path: Path) -> SurfaceMesh:
         digest = hashlib.sha256(_CACHE_VERSION + path.read_bytes())
         materials = path.with_suffix(".mtl")
         digest.update(materials.read_bytes() if materials.is_file() else b"")
-        cached = platformdirs.user_cache_path("demorec") / "playback" / f"{digest.hexdigest()[:32]}.npz"
-        if cached.is_file():
-            with np.load(cached) as arrays:
-                return SurfaceMesh(**{name: arrays[name] for name in ("vertices", "normals", "triangles", "colors")})
+        cached = cache_folder("playback") / f"{digest.hexdigest()[:32]}.npz"
+        with suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile), np.load(cached) as arrays:
+            return SurfaceMesh(**{name: arrays[name] for name in _ARRAYS})
         mesh = _read_mesh_file(path)
     except (OSError, ValueError, KeyError) as error:
         raise RecordingError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
-    _keep(cached, mesh)
+    with suppress(OSError):  # a folder that cannot be written only costs time
+        write_whole(cached, lambda file: np.savez(file, **{name: getattr(mesh, name) for name in _ARRAYS}))
     return mesh
-
-
-def _keep(cached: Path, mesh: SurfaceMesh) -> None:
-    """Write the cache file as a whole or not at all; a folder that cannot be written only costs time."""
-    try:
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=cached.parent, suffix=".npz", delete=False) as file:
-            np.savez(file, vertices=mesh.vertices, normals=mesh.normals, triangles=mesh.triangles, colors=mesh.colors)
-        Path(file.name).replace(cached)
-    except OSError:
-        return
 
 
 def _read_mesh_file(path: Path) -> SurfaceMesh:

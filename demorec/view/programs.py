@@ -8,8 +8,7 @@ import socket
 import sys
 from pathlib import Path
 
-import platformdirs
-
+from demorec.core.cache import cache_folder
 from demorec.core.errors import MissingDependencyError
 
 
@@ -41,10 +40,9 @@ def _ffmpeg_folder() -> Path:
         program = Path(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError as error:
         raise MissingDependencyError("Playing H.264", "ffmpeg", "pip install imageio-ffmpeg, or ffmpeg") from error
-    folder = platformdirs.user_cache_path("demorec") / "bin" / program.name
+    folder = cache_folder("bin", program.name)
     link = folder / ("ffmpeg.exe" if sys.platform == "win32" else "ffmpeg")
     if not link.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
         fresh = folder / f"{link.name}.{os.getpid()}"
         try:
             fresh.symlink_to(program)

@@ -97,8 +97,8 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         try:
             self.client = self._connect()
             self._add(recordings[1:])
-        except BaseException:
-            self.close()
+        except BaseException as error:
+            self.__exit__(type(error), error, error.__traceback__)
             raise
 
     def __exit__(

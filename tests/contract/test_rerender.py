@@ -12,18 +12,23 @@ import pytest
 from support.check import checked, simulate
 from support.commands import exit_code
 
-from demorec.core.errors import ConfigError
 from demorec.mcap import Recording
 from demorec.render.painter import WarmRenderer
-from demorec.replay.free_camera import read_cameras
 from demorec.replay.rerender import RerenderOptions, rerender
 
 SIDE = """
-[side]
-position = [0.5, 0.9, 0.5]
-look_at = [0.5, 0.0, 0.1]
-fov_y_degrees = 50
+import math
+from demorec.render.cameras import CameraPreset
+
+SIDE = CameraPreset(summary="", eye=(0.5, 0.9, 0.5), target=(0.5, 0.0, 0.1), fov_y=math.radians(50))
 """
+
+
+def own_camera(folder: Path) -> Path:
+    """A folder for Python's path, with `rerender_cameras:SIDE` in it."""
+    (folder / "path").mkdir()
+    (folder / "path" / "rerender_cameras.py").write_text(SIDE)
+    return folder / "path"
 
 
 @pytest.fixture(scope="session")
@@ -66,10 +71,12 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_other_cameras_sizes_and_looks_pass_the_checks(filmed: Path, tmp_path: Path) -> None:
-    (tmp_path / "cameras.toml").write_text(SIDE)
+def test_other_cameras_sizes_and_looks_pass_the_checks(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(own_camera(tmp_path))
     out = tmp_path / "out"
-    args = ("--cameras", "side", "front", "--camera-file", tmp_path / "cameras.toml", "--width", 128, "--height", 96)
+    args = ("--cameras", "rerender_cameras:SIDE", "front", "--width", 128, "--height", 96)
     assert exit_code("render", filmed, "--out", out, *args, "--looks", 3, "--depth", "--segmentation") == 0
     report = checked(out / "filmed.mcap")
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
@@ -112,19 +119,14 @@ def test_impossible_requests(filmed: Path, tmp_path: Path, capsys: pytest.Captur
     assert exit_code("render", filmed, "--out", tmp_path, "--renderer", "rastr") == 2
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["[a]\nposition = [0, 0, 1]\n", "[a]\nposition = [0, 0, 1]\nlook_at = [0, 0, 0]\ncolour = 3\n", "", "a = 3\n"],
-)
-def test_bad_camera_files(text: str, tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text(text)
-    with pytest.raises(ConfigError):
-        [camera.camera(name, width=64, height=64) for name, camera in read_cameras(tmp_path / "c.toml").items()]
-
-
-def test_a_free_camera_stands_where_it_is_said(tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text(SIDE)
-    camera = read_cameras(tmp_path / "c.toml")["side"].camera("side", width=64, height=48)
+def test_a_camera_of_ones_own_stands_where_it_is_said(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(own_camera(tmp_path))
+    assert exit_code("render", filmed, "--out", tmp_path / "out", "--cameras", "rerender_cameras:SIDE") == 0
+    with Recording(tmp_path / "out" / "filmed.mcap") as recording:
+        (camera,) = recording.info.scene.cameras
+    assert camera.name == "side"
     assert camera.mount_from_camera.position.tolist() == [0.5, 0.9, 0.5]
     assert np.degrees(camera.fov_y) == pytest.approx(50)
     # The optical axis goes through the point that is looked at.

@@ -30,6 +30,7 @@ WRONG = [
     ('field = "position"', 'feild = "position"', r"unknown key 'feild' in features.observation.state"),
     ('fps = 30', 'fps = "x"', r"'x' is no whole number"),
     ('fps = 30', 'fps = 0', r"clock.fps is 0, allowed are 1 to 1000"),
+    ('[robot]', '[episodes]\ncut = "service"\n[robot]', r"'service' is none of 'file', 'marker', 'gap', 'times'"),
     ('fps = 30', 'fps = 30\nmax_age_s = 0', r"clock.max_age_s is 0, it must be above 0"),
     ('text = "stack the cups"', '', r"\[task\] needs one of text, topic and file_name"),
     ('[features.action]', '[features.act]', r"there is no feature 'action'"),

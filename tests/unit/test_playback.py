@@ -20,6 +20,7 @@ from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.view import bodies
 from demorec.view.bodies import robot_model
+from demorec.view.meshes import mesh_file
 from demorec.view.programs import viewer_environment
 from demorec.view.save import save, save_comparison
 from demorec.view.scene import differences
@@ -225,9 +226,21 @@ def test_a_comparison_measures_the_distance(tmp_path: Path, recording: Path) -> 
     assert {"/a/plots/position", "/b/plots/position", "/differences/distance"} <= entities
 
 
+def test_a_damaged_file_in_the_cache_is_made_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("DEMOREC_CACHE", str(tmp_path))
+    source = assets.data_folder() / "cube.obj"
+    first = mesh_file.__wrapped__(source)
+    (cached,) = (tmp_path / "playback").iterdir()
+    whole = cached.read_bytes()
+    for damage in (b"", whole[:100], b"PK" + whole[:50:-1]):
+        cached.write_bytes(damage)
+        assert np.array_equal(mesh_file.__wrapped__(source).vertices, first.vertices)
+        assert cached.stat().st_size == len(whole)
+
+
 def test_the_viewer_finds_ffmpeg(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("DEMOREC_CACHE", str(tmp_path / "cache"))
     folder = viewer_environment()["PATH"].split(os.pathsep)[-1]
     said = subprocess.run([f"{folder}/ffmpeg", "-version"], capture_output=True, text=True, check=True).stdout
     assert said.startswith("ffmpeg version")

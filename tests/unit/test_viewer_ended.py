@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import rerun as rr
+from support.external import make_external, write_external
 from support.viewer import need_vulkan
 
 from demorec.cli import run_command
@@ -17,14 +18,12 @@ from demorec.view.viewer import why_it_ended
 @pytest.mark.viewer
 def test_a_character_without_a_glyph_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     need_vulkan()
-    recording = rr.RecordingStream("glyphs")
-    recording.save(tmp_path / "x.rrd")
-    recording.log("text", rr.TextDocument("一"), static=True)
-    recording.disconnect()
-    arguments = [str(tmp_path / "x.rrd"), "--screenshot", str(tmp_path / "x.png")]
+    given = make_external()
+    write_external(tmp_path / "x.mcap", replace(given, info=replace(given.info, instruction="一")))
+    arguments = [str(tmp_path / "x.mcap"), "--screenshot", str(tmp_path / "x.png")]
     assert run_command(View, arguments, prog="demorec view") == 1
     assert "cannot draw '一' (U+4E00), which the file contains" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["x.rrd"]
+    assert [path.name for path in tmp_path.iterdir()] == ["x.mcap"]
 
 
 NO_DRIVER = """libEGL warning: MESA-LOADER: failed to open swrast
