@@ -2,7 +2,7 @@
 
 A file has one video track at a constant rate, the index (`moov`) in front so that it can be read over a network
 (ISO/IEC 14496-12). LeRobot's own writer copies the whole file for every episode; here the images of an episode are
-appended, images that lie in other files are copied once, by the kernel, and the index is written once, at the end.
+appended, images that lie in other files are copied once, and the index is written once, at the end.
 """
 
 from __future__ import annotations
