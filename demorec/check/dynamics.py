@@ -12,15 +12,18 @@ however noise on the commands shakes the arm.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
-from typing import NamedTuple
+from functools import lru_cache, partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, NotMeasured, worst
+from demorec.check.rows import LinkMatrices
 from demorec.core.errors import SceneError, as_reason
 from demorec.core.geometry import Array
+from demorec.episode.episode import Columns
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import POSITION_GAIN
 from demorec.robots.assets import asset_path
 from demorec.robots.inertials import link_masses
@@ -36,7 +39,7 @@ MAX_CHANGE = 2.0
 one of them (noise on the commands shakes the arm within a frame). This leaves a fifth of gravity unknown at most."""
 
 
-FREE, SERVED = 0.65, 0.005
+_FREE, _SERVED = 0.65, 0.005
 """Share of a motor's torque from which on it may not have done in the step before what the servo asked for; rad/s by
 which it did not in the frame itself."""
 _MOST_ACCELERATION = 50.0
@@ -179,6 +182,80 @@ class Dynamics:
                 gain = float((values * torque).sum() / (torque**2).sum())
                 found.append(Measurement(value=abs(gain - 1), detail=f"{name} gives {gain:.3g} of {size:.0f} N m"))
         return worst(*found) or NotMeasured(why="no joint of the arm is known")
+
+
+class Arm(Protocol):
+    """What is asked of a simulated episode; as of `CheckedEpisode`."""
+
+    @property
+    def info(self) -> EpisodeInfo:
+        """What was known before the first frame."""
+        ...
+
+    @property
+    def columns(self) -> Columns:
+        """All numbers."""
+        ...
+
+    @property
+    def urdf(self) -> Urdf:
+        """The robot's joint tree."""
+        ...
+
+    def kinematics(self, joint_position: Array) -> LinkMatrices:
+        """Forward kinematics of (T, n_joints) positions."""
+        ...
+
+    def world_from_link(self, link: str, kinematics: LinkMatrices | None = None) -> Array:
+        """(T, 4, 4), by default of the recorded joints."""
+        ...
+
+    def is_carried(self, name: str, height: float) -> NDArray[np.bool_]:
+        """(T,) whether a closed hand has a movable body so many metres above its start."""
+        ...
+
+
+def dynamics_by_frames(arm: Arm) -> Dynamics | NotMeasured:
+    """Of a robot with what its hand carries, accelerated as the frames tell."""
+    return _dynamics(arm, [arm.world_from_link], np.ones(arm.columns.num_frames, dtype=np.bool_), 1 / arm.info.fps)
+
+
+def dynamics_by_servo(arm: Arm) -> Dynamics | NotMeasured:
+    """The same by what the servo did in the physics steps before each frame, where it alone moved the arm."""
+    c, info, n = arm.columns, arm.info, len(arm.info.robot.arm_joints)
+    recorded = c.joint_position[:, :n], c.joint_velocity[:, :n], c.command_joint_target
+    start, step_s = np.array(info.scene.robot.joint_position), 1 / info.physics_hz
+    steps = Steps.of_servo(*recorded, start=start, substeps=max(info.physics_hz // info.fps, 1), step_s=step_s)
+    is_free = (np.abs(c.joint_effort[:, :n]) < _FREE * np.array(info.robot.torque_limit)).all(axis=1)
+    joints = [np.hstack([positions, c.joint_position[:, n:]]) for positions in (steps.before, steps.first)]
+    links = [partial(arm.world_from_link, kinematics=arm.kinematics(positions)) for positions in joints]
+    return _dynamics(arm, [arm.world_from_link, *links], is_free & (steps.off < _SERVED), step_s)
+
+
+def _dynamics(arm: Arm, links: Sequence[Links], is_free: NDArray[np.bool_], step_s: float) -> Dynamics | NotMeasured:
+    info, c = arm.info, arm.columns
+    gravity, robot = np.array(info.scene.physics.gravity), info.robot
+    if not gravity.any():
+        return NotMeasured(why="there is no gravity")
+    carried, free = [], c.contact_force == 0
+    for body in info.scene.movable:
+        is_carried = arm.is_carried(body.name, LIFTED_HEIGHT)
+        carried.append(Carried(body.mass * is_carried.astype(np.float64), c.object_poses[body.name][:, :3]))
+        free = free | is_carried
+    scale = info.scene.robot.scale
+    try:
+        return Dynamics(
+            links,
+            arm.urdf,
+            {name: (mass, scale * centre) for name, (mass, centre) in masses_of(robot.urdf).items()},
+            gravity=gravity,
+            step_s=step_s,
+            tip=robot.tcp_link,
+            carried=carried,
+            free=free & is_free,
+        )
+    except (SceneError, KeyError) as error:
+        return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
 
 
 def masses_of(model: str) -> dict[str, tuple[float, Array]]:

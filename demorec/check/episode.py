@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Any, cast
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import ImageKind, correlation
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, strays
-from demorec.check.dynamics import FREE, LIFTED_HEIGHT, SERVED, Carried, Dynamics, Links, Steps, masses_of
+from demorec.check.dynamics import Dynamics, dynamics_by_frames
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size, drawable_world
 from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
 from demorec.check.films import Films, films_of_recording, likeness_of_films
@@ -26,7 +26,7 @@ from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.check.summary import ImageSummary, summarise
 from demorec.check.topic_scan import TopicScan, scan_topics
-from demorec.core.errors import RecordingError, SceneError
+from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.episode.camera_error import stated_error
 from demorec.episode.episode import Columns, Event, Outcome, frame_time_ns
@@ -160,45 +160,7 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def dynamics(self) -> Dynamics | NotMeasured:
         """Of its robot, with what the hand carries."""
-        return self._dynamics([self.world_from_link], np.ones(self.num_frames, dtype=np.bool_), 1 / self.info.fps)
-
-    @cached_property
-    def exact_dynamics(self) -> Dynamics | NotMeasured:
-        """The same by what the servo did in the physics steps before each frame, where it alone moved the arm."""
-        c, n, info = self.columns, self.num_arm, self.info
-        start, step_s = np.array(info.scene.robot.joint_position), 1 / info.physics_hz
-        arm = c.joint_position[:, :n], c.joint_velocity[:, :n], c.command_joint_target
-        steps = Steps.of_servo(*arm, start=start, substeps=max(info.physics_hz // info.fps, 1), step_s=step_s)
-        is_free = (np.abs(c.joint_effort[:, :n]) < FREE * np.array(info.robot.torque_limit)).all(axis=1)
-        is_free &= steps.off < SERVED
-        fingers = c.joint_position[:, n:]
-        links = [self.kinematics(np.hstack([joints, fingers])) for joints in (steps.before, steps.first)]
-        before = [partial(self.world_from_link, kinematics=each) for each in links]
-        return self._dynamics([self.world_from_link, *before], is_free, step_s)
-
-    def _dynamics(self, links: Sequence[Links], is_free: NDArray[np.bool_], step_s: float) -> Dynamics | NotMeasured:
-        gravity, robot = np.array(self.info.scene.physics.gravity), self.info.robot
-        if not gravity.any():
-            return NotMeasured(why="there is no gravity")
-        carried, free = [], self.columns.contact_force == 0
-        for body in self.info.scene.movable:
-            is_carried = self.is_carried(body.name, LIFTED_HEIGHT)
-            carried.append(Carried(body.mass * is_carried, self.columns.object_poses[body.name][:, :3]))
-            free = free | is_carried
-        scale = self.info.scene.robot.scale
-        try:
-            return Dynamics(
-                links,
-                self.urdf,
-                {name: (mass, scale * centre) for name, (mass, centre) in masses_of(robot.urdf).items()},
-                gravity=gravity,
-                step_s=step_s,
-                tip=robot.tcp_link,
-                carried=carried,
-                free=free & is_free,
-            )
-        except (SceneError, KeyError) as error:
-            return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
+        return dynamics_by_frames(self)
 
     @property
     def num_arm(self) -> int:

@@ -236,7 +236,7 @@ def elements_alive(subject: Moving) -> Found:
     needs=STATE_ALONE,
 )
 def stuck_sensors(subject: Moving) -> Iterator[Found]:
-    """What is measured changes in each of its elements, if ever so little, while the arm moves.
+    """What is measured changes, if ever so little, while the arm moves, and each of its elements in some frame.
 
     Of other robots than simulated ones a sensor is reported that never changes in an episode.
     """
@@ -245,13 +245,12 @@ def stuck_sensors(subject: Moving) -> Iterator[Found]:
         if motion.contact is not None:
             moves = np.abs(np.diff(motion.state[:, :-1], axis=0)).max(axis=1, initial=0.0) > 1e-5
         for name, table in motion.sensors.items():
-            same = (table[1:] == table[:-1]) & moves[:, None]
+            same, stands = (table[1:] == table[:-1]).all(axis=1) & moves, np.ptp(table, axis=0) == 0
+            length, start = longest_run(same)
             if motion.contact is None:  # sensors slower than the frames hold a value, and contacts come and go
-                length, start = int(same.all(axis=1).sum() * (np.ptp(table, axis=0) == 0).all()), 0
-            else:
-                at_limit = np.abs(table[1:]) == np.abs(table).max(axis=0)  # as a motor that gives all it can
-                same &= ~at_limit | (np.ptp(table, axis=0) == 0)
-                length, start = max(longest_run(element) for element in same.T)
+                length, start = int(same.sum() * stands.all()), 0
+            elif stands.any():
+                length, start = int(moves.sum()), 0
             label = f"{name}, {motion.where}" if motion.where else name
             yield Measurement(value=length, frame=start + 1 if length else None, detail=label)
 

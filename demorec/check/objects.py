@@ -303,9 +303,10 @@ def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
     unit="m",
 )
 def slips(episode: CheckedEpisode) -> Iterator[Found]:
-    """What fingers press on in the air stays where it is in the hand, from one frame of it to any other."""
+    """What fingers press on in the air stays where it is in the hand, from one frame of it to any other (boxes,
+    spheres, cylinders, capsules: a duck finds its place between the fingers)."""
     c, hand = episode.columns, inverse(episode.world_from_tcp)
-    for body in episode.info.scene.movable:
+    for body in (body for body in episode.info.scene.movable if body.shape.kind in SOLID):
         pose = episode.world_from_object(body.name)
         held = episode.is_carried(body.name, _CARRIED) & (c.contact_force > 0) & ~_is_borne(episode, body, pose)
         length, start = longest_run(held)

@@ -19,7 +19,7 @@ from demorec.check.base import (
     worst,
     worst_frame,
 )
-from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics
+from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics, dynamics_by_servo
 from demorec.check.episode import CheckedEpisode
 from demorec.check.gripper import CARRIED_HEIGHT
 from demorec.core.geometry import Array
@@ -190,7 +190,7 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
 def effort_in_each_frame(episode: CheckedEpisode) -> Found:
     """The motors give in each frame what the arm's weight and its acceleration in that frame need, also where noise
     shakes it: catches torques that are late, filtered or made up. The links' own inertia is left out."""
-    dynamics, found = episode.exact_dynamics, list[Found]()
+    dynamics, found = episode.shared(dynamics_by_servo), list[Found]()
     if isinstance(dynamics, NotMeasured):
         return dynamics
     rows = dynamics.is_judged
@@ -228,7 +228,7 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     for name, table in (("wrench", episode.columns.sensed.get("wrench")), ("efforts", episode.columns.joint_effort)):
         if table is not None and (lost := (table == 0).all(axis=1)).mean() < _LOST_SHARE:  # weight is always there
             yield worst_frame(lost.astype(np.float64), f"{name} of zero")
-    hand, dynamics = episode.shared(_hand), episode.exact_dynamics
+    hand, dynamics = episode.shared(_hand), episode.shared(dynamics_by_servo)
     if not isinstance(hand, _Hand) or isinstance(dynamics, NotMeasured):
         yield None if isinstance(hand, _Hand) else hand
         return

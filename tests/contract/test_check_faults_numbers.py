@@ -198,19 +198,45 @@ def other_color(c: Changed) -> Changed:
     return c.with_info(instruction=c.info.instruction.replace("red", "purple").replace("green", "purple"))
 
 
-def once_while_carried(name: str, factor: float) -> Fault:
-    """One frame in the midst of carrying."""
+def once_while_carried(name: str, factor: float, share: float = 0.5) -> Fault:
+    """One frame of carrying, in the midst or later, where no motor is at its limit."""
 
     def fault(c: Changed) -> Changed:
         carried = np.flatnonzero(np.array(c.columns.phase) == "transport")
         rows = np.array(c.columns.sensed[name] if name in c.columns.sensed else getattr(c.columns, name))
-        rows[carried[len(carried) // 2]] *= factor
+        rows[carried[int(share * len(carried))]] *= factor
         return c.with_columns(**({"sensed": {name: rows}} if name in c.columns.sensed else {name: rows}))
 
     return fault
 
 
+def held_on(c: Changed) -> Changed:
+    """Where the force on the fingers ends it stays for three frames more."""
+    force = c.columns.contact_force.copy()
+    last = np.flatnonzero((force[:-1] > 1) & (force[1:] == 0))[-1]
+    force[last + 1 : last + 4] = force[last]
+    return c.with_columns(contact_force=force)
+
+
+def woken_early(c: Changed) -> Changed:
+    """The cube jumps by 5 mm between the open fingers, before they close."""
+    first = int(np.flatnonzero(c.columns.contact_force > 0)[0])
+    return cube(plus(np.s_[first - 4 : first - 2, 2], 0.005))(c)
+
+
+def one_joint(index: int, change: Callable[[Rows], Rows]) -> Callable[[Rows], Rows]:
+    """Other values of one column."""
+    return lambda rows: np.column_stack([rows[:, :index], change(rows[:, index]), rows[:, index + 1 :]])
+
+
 CASES: list[tuple[str, Fault, str]] = [
+    ("efforts filtered", column("joint_effort", lambda r: filtered(filtered(r))), "effort_in_each_frame"),
+    ("efforts late", column("joint_effort", lambda r: late(late(late(r)))), "effort_in_each_frame"),
+    ("a sample of the wrench inverted", once_while_carried("wrench", -1.0, 0.95), "force_spikes"),
+    ("a sample of the efforts a tenth", once_while_carried("joint_effort", 0.1, 0.95), "force_spikes"),
+    ("an effort of zero", column("joint_effort", one_joint(6, np.zeros_like)), "stuck_sensors"),
+    ("contact force beyond the release", held_on, "touches_nothing"),
+    ("a cube that moves before it is touched", woken_early, "object_motion"),
     ("contact force two frames late", column("contact_force", lambda r: late(late(r))), "contact_lag"),
     ("contact force doubled once", once_while_carried("contact_force", 2.0), "force_spikes"),
     ("a sample of the contact force lost", once_while_carried("contact_force", 0.0), "force_spikes"),

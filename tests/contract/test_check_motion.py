@@ -69,6 +69,11 @@ def repeats(rows: Rows) -> Rows:
     return out
 
 
+def slips(rows: Rows) -> Rows:
+    """One encoder loses 0.08 rad in the middle."""
+    return np.asarray(rows - 0.08 * (np.arange(rows.shape[1]) == 2) * (np.arange(len(rows)) > len(rows) // 2)[:, None])
+
+
 def late_when_opening(rows: Rows) -> Rows:
     """The gripper alone, by eight frames."""
     out = rows.copy()
@@ -88,6 +93,7 @@ FAULTS: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
     "late actions": (ACTION, late, "state_follows_action"),
     "degrees": (STATE, np.degrees, "joint_limits"),
     "a dead encoder": (STATE, lambda rows: rows * (np.arange(rows.shape[1]) != 2), "elements_alive"),
+    "an encoder that slips": (STATE, slips, "steps_as_velocities"),
     "velocities of another joint": (VELOCITY, exchanged, "velocity_matches_position"),
     "states by interpolation": (STATE, interpolated, "interpolated_frames"),
     "a gripper that opens before it is told": (ACTION, late_when_opening, "gripper_waits_for_action"),
