@@ -78,7 +78,8 @@ class VideoFiles:
 
     def open(self, path: Path, fps: int) -> _VideoFile:
         """One of them; ExportError when it cannot be read."""
-        file = self._files[path] = self._files.pop(path, None) or _VideoFile(path, fps)
+        file = self._files.pop(path) if path in self._files else _VideoFile(path, fps)
+        self._files[path] = file
         if len(self._files) > _MOST_FILES:
             del self._files[next(iter(self._files))]
         return file

@@ -222,15 +222,15 @@ def _first_image_file(video: EncodedVideo, fps: int) -> bytes:
     # The bit rate would be that of the first image, and without `bitexact` the file would name the version of libav.
     options = {"write_btrt": "0", "fflags": "bitexact"}
     with (
-        av.open(described, format="mp4") as source,
+        av.open(described, "r", format="mp4") as image,
         av.open(buffer, "w", format="mp4", container_options=options) as target,
     ):
-        stream = target.add_stream_from_template(source.streams.video[0], opaque=True)
+        stream = target.add_stream_from_template(image.streams.video[0], opaque=True)
         stream.codec_context.thread_count = 1  # nothing is decoded: no threads for it
         stream.time_base = Fraction(1, fps)
         target.start_encoding()
         ticks = int(1 / (fps * stream.time_base))  # a frame, in the unit that libav has chosen now
-        packet = next(source.demux())
+        packet = next(image.demux())
         packet.stream, packet.time_base = stream, stream.time_base
         packet.pts, packet.dts, packet.duration = 0, -video.delay * ticks, ticks
         target.mux_one(packet)
