@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.check import simulate_run
 from support.export import data_table, episode_rows, export, files_of
-from support.language import active, language_of, meant, phrases
+from support.language import active, language_of, meant, phrases, scene_at
 
 from demorec.annotate import STATES
 from demorec.annotate.situation import nouns_of, place_of
@@ -136,7 +136,8 @@ def test_subtasks_name_the_thing_that_rises_and_the_place_where_it_ends(runs: li
             first, last = (round(part["timestamp"] * fps) for part in (row, after))
             if row["content"].startswith("lift the "):
                 risen = {name: poses[last, 2] - poses[first, 2] for name, poses in columns.object_poses.items()}
-                assert max(risen, key=lambda name: risen[name]) in meant(phrases(row["content"])[0], scene)
+                now = scene_at(scene, {name: poses[first] for name, poses in columns.object_poses.items()})
+                assert max(risen, key=lambda name: risen[name]) in meant(phrases(row["content"])[0], now)
                 lifts += 1
             if row["content"].startswith("lower the ") and "gripper" not in row["content"]:
                 _, place = (meant(phrase, scene) for phrase in phrases(row["content"]))

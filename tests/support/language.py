@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Scene
 from support.export import data_table
 
@@ -82,6 +84,13 @@ _PHRASE = re.compile(
 def phrases(text: str) -> list[tuple[str, ...]]:
     """(whole, article, order, colour, noun, nearness) of each phrase in a text."""
     return [(match[0], *((part or "").strip() for part in match.groups())) for match in _PHRASE.finditer(text)]
+
+
+def scene_at(scene: Scene, world_from_object: Mapping[str, Any]) -> Scene:
+    """The scene with bodies at other poses (7,): a phrase is true of the moment at which it is said."""
+    poses = {name: Pose(position=pose[:3], quat_xyzw=pose[3:]) for name, pose in world_from_object.items()}
+    bodies = (replace(body, world_from_body=poses.get(body.name, body.world_from_body)) for body in scene.bodies)
+    return replace(scene, bodies=tuple(bodies))
 
 
 def meant(phrase: tuple[str, ...], scene: Scene) -> list[str]:
