@@ -38,6 +38,9 @@ _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
 """rad, m: by how much a state that stays changes at most, and an action that goes on at least; how often."""
+_RESOLVED_FPS = 20
+"""Frames a second from which on a joint's steps follow from its velocities: noise on commands starts and stops an arm
+within longer ones."""
 _ANY_OTHER = 2.0
 """Times the second largest difference of a step from its velocities, beyond which the largest is a jump."""
 _NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
@@ -79,10 +82,12 @@ def state_follows_action(subject: Moving) -> Found:
         # The variance: a zero that is off, and weight, keep state and action apart whatever the lag.
         squares += [len(state) * (state[core] - np.roll(action, lag, axis=0)[core]).var(axis=0) for lag in lags]
     off = np.sqrt(squares)
-    moved = np.flatnonzero(off.min(axis=0) < 0.8 * np.minimum(off[0], off[-1]))
+    first = subject.motions.all[0]
+    elements = np.flatnonzero(subject.motions.moving)
+    # A gripper is slower than the arm, and stops at what it holds.
+    moved = np.flatnonzero((off.min(axis=0) < 0.8 * np.minimum(off[0], off[-1])) & (elements != first.gripper))
     if not len(moved):
-        return NotMeasured(why="state and action move too little to tell which of them is first")
-    # The middle one: a gripper is slower than the arm, and stops at what it holds.
+        return NotMeasured(why="state and action of the arm move too little to tell which of them is first")
     lag = float(np.median([finest_lag(lags, off[:, element].tolist()) for element in moved]))
     late = lag - _LATEST_S * subject.motions.all[0].fps
     return Measurement(value=max(1 - lag, late, 0.0), detail=f"the state follows by {lag:+.2f} frames")
@@ -164,6 +169,9 @@ def steps_as_velocities(subject: Moving) -> Iterator[Found]:
             return
         if len(motion.state) < FEWEST:
             continue
+        if motion.fps < _RESOLVED_FPS:
+            yield NotMeasured(why=f"at {motion.fps:g} frames a second an arm starts and stops within a step")
+            return
         told = (motion.velocity[1:] + motion.velocity[:-1]) / 2 * motion.steps_s[:, None]
         # Within a step a joint may start and stop: only what is more than its fastest could do is a jump.
         fastest = np.abs(motion.velocity).max(axis=0) * motion.steps_s[:, None]
