@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from demorec.check.rows import longest_run
 from demorec.check.scoring import neighbours
+from demorec.check.scoring.held import lacking
 from demorec.check.scoring.measured import Measured, measure, scale_of
 from demorec.check.scoring.movement import Reading
 from demorec.check.scoring.sight import Sight
@@ -72,6 +73,7 @@ _LAWS: Mapping[str, Law] = {
     "switches": Law("both", 0.12, "the gripper is switched {value:.0f} times, usual are {usual:.0f}"),  # 0.0, 0.0
     "slip": Law("more", 0.02, "the gripper closes by {value:.0%} of its range without being told to"),  # 0.1, 0.1
     "grip": Law("less", 0.05, "the gripper closes on nothing"),  # 1.8, 2.2
+    "held": Law("more", 0.04, "the hand does not hold what others hold, as {camera} shows it"),
     "frozen": Law("more", 0.12, "{camera} shows the same for {value:.1f} s while the arm moves"),  # 0.0, 4.2
     "brightness": Law("both", 6.0, "{camera} has a brightness of {value:.0f}, usual are {usual:.0f}"),  # 1.4, 3.6
     "sharpness": Law("less", 0.1, "{camera} is {ratio:.2f} times as sharp as usual"),  # 0.8, 1.9
@@ -235,6 +237,20 @@ def _images(group: Sequence[Measured]) -> Iterator[tuple[str, Readings, str]]:
         yield "sharpness", whole(lambda each: math.log(each.sharpness + 0.1)), camera
         yield "blank", whole(lambda each: each.blank), camera
         yield "frozen", _frozen(group, sights), camera
+        if len({episode.task for episode in group}) == 1:
+            yield "held", _held(group, sights), camera
+
+
+def _held(group: Sequence[Measured], sights: Sequence[Sight | None]) -> Readings:
+    """How much of the colours in others' hands a hand lacks."""
+    found: list[Reading | None] = [None] * len(group)
+    grips = [() if each.movement is None else each.movement.grips for each in group]
+    seen = [number for number, each in enumerate(sights) if each is not None and grips[number]]
+    if len(seen) >= neighbours.FEWEST:
+        colors = np.stack([sight.held for number in seen if (sight := sights[number]) is not None])
+        for number, value in zip(seen, lacking(colors).tolist(), strict=True):
+            found[number] = Reading(value=value, first=grips[number][0][0], last=grips[number][-1][1])
+    return found
 
 
 def _frozen(group: Sequence[Measured], sights: Sequence[Sight | None]) -> Readings:
