@@ -4,7 +4,7 @@ and on as many sound ones.
     python benchmarks/curated.py --out outputs/curated
     python benchmarks/curated.py --out outputs/curated --plot curated.png
 
-Demonstrations of `pick_place` with another thing on the table, of which 30 in 100 are spoilt in the eight ways of
+Demonstrations with another thing on the table, of which 30 in 100 are spoilt in the eight ways of
 benchmarks/curation.py: some larger, as people's may be (pauses of 2 to 6 s, actions 0.2 to 0.6 s late, labels off by
 0.01 to 0.04 rad in every frame), and the wrong object is really taken. They are recorded and exported with the
 product's own means. `demorec dataset score` sees joint targets and two small cameras,
@@ -246,7 +246,7 @@ def main() -> None:
     parser.add_argument("--task", default="pick_place")
     parser.add_argument("--seed", type=int, default=SEED, help="of the demonstrations and of what is spoilt")
     parser.add_argument("--episodes", type=int, default=320)
-    parser.add_argument("--only", nargs="*", default=CHOICES, choices=CHOICES, help="what is learned from (none: scores alone)")
+    parser.add_argument("--only", nargs="*", default=CHOICES, choices=CHOICES, help="what is learned from; may be none")
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--learning-rate", type=float, default=5e-4)

@@ -23,7 +23,7 @@ _LIGHT, _HUE = 6, 14
 """Bins of lightness, and of each of two axes of colour, relative to the lightness."""
 _DARK = 30.0
 """Levels added to a colour's brightest channel, so that black has none."""
-_AGREED = 0.8
+_AGREED = 0.85
 """Share of the episodes that must show a colour for the others to lack it."""
 _HARDLY = 0.3
 """Share of what is usual of a colour, below which it is lacking: things differ in size."""
@@ -73,7 +73,7 @@ def _bins(pixels: Array) -> NDArray[np.int64]:
 def lacking(colors: Array) -> Array:
     """(N,) share of what most of N hands hold that each hand lacks, nan where hardly anything is seen in it.
 
-    Where fewer than four in five agree in a colour nothing lacks it.
+    Where fewer than 85 in 100 agree in a colour nothing lacks it.
 
     Args:
         colors: (N, 1176) by `held_colors`.
