@@ -33,7 +33,7 @@ _LEAST = 0.01
 
 def held_colors(
     images: NDArray[np.uint8], frames: NDArray[np.int64], grips: Sequence[tuple[int, int]], fps: float
-) -> Array:
+) -> NDArray[np.float32]:
     """(1176,) share of the image that has each colour, of what stands still in it while something is held.
 
     Args:
@@ -42,7 +42,7 @@ def held_colors(
         grips: (first, last) frames; of several the largest share of each colour counts.
         fps: Frames per second.
     """
-    found = np.zeros(_LIGHT * _HUE * _HUE, np.float32)
+    found: NDArray[np.float32] = np.zeros(_LIGHT * _HUE * _HUE, np.float32)
     near = np.zeros(len(frames), np.bool_)
     for first, last in grips:
         near |= (frames > first - _AWAY_S * fps) & (frames < last + _AWAY_S * fps)
@@ -70,7 +70,7 @@ def _bins(pixels: Array) -> NDArray[np.int64]:
     return np.asarray((light.astype(np.int64) * _HUE + across.astype(np.int64)) * _HUE + along.astype(np.int64))
 
 
-def lacking(colors: Array) -> Array:
+def lacking(colors: NDArray[np.float32]) -> Array:
     """(N,) share of what most of N hands hold that each hand lacks, nan where hardly anything is seen in it.
 
     Where fewer than 85 in 100 agree in a colour nothing lacks it.
@@ -90,7 +90,7 @@ def lacking(colors: Array) -> Array:
     return np.where(seen, lack.sum(axis=(1, 2, 3)) / usual.sum(), np.nan)
 
 
-def _around(shares: Array, join: np.ufunc) -> Array:
+def _around(shares: NDArray[np.float32], join: np.ufunc) -> NDArray[np.float32]:
     """(N, ...) joined with the bins beside, along all axes but the first."""
     for axis in range(1, shares.ndim):
         width = [(0, 0)] * shares.ndim

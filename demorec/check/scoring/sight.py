@@ -45,7 +45,7 @@ class Sight:
     sharpness: float
     blank: float
     look: Array
-    held: Array
+    held: NDArray[np.float32]
 
 
 def sampled_frames(length: int, fps: float) -> list[int]:
