@@ -7,9 +7,9 @@ and on as many sound ones.
 Demonstrations with another thing on the table, of which 30 in 100 are spoilt in the eight ways of
 benchmarks/curation.py: some larger, as people's may be (pauses of 2 to 6 s, actions 0.2 to 0.6 s late, labels off by
 0.01 to 0.04 rad in every frame), and the wrong object is really taken. They are recorded and exported with the
-product's own means. `demorec dataset score` sees joint targets and two small cameras,
-ACT the joints, `observation.environment_state` (with what was asked for) and `ee_delta`. It learns as in
-benchmarks/learning.py and acts in scenes of `--split eval`. Nothing says to the score what was spoilt. What is there
+product's own means. `demorec dataset score` sees joint targets and two small cameras, ACT the joints,
+`observation.environment_state` (with what was asked for) and `ee_delta`. It learns as in benchmarks/learning.py and
+acts in scenes of `--split eval`. Nothing says to the score what was spoilt. What is there
 already in --out is used again.
 """
 
