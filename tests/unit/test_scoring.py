@@ -223,6 +223,13 @@ def test_what_holds_something_else_is_found(held: Any, other: tuple[int, int, in
     assert (found[BAD]["first"], found[BAD]["last"]) == (CLOSES, OPENS - 1)
 
 
+def test_instructions_by_which_most_hold_the_same_are_compared(held: Any) -> None:
+    """A fifth of one that few have is wrong, which by itself would be as good as any other fifth."""
+    texts = ["grab the block" if number < BAD else "take the block" for number in range(EPISODES_IN_ALL)]
+    found = held([from_the_hand(n, BLACK if n == 1 else RED, text) for n, text in enumerate(texts)])
+    assert list(found) == [1]
+
+
 def test_things_that_differ_honestly_are_not_judged(held: Any) -> None:
     colors = [RED, BLUE, BLACK, (30, 180, 30), (220, 200, 30), (220, 220, 220)]
     assert not held([from_the_hand(number, colors[number % 6]) for number in range(EPISODES_IN_ALL)])

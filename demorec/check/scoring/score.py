@@ -145,7 +145,7 @@ def scores(episodes: Sequence[Measured]) -> list[EpisodeScore]:
         for name, readings, detail in (*_motions(group), *_images(group)):
             for number, reason in _judged(name, readings, detail):
                 reasons[numbers[number]].append(reason)
-    for number, reason in (*_otherwise(episodes), *_twins(episodes)):
+    for number, reason in (*_otherwise(episodes), *_other_things(episodes), *_twins(episodes)):
         reasons[number].append(reason)
     return [
         EpisodeScore(
@@ -237,20 +237,6 @@ def _images(group: Sequence[Measured]) -> Iterator[tuple[str, Readings, str]]:
         yield "sharpness", whole(lambda each: math.log(each.sharpness + 0.1)), camera
         yield "blank", whole(lambda each: each.blank), camera
         yield "frozen", _frozen(group, sights), camera
-        if len({episode.task for episode in group}) == 1:
-            yield "held", _held(group, sights), camera
-
-
-def _held(group: Sequence[Measured], sights: Sequence[Sight | None]) -> Readings:
-    """How much of the colours in others' hands a hand lacks."""
-    found: list[Reading | None] = [None] * len(group)
-    grips = [() if each.movement is None else each.movement.grips for each in group]
-    seen = [number for number, each in enumerate(sights) if each is not None and grips[number]]
-    if len(seen) >= neighbours.FEWEST:
-        colors = np.stack([sight.held for number in seen if (sight := sights[number]) is not None])
-        for number, value in zip(seen, lacking(colors).tolist(), strict=True):
-            found[number] = Reading(value=value, first=grips[number][0][0], last=grips[number][-1][1])
-    return found
 
 
 def _frozen(group: Sequence[Measured], sights: Sequence[Sight | None]) -> Readings:
@@ -306,6 +292,22 @@ def _otherwise(episodes: Sequence[Measured]) -> Iterator[tuple[int, Reason]]:
                 last=episode.length - 1,
             ),
         )
+
+
+def _other_things(episodes: Sequence[Measured]) -> Iterator[tuple[int, Reason]]:
+    """Episodes whose hand lacks the colours of what others hold."""
+    grips = {episode.number: episode.movement.grips for episode in episodes if episode.movement is not None}
+    for camera in dict.fromkeys(camera for episode in episodes for camera in episode.sights):
+        seen = [episode for episode in episodes if camera in episode.sights and grips.get(episode.number)]
+        if len(seen) < neighbours.FEWEST:
+            continue
+        values = lacking(np.stack([each.sights[camera].held for each in seen]), [each.task for each in seen])
+        readings: list[Reading | None] = [None] * len(episodes)
+        for each, value in zip(seen, values.tolist(), strict=True):
+            if not math.isnan(value):
+                own = grips[each.number]
+                readings[each.number] = Reading(value=value, first=own[0][0], last=own[-1][1])
+        yield from _judged("held", readings, camera)
 
 
 def _twins(episodes: Sequence[Measured]) -> Iterator[tuple[int, Reason]]:
