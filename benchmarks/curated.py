@@ -4,12 +4,12 @@ and on as many sound ones.
     python benchmarks/curated.py --out outputs/curated
     python benchmarks/curated.py --out outputs/curated --plot curated.png
 
-Demonstrations of `pick_place` with another thing on the table, of which 30 in 100 are spoilt in the eight ways of
+Demonstrations with another thing on the table, of which 30 in 100 are spoilt in the eight ways of
 benchmarks/curation.py: some larger, as people's may be (pauses of 2 to 6 s, actions 0.2 to 0.6 s late, labels off by
 0.01 to 0.04 rad in every frame), and the wrong object is really taken. They are recorded and exported with the
-product's own means. `demorec dataset score` sees joint targets and two small cameras,
-ACT the joints, `observation.environment_state` (with what was asked for) and `ee_delta`. It learns as in
-benchmarks/learning.py and acts in scenes of `--split eval`. Nothing says to the score what was spoilt. What is there
+product's own means. `demorec dataset score` sees joint targets and two small cameras, ACT the joints,
+`observation.environment_state` (with what was asked for) and `ee_delta`. It learns as in benchmarks/learning.py and
+acts in scenes of `--split eval`. Nothing says to the score what was spoilt. What is there
 already in --out is used again.
 """
 
@@ -47,7 +47,7 @@ from demorec.mcap import EpisodeWriter, Recording
 from demorec.robots.kinematics import ArmKinematics
 
 SEED, ATTEMPTS = 31, 40
-TASK, THINGS = "pick_place", Ranges(distractors=(1, 1))
+THINGS = Ranges(distractors=(1, 1))
 PAUSE, LATE, NOISE = (2.0, 6.0), (0.2, 0.6), (0.01, 0.04)
 """Of hesitations and late actions, seconds; standard deviations of the noise in labels, rad."""
 SOUND = 0.8
@@ -56,15 +56,15 @@ CHOICES = ("all", "selected", "sound")
 _caches: list[SimulatorCache] = []
 
 
-def record(job: tuple[int, str, Path]) -> None:
+def record(job: tuple[str, int, int, str, Path]) -> None:
     """One demonstration, with what shall be wrong with it ("" for nothing), into a file; none where one is there."""
-    index, kind, path = job
+    task, seed, index, kind, path = job
     if path.exists():
         return
     if not _caches:
         _caches.append(SimulatorCache())
     config = GenerateConfig(
-        task=TASK, seed=SEED, split="train", fps=FPS, width=WIDTH, height=HEIGHT, cameras=CAMERAS, ranges=THINGS
+        task=task, seed=seed, split="train", fps=FPS, width=WIDTH, height=HEIGHT, cameras=CAMERAS, ranges=THINGS
     )
     for attempt in range(ATTEMPTS):
         try:
@@ -77,7 +77,7 @@ def record(job: tuple[int, str, Path]) -> None:
         world, renderer = _caches[0].acquire(told)
         session = Session.of_episode(world, episode, renderer)
         agent: Any = ScriptAgent(episode)
-        rng = np.random.default_rng([SEED, index])
+        rng = np.random.default_rng([seed, index])
         if kind in SIMULATED:
             agent = Clumsy(agent, kind, rng, PAUSE)
         frames = list(session.run(agent))
@@ -137,19 +137,20 @@ def off(action: Action, offset: NDArray[np.float64], arm: ArmKinematics) -> Acti
     return replace(action, joint_target=target, base_from_tcp_target=arm.forward(target))
 
 
-def kinds_of(episodes: int) -> list[str]:
+def kinds_of(episodes: int, seed: int) -> list[str]:
     """What is wrong with each episode, "" for nothing: as many of each kind, in random order."""
     count = round(SPOILT * episodes)
     kinds = [KINDS[number % len(KINDS)] for number in range(count)] + [""] * (episodes - count)
-    return [str(kind) for kind in np.random.default_rng(SEED).permutation(kinds)]
+    return [str(kind) for kind in np.random.default_rng(seed).permutation(kinds)]
 
 
-def scores_of(out: Path, kinds: Sequence[str], workers: int) -> list[float]:
+def scores_of(args: argparse.Namespace, kinds: Sequence[str]) -> list[float]:
     """Record what is not there yet, export it, and score each episode."""
+    out = args.out
     run, seen, scores = out / "run", out / "seen", out / "scores.json"
     run.mkdir(parents=True, exist_ok=True)
-    jobs = [(index, kind, run / f"{index:04d}.mcap") for index, kind in enumerate(kinds)]
-    for _ in in_turn(record, jobs, workers):
+    jobs = [(args.task, args.seed, index, kind, run / f"{index:04d}.mcap") for index, kind in enumerate(kinds)]
+    for _ in in_turn(record, jobs, args.workers):
         pass
     if not seen.exists():
         command("demorec", "export", "lerobot", run, "--out", seen, "--action", "joint")
@@ -179,18 +180,18 @@ def data_of(episodes: Sequence[dict[str, torch.Tensor]]) -> Data:
     return Data(columns=columns, end=end, stats={name: statistics(values) for name, values in columns.items()})
 
 
-def chosen(kinds: Sequence[str], scores: Sequence[float]) -> dict[str, list[int]]:
+def chosen(kinds: Sequence[str], scores: Sequence[float], seed: int) -> dict[str, list[int]]:
     """Name -> episodes that are learned from."""
     selected = [number for number, score in enumerate(scores) if score > SOUND]
     sound = [number for number, kind in enumerate(kinds) if not kind]
-    few = np.random.default_rng(SEED).permutation(sound)[: len(selected)]
+    few = np.random.default_rng(seed).permutation(sound)[: len(selected)]
     return dict(zip(CHOICES, (list(range(len(kinds))), selected, sorted(few.tolist())), strict=True))
 
 
 def learned(name: str, numbers: Sequence[int], args: argparse.Namespace) -> Rate:
     """Success of ACT on some episodes, over all trainings; what was trained or tried before is not done again."""
     variant = Variant(about="", action="ee_delta", execute=8)
-    config = GenerateConfig(task=TASK, split="eval", cameras=(), fps=FPS, ranges=THINGS)
+    config = GenerateConfig(task=args.task, split="eval", cameras=(), fps=FPS, ranges=THINGS)
     results = []
     for seed in range(args.seeds):
         policy = args.out / "policies" / f"{name}_{args.steps}_{seed}"
@@ -242,8 +243,10 @@ def plot(rates: Mapping[str, Rate], kinds: Sequence[str], scores: Sequence[float
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for episodes, datasets and policies")
+    parser.add_argument("--task", default="pick_place")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the demonstrations and of what is spoilt")
     parser.add_argument("--episodes", type=int, default=320)
-    parser.add_argument("--only", nargs="+", default=CHOICES, choices=CHOICES, help="what is learned from")
+    parser.add_argument("--only", nargs="*", default=CHOICES, choices=CHOICES, help="what is learned from; may be none")
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
@@ -254,14 +257,14 @@ def main() -> None:
     args = parser.parse_args()
     args.device = "cpu"
     torch.set_num_threads(1)
-    kinds = kinds_of(args.episodes)
-    scores = scores_of(args.out, kinds, args.workers)
+    kinds = kinds_of(args.episodes, args.seed)
+    scores = scores_of(args, kinds)
     good = [score for score, kind in zip(scores, kinds, strict=True) if not kind]
     bad = [score for score, kind in zip(scores, kinds, strict=True) if kind]
     kept = Counter(kind for kind, score in zip(kinds, scores, strict=True) if score > SOUND)
     told = [f"{kept[kind]} of {kinds.count(kind)} {kind or 'sound'}" for kind in ("", *KINDS)]
     print(f"AUC {auc(good, bad):.3f}; selected: {', '.join(told)}", flush=True)
-    found = chosen(kinds, scores)
+    found = chosen(kinds, scores, args.seed)
     rates = {name: learned(name, found[name], args) for name in args.only}
     if args.plot is not None:
         plot(rates, kinds, scores, args.plot)

@@ -183,6 +183,63 @@ def test_sound_episodes_are_sound(scored: Any) -> None:
     assert all(episode["score"] > 0.8 and not episode["reasons"] for episode in found)
 
 
+def from_the_hand(number: int, color: tuple[int, int, int], task: str = "take the block") -> Rows:
+    """A demonstration as a camera on the hand sees it: the ground goes by, and what is held stands still."""
+    rng = np.random.default_rng(100 + number)
+    rows = demonstration(number)
+    ground = rng.integers(90, 160, (SIZE[1], 4 * LENGTH + SIZE[0], 1)).repeat(3, axis=2)
+    rows["images"] = np.stack([ground[:, 4 * t : 4 * t + SIZE[0]] for t in range(LENGTH)]).astype(np.uint8)
+    half = int(rng.integers(3, 6))
+    rows["images"][CLOSES:OPENS, 12 - half : 12 + half, 16 - half : 16 + half] = np.array(color) * rng.uniform(0.7, 1.1)
+    return {**rows, "task": np.array(task)}
+
+
+@pytest.fixture
+def held(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[list[Rows]], dict[int, Any]]:
+    """What is held in which episodes that is not what others hold: number -> the reason."""
+
+    def run(episodes: list[Rows]) -> dict[int, Any]:
+        root = write(tmp_path / "d", episodes)
+        assert exit_code("dataset", "score", str(root), "--workers", "1", "--json") == 0
+        found = json.loads(capsys.readouterr().out)["episodes"]
+        return {
+            episode["episode_index"]: reason
+            for episode in found
+            for reason in episode["reasons"]
+            if reason["kind"] == "held"
+        }
+
+    return run
+
+
+RED, BLUE, BLACK = (200, 30, 30), (30, 30, 200), (20, 20, 20)
+
+
+@pytest.mark.parametrize("other", [BLUE, BLACK])
+def test_what_holds_something_else_is_found(held: Any, other: tuple[int, int, int]) -> None:
+    found = held([from_the_hand(number, other if number == BAD else RED) for number in range(EPISODES_IN_ALL)])
+    assert list(found) == [BAD]
+    assert found[BAD]["factor"] < 0.5
+    assert (found[BAD]["first"], found[BAD]["last"]) == (CLOSES, OPENS - 1)
+
+
+def test_instructions_by_which_most_hold_the_same_are_compared(held: Any) -> None:
+    """A fifth of one that few have is wrong, which by itself would be as good as any other fifth."""
+    texts = ["grab the block" if number < BAD else "take the block" for number in range(EPISODES_IN_ALL)]
+    found = held([from_the_hand(n, BLACK if n == 1 else RED, text) for n, text in enumerate(texts)])
+    assert list(found) == [1]
+
+
+def test_things_that_differ_honestly_are_not_judged(held: Any) -> None:
+    colors = [RED, BLUE, BLACK, (30, 180, 30), (220, 200, 30), (220, 220, 220)]
+    assert not held([from_the_hand(number, colors[number % 6]) for number in range(EPISODES_IN_ALL)])
+
+
+def test_what_the_instruction_names_is_no_outlier(held: Any) -> None:
+    told = [(BLUE, "take the blue block") if number % 8 == 5 else (RED, "take the red block") for number in range(24)]
+    assert not held([from_the_hand(number, color, task) for number, (color, task) in enumerate(told)])
+
+
 @pytest.fixture
 def late(tmp_path: Path) -> Path:
     """A dataset in which the actions of one episode are late."""

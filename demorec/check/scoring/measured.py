@@ -99,11 +99,10 @@ def _measured(dataset: LeRobotDataset, scale: Scale | None, number: int, *, imag
     sights: dict[str, Sight] = {}
     recording = DatasetRecording(dataset, number)
     grips = moved.grips if moved is not None else ()
-    first, last = grips[0] if grips else (place.length // 2, place.length // 2)
     for camera in recording.cameras if images and place.length else ():
         try:
             images_at = partial(recording.images_at, camera)
-            sights[camera] = sight(images_at, place.length, float(dataset.info.fps), (first + last) // 2)
+            sights[camera] = sight(images_at, place.length, float(dataset.info.fps), grips)
         except ExportError as error:
             flaws.append(Flaw(kind="images", text=without_path(error, dataset.root), first=0, last=place.length - 1))
     return Measured(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from demorec.check.scoring.held import held_colors
 from demorec.core.geometry import Array
 
 SAMPLED_S, MOST_SAMPLED = 0.25, 48
@@ -34,6 +35,7 @@ class Sight:
         brightness, contrast, sharpness: Of the middle one of the images, in levels.
         blank: Share of the images that show nothing.
         look: (C,) shares of colours: what is in the image at the grasp, and what comes and goes over the episode.
+        held: (1176,) of `held_colors`.
     """
 
     frames: NDArray[np.int64]
@@ -43,6 +45,7 @@ class Sight:
     sharpness: float
     blank: float
     look: Array
+    held: NDArray[np.float32]
 
 
 def sampled_frames(length: int, fps: float) -> list[int]:
@@ -52,18 +55,22 @@ def sampled_frames(length: int, fps: float) -> list[int]:
 
 
 def sight(
-    images_at: Callable[[Sequence[int]], Iterator[NDArray[np.uint8]]], length: int, fps: float, grasp: int
+    images_at: Callable[[Sequence[int]], Iterator[NDArray[np.uint8]]],
+    length: int,
+    fps: float,
+    grips: Sequence[tuple[int, int]],
 ) -> Sight:
     """Look at an episode.
 
     Args:
         images_at: Gives (H, W, 3) images of frames in rising order.
         length, fps: Of the episode.
-        grasp: Frame at which something is held.
+        grips: (first, last) frames between which something is held.
     """
     even = sampled_frames(length, fps)
+    grasp = sum(grips[0]) // 2 if grips else length // 2
     wanted = sorted({*even, grasp, length - 1})
-    cells, levels = [], []
+    cells, levels, reduced = [], [], []
     blank: NDArray[np.uint8] = np.zeros((1, 1, 3), np.uint8)
     first = held = last = blank
     for frame, image in zip(wanted, images_at(wanted), strict=True):
@@ -74,6 +81,7 @@ def sight(
         if frame in even:
             cells.append(np.asarray(Image.fromarray(image).resize(_CELLS, Image.Resampling.BOX), dtype=np.float32))
             levels.append(_quality(small))
+            reduced.append(small)
     parts = np.stack(cells)
     quality = np.array(levels)
     changed = np.abs(first.astype(np.int16) - last).max(axis=2) > _CHANGED
@@ -85,6 +93,7 @@ def sight(
         sharpness=float(np.median(quality[:, 2])),
         blank=float((quality[:, 1] < 2).mean()),
         look=np.concatenate([_colors(held), _colors(first, changed), _colors(last, changed)]),
+        held=held_colors(np.stack(reduced), np.array(even), grips, fps),
     )
 
 
