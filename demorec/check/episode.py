@@ -259,9 +259,8 @@ class CheckedEpisode(ExitStack):
         """What the checks need of a camera's decoded images; decoded once."""
         if (camera.name, kind) not in self._images:
             keep: Iterable[int] = ()
-            with suppress(
-                RecordingError
-            ):  # of colours all but those of the most unusual keyframe, which decoding shows
+            # Of colours all but those of the most unusual keyframe, which decoding shows.
+            with suppress(RecordingError):
                 if kind != "color":
                     keep = self.sampled[camera.name].tolist()[::2]
                 else:

@@ -172,10 +172,10 @@ def steps_as_velocities(subject: Moving) -> Iterator[Found]:
         if motion.fps < _RESOLVED_FPS:
             yield NotMeasured(why=f"at {motion.fps:g} frames a second an arm starts and stops within a step")
             return
-        told = (motion.velocity[1:] + motion.velocity[:-1]) / 2 * motion.steps_s[:, None]
+        expected = (motion.velocity[1:] + motion.velocity[:-1]) / 2 * motion.steps_s[:, None]
         # Within a step a joint may start and stop: only what is more than its fastest could do is a jump.
         fastest = np.abs(motion.velocity).max(axis=0) * motion.steps_s[:, None]
-        off = np.sort(np.maximum(np.abs(np.diff(motion.state, axis=0) - told) - fastest, 0.0), axis=0)[-2:]
+        off = np.sort(np.maximum(np.abs(np.diff(motion.state, axis=0) - expected) - fastest, 0.0), axis=0)[-2:]
         beyond = np.maximum(off[1] - _ANY_OTHER * off[0], 0.0) / np.maximum(np.ptp(motion.state, axis=0), _GOES)
         known = np.isfinite(beyond) & (np.arange(len(beyond)) != motion.gripper)
         if known.any():
