@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -254,3 +255,11 @@ def test_what_is_no_number_is_not_sent(recorded: Path) -> None:
     report = next(iter(replay_all([damaged], options)))[0]
     assert report.unreachable == 1
     assert np.isfinite(report.joint_error)
+
+
+def test_increments_of_a_jaw_arm_are_judged_by_the_arm_alone(tmp_path: Path) -> None:
+    """Without demorec's own files only the jaw's action is a target; it stops at what it holds, so it has no lag."""
+    run = simulate_run(tmp_path / "run", 4, seed=61, robot="so101", cameras=())
+    export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, action="joint_increment"))
+    shutil.rmtree(tmp_path / "ds" / "demorec")
+    assert exit_code("check", tmp_path / "ds") == 0
