@@ -41,9 +41,9 @@ from demorec.sim.world import World
 
 SIMULATED = ("slip", "detour", "hesitation")
 KINDS = (*SIMULATED, "label noise", "late actions", "wrong object", "frozen camera", "cut end")
-MEASURED = ("stack/panda/7", "place_in_tray/iiwa/8", "pick_from_clutter/panda/9")
+MEASURED = ("stack/panda/7", "unstack/iiwa/8", "pick_from_clutter/panda/9")
 FPS, WIDTH, HEIGHT = 20, 64, 48
-SPOILT = 0.3
+SPOILT, ATTEMPTS = 0.3, 40
 CAMERAS = ("front", "wrist")
 
 
@@ -119,7 +119,7 @@ def simulate(job: tuple[str, int, str, str]) -> Path:
     config = GenerateConfig(
         task=task, robot=robot, seed=int(seed), fps=FPS, width=WIDTH, height=HEIGHT, cameras=CAMERAS
     )
-    for attempt in range(5):
+    for attempt in range(ATTEMPTS):
         episode = prepare(EpisodePlan(config=config, episode_index=index, attempt=attempt))
         world, renderer = _cache().acquire(episode.info)
         session = Session.of_episode(world, episode, renderer)
@@ -130,6 +130,8 @@ def simulate(job: tuple[str, int, str, str]) -> Path:
             continue
         if agent.happened if isinstance(agent, Clumsy) else session.outcome.success:
             break
+    else:
+        raise SystemExit(f"No attempt at episode {index} of {cell} became {kind or 'sound'}.")
     scene, num_arm = episode.info.scene, len(world.robot.arm_joints)
     arrays: dict[str, Any] = dict(
         state=[[*f.observation.joint_position[:num_arm], f.observation.gripper_width] for f in frames],

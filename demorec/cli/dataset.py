@@ -83,7 +83,7 @@ class Dataset:
     """Folder of the new dataset; of split the folder in which each part gets one; of score a JSON file."""
     where: str = ""
     """Episodes for which this holds (select, drop, set-task)."""
-    episodes: str = ""
+    episodes: tuple[str, ...] = ()
     """Numbers of episodes, 0,3,5:9 (select, drop, set-task)."""
     head: int = 0
     """Frames to cut off at the beginning of each episode (trim)."""
@@ -103,7 +103,7 @@ class Dataset:
     """Column to sort by (reorder), or to stratify by (split)."""
     descending: bool = False
     """Largest first (reorder)."""
-    order: str = ""
+    order: tuple[str, ...] = ()
     """Numbers of all episodes in their new order, 2,0,1 (reorder)."""
     seed: int = 0
     """Seed of the order or the parts (shuffle, split)."""
@@ -312,16 +312,17 @@ def scored(root: Path, *, images: bool = True, workers: int | None = None) -> li
         return score_dataset(root, images=images, workers=workers or available_cores(), progress=bar.set)
 
 
-def _numbers(text: str) -> list[int]:
-    """Of episodes: 0,3,5:9; the end of a range is not part of it."""
+def _numbers(texts: Sequence[str]) -> list[int]:
+    """Of episodes: 0,3,5:9 or 0 3 5:9; the end of a range is not part of it."""
     found: list[int] = []
-    for part in text.split(",") if text else ():
-        first, colon, last = part.strip().partition(":")
-        try:
-            begin = int(first)
-            found += range(begin, int(last)) if colon else [begin]
-        except (ValueError, MemoryError, OverflowError) as error:
-            raise ConfigError(f"Episodes are numbers and ranges, such as 0,3,5:9, not {text!r}.") from error
+    try:
+        for part in " ".join(texts).replace(",", " ").split():
+            first, colon, last = part.partition(":")
+            found += range(int(first), int(last)) if colon else [int(first)]
+    except (ValueError, MemoryError, OverflowError):
+        found = []
+    if texts and not found:
+        raise ConfigError(f"Episodes are numbers and ranges, such as 0,3,5:9, not {' '.join(texts)!r}.")
     return found
 
 

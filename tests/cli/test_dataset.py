@@ -37,5 +37,9 @@ def test_a_run_stands_for_its_dataset(tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(json.loads(capsys.readouterr().out)["episodes"]) == 3
     assert exit_code("dataset", "select", run, "--episodes", "1", "--out", tmp_path / "one") == 0
     assert "1 episode, 8 frames" in capsys.readouterr().out
+    assert exit_code("dataset", "drop", run, "--episodes", "0,", "2", "--out", tmp_path / "rest") == 0
+    assert "1 episode, 8 frames" in capsys.readouterr().out
+    assert exit_code("dataset", "drop", run, "--episodes", "2:2", "--out", tmp_path / "none") == 2
+    assert "Episodes are numbers and ranges, such as 0,3,5:9, not '2:2'" in capsys.readouterr().err
     assert exit_code("dataset", "select", run / "run.json", "--episodes", "1", "--out", tmp_path / "two") == 2
     assert "The file is no recording" in capsys.readouterr().err

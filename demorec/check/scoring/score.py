@@ -36,8 +36,9 @@ _CHUNK = 8
 """Episodes that a process measures at once."""
 _TWIN = 0.9
 """Share of the rows that two episodes have in common, so that one is a copy of the other."""
-_FROZEN, _FROZEN_LEVELS = 0.1, 0.5
-"""Share of the usual change of the image, and levels, below which it stands still while the arm moves."""
+_FROZEN, _FROZEN_LEVELS = 0.1, 3.0
+"""Below which an image stands still while the arm moves: share of its usual change, and levels in any of its parts. The
+same image, encoded again, differs by 2 (x264 and AV1 at 224x224 and 640x480), the hand above an empty table by more."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,8 @@ def scores(episodes: Sequence[Measured]) -> list[EpisodeScore]:
         for name, readings, detail in (*_motions(group), *_images(group)):
             for number, reason in _judged(name, readings, detail):
                 reasons[numbers[number]].append(reason)
+        for number, reason in _ends(group):
+            reasons[numbers[number]].append(reason)
     for number, reason in (*_otherwise(episodes), *_other_things(episodes), *_twins(episodes)):
         reasons[number].append(reason)
     return [
@@ -167,11 +170,12 @@ def _factor(spreads: float) -> float:
     return math.exp(-((max(spreads, 0.0) / _HALF) ** _STEEPNESS))
 
 
-def _judged(name: str, readings: Readings, detail: str) -> Iterator[tuple[int, Reason]]:
+def _judged(name: str, readings: Readings, detail: str, most: Array | float = math.inf) -> Iterator[tuple[int, Reason]]:
+    """(number, reason) of each that is read; none is taken for more than `most` usual spreads off."""
     law = _LAWS[name]
     values = np.array([math.nan if reading is None else reading.value for reading in readings])
     off = neighbours.deviation(values, law.spread)
-    off = {"more": off, "less": -off, "both": np.abs(off)}[law.side]
+    off = np.minimum({"more": off, "less": -off, "both": np.abs(off)}[law.side], most)
     usual = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
     for number, (reading, spreads) in enumerate(zip(readings, off.tolist(), strict=True)):
         if reading is not None:
@@ -187,15 +191,8 @@ def _motions(group: Sequence[Measured]) -> Iterator[tuple[str, Readings, str]]:
         readings = [None if each is None else each.readings.get(name) for each in moved]
         if any(readings):
             yield name, readings, ""
-    known = [number for number, each in enumerate(moved) if each is not None]
-    ends = np.array([each.ends[-1] for each in moved if each is not None])
-    if len(known) < neighbours.FEWEST:
+    if sum(each is not None for each in moved) < neighbours.FEWEST:
         return
-    away: list[Reading | None] = [None] * len(group)
-    for number, value in zip(known, neighbours.nearest_distance(ends).tolist(), strict=True):
-        last = group[number].length - 1
-        away[number] = Reading(value=value, first=last, last=last)
-    yield "end", away, ""
     stretches: dict[int, list[int]] = {}
     for number, each in enumerate(moved):
         if each is not None:
@@ -203,6 +200,26 @@ def _motions(group: Sequence[Measured]) -> Iterator[tuple[str, Readings, str]]:
     for numbers in stretches.values():
         if len(numbers) >= neighbours.FEWEST:
             yield from ((name, readings, "") for name, readings in _courses(group, numbers))
+
+
+def _ends(group: Sequence[Measured]) -> Iterator[tuple[int, Reason]]:
+    """Of episodes that end both elsewhere than others and elsewhere as seen from the gripper's last switch.
+
+    A hand that let go turned another way, or in another place, ends elsewhere; where it let go it ends as usual.
+    """
+    known = [(number, each.movement.ends) for number, each in enumerate(group) if each.movement is not None]
+    if len(known) < neighbours.FEWEST:
+        return
+    last = np.array([ends[-2:] for _, ends in known])
+    readings: list[Reading | None] = [None] * len(group)
+    most = np.full(len(group), math.inf)
+    numbers = [number for number, _ in known]
+    for number, value in zip(numbers, neighbours.nearest_distance(last[:, 1]).tolist(), strict=True):
+        end = group[number].length - 1
+        readings[number] = Reading(value=value, first=end, last=end)
+    ways = neighbours.nearest_distance(last[:, 1] - last[:, 0])
+    most[numbers] = neighbours.deviation(ways, _LAWS["end"].spread)
+    yield from _judged("end", readings, "", most)
 
 
 def _courses(group: Sequence[Measured], numbers: Sequence[int]) -> Iterator[tuple[str, Readings]]:
@@ -259,7 +276,7 @@ def _frozen(group: Sequence[Measured], sights: Sequence[Sight | None]) -> Readin
         if each is None or pair is None:
             found.append(None)
             continue
-        stands = (pair[1] > least) & (pair[0] < np.maximum(_FROZEN * rate * pair[1], 0)) & (pair[0] < _FROZEN_LEVELS)
+        stands = (pair[1] > least) & (pair[0] < _FROZEN * rate * pair[1]) & (each.most_changes < _FROZEN_LEVELS)
         length, start = longest_run(stands)
         first, last = int(each.frames[start]), int(each.frames[start + length])
         fps = 1.0 if episode.movement is None else episode.movement.fps

@@ -31,7 +31,8 @@ class Sight:
 
     Attributes:
         frames: (N,) that were decoded evenly over it.
-        changes: (N - 1,) levels, of 255, by which the parts of an image differ from those of the one before.
+        changes, most_changes: (N - 1,) levels, of 255, by which the parts of an image differ from those of the one
+            before: their mean, and the part that differs most.
         brightness, contrast, sharpness: Of the middle one of the images, in levels.
         blank: Share of the images that show nothing.
         look: (C,) shares of colours: what is in the image at the grasp, and what comes and goes over the episode.
@@ -40,6 +41,7 @@ class Sight:
 
     frames: NDArray[np.int64]
     changes: Array
+    most_changes: Array
     brightness: float
     contrast: float
     sharpness: float
@@ -84,10 +86,12 @@ def sight(
             reduced.append(small)
     parts = np.stack(cells)
     quality = np.array(levels)
+    differences = np.abs(np.diff(parts, axis=0)).astype(np.float64)
     changed = np.abs(first.astype(np.int16) - last).max(axis=2) > _CHANGED
     return Sight(
         frames=np.array(even),
-        changes=np.abs(np.diff(parts, axis=0)).mean(axis=(1, 2, 3)).astype(np.float64),
+        changes=differences.mean(axis=(1, 2, 3)),
+        most_changes=differences.max(axis=(1, 2, 3)),
         brightness=float(np.median(quality[:, 0])),
         contrast=float(np.median(quality[:, 1])),
         sharpness=float(np.median(quality[:, 2])),
