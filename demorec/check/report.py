@@ -13,7 +13,7 @@ from demorec.check.base import Check, Form, Group, Level, Result
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
-from demorec.core.errors import OptionError, check_option, resource_error
+from demorec.core.errors import check_option, resource_error
 from demorec.core.processes import SPAWN
 from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
@@ -28,52 +28,6 @@ _OF_THE_FILE: tuple[Group, ...] = ("file", "time")
 _WORTH_PROCESSES = {"with images": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
 SubjectKind = Literal["recording", "run", "dataset"]
-RENAMED = {
-    "pictures_decode": "images_decode",
-    "pictures_as_drawn": "images_as_drawn",
-    "odd_pictures": "odd_images",
-    "repeated_pictures": "repeated_images",
-    "picture_lag": "image_lag",
-    "import_pictures": "import_images",
-    "dataset_picture_statistics": "dataset_image_statistics",
-    "dataset_pictures_as_drawn": "dataset_images_as_drawn",
-    "dataset_picture_lag": "dataset_image_lag",
-    "collected_opens": "opens",
-    "collected_checksums": "checksums",
-    "collected_readable": "readable",
-    "collected_complete": "complete",
-    "collected_drops": "drops",
-    "collected_rate": "rate",
-    "collected_gaps": "gaps",
-    "collected_sample_age": "sample_age",
-    "collected_picture_age": "image_age",
-    "collected_missing_pictures": "missing_images",
-    "collected_pictures": "images_show_something",
-    "collected_distinct_cameras": "distinct_cameras",
-    "collected_stuck": "stuck_sensors",
-    "collected_run_files": "run_files",
-    "joint_position": "joint_limits",
-    "joint_velocity": "joint_speed",
-    "state_matches_velocity": "velocity_matches_position",
-    "dataset_forward_kinematics": "forward_kinematics",
-    "run_duplicates": "duplicates",
-    "dataset_duplicates": "duplicates",
-    "run_coverage": "coverage",
-    "dataset_coverage": "coverage",
-    "projected_size": "image_placement",
-    "pictures_exposed": "exposure",
-    "effort_bears_the_arm": "effort_matches_dynamics",
-    "wrench_holds_the_hand": "wrench_bears_the_hand",
-    "dataset_images": "stray_images",
-    "dataset_frozen": "frozen_images",
-    **dict.fromkeys(
-        ("latched_messages", "metadata_agrees", "phase_events", "picture_messages", "moving_frames", "derived_values",
-         "joint_sample_times", "end_values", "story", "deliberate_misses", "phases_match_motion", "config_agrees",
-         "drawn_within_ranges", "robot_as_known", "noise_as_said"),
-        "part of --deep",
-    ),
-}  # fmt: skip
-"""Names of checks up to version 0.2.0 -> what finds the same faults now."""
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
 
@@ -100,8 +54,6 @@ class CheckOptions:
     def validate(self) -> None:
         """Raise ConfigError for unknown names or impossible numbers."""
         for name in self.only:
-            if name in RENAMED:
-                raise OptionError("only", f"names {name}, which is now {RENAMED[name]}.")
             CHECKS.check_name(name)
         check_option("workers", self.workers, 1, 1024)
 

@@ -370,13 +370,6 @@ def _fixed(match: re.Match[str]) -> str:
     return match[0].replace("prismatic", "fixed")
 
 
-def test_an_old_name_of_a_check_names_the_new_one(strange: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["check", str(strange), "--only", "collected_gaps"])
-    assert ended.value.code == 2
-    assert "names collected_gaps, which is now gaps" in capsys.readouterr().err
-
-
 def test_exposure_that_drifts(strange: Path, tmp_path: Path) -> None:
     spoilt = copy(strange, tmp_path / "spoilt")
 
