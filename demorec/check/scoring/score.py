@@ -36,9 +36,12 @@ _CHUNK = 8
 """Episodes that a process measures at once."""
 _TWIN = 0.9
 """Share of the rows that two episodes have in common, so that one is a copy of the other."""
-_FROZEN, _FROZEN_LEVELS = 0.1, 3.0
-"""Below which an image stands still while the arm moves: share of its usual change, and levels in any of its parts. The
-same image, encoded again, differs by 2 (x264 and AV1 at 224x224 and 640x480), the hand above an empty table by more."""
+_FROZEN, _FROZEN_LEVELS = 0.1, 0.5
+"""Share of the usual change of the image, and mean levels, below which it stands still while the arm moves."""
+_SAME_PART, _SAME_LEVELS = 3.0, 0.05
+"""Levels, of the part that changes most or in the mean, below which half of the steps of a still image are. An image
+that is encoded again changes in no part by more than 2 (x264 and AV1 at 224x224 and 640x480); the view of a hand that
+carries a cube over an empty table does."""
 
 
 @dataclass(frozen=True)
@@ -276,8 +279,11 @@ def _frozen(group: Sequence[Measured], sights: Sequence[Sight | None]) -> Readin
         if each is None or pair is None:
             found.append(None)
             continue
-        stands = (pair[1] > least) & (pair[0] < _FROZEN * rate * pair[1]) & (each.most_changes < _FROZEN_LEVELS)
+        stands = (pair[1] > least) & (pair[0] < np.minimum(_FROZEN * rate * pair[1], _FROZEN_LEVELS))
         length, start = longest_run(stands)
+        run = slice(start, start + length)
+        if length and np.median(each.most_changes[run]) >= _SAME_PART and np.median(each.changes[run]) >= _SAME_LEVELS:
+            length = 0
         first, last = int(each.frames[start]), int(each.frames[start + length])
         fps = 1.0 if episode.movement is None else episode.movement.fps
         found.append(Reading(value=(last - first) / fps, first=first, last=last))
