@@ -126,6 +126,30 @@ def ends_early(rows: Rows) -> Rows:
     return _each(rows, lambda values: values[:38])
 
 
+def goes_elsewhere_in_the_end(rows: Rows) -> Rows:
+    return _shifted(rows, OPENS, LENGTH - 1)
+
+
+def puts_it_elsewhere(rows: Rows) -> Rows:
+    """And ends as far from there as always."""
+    return _shifted(rows, CLOSES, OPENS)
+
+
+def _shifted(rows: Rows, first: int, last: int) -> Rows:
+    way = np.clip((np.arange(LENGTH) - first) / (last - first), 0, 1)
+    for name in ("state", "action"):
+        rows[name][:, 1] += 0.5 * (3 * way**2 - 2 * way**3)
+    return rows
+
+
+def sees_little(rows: Rows) -> Rows:
+    """But for a shadow that moves."""
+    freezes(rows)
+    for t in range(24, 40):
+        rows["images"][t, 22:, 2 * (t - 24) : 2 * (t - 24) + 2] -= 20
+    return rows
+
+
 def is_copied(rows: Rows) -> Rows:
     return demonstration(BAD - 2)
 
@@ -161,6 +185,7 @@ def scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[Call
         (takes_the_other, {"instruction"}, 30),
         (freezes, {"frozen"}, 32),
         (ends_early, {"switches", "end"}, 37),
+        (goes_elsewhere_in_the_end, {"end"}, LENGTH - 1),
         (is_copied, {"copy"}, 30),
         (lacks_numbers, {"missing"}, 7),
     ],
@@ -175,6 +200,11 @@ def test_the_spoilt_episode_is_the_worst_and_says_why(
     reason = next(reason for reason in found[BAD]["reasons"] if reason["kind"] in kinds)
     assert reason["first"] <= frame <= reason["last"]
     assert all(episode["score"] > 0.8 for episode in found if episode["episode_index"] != BAD)
+
+
+@pytest.mark.parametrize(("vary", "kind"), [(puts_it_elsewhere, "end"), (sees_little, "frozen")])
+def test_what_varies_honestly_is_not_blamed(scored: Any, vary: Callable[[Rows], Rows], kind: str) -> None:
+    assert kind not in {reason["kind"] for reason in scored(vary)[BAD]["reasons"]}
 
 
 def test_sound_episodes_are_sound(scored: Any) -> None:
