@@ -98,7 +98,7 @@ class Pretrain:
             plan,
             self.out,
             frame_cache_bytes=self.frame_cache_mb << 20,
-            on_progress=lambda done, loss: tell(f"update {done:,} of {plan.updates:,}, loss {loss:.3f}"),
+            on_progress=tell,
         )
         say(
             f"next keyframe {1000 * result.median_m:.1f} mm off (median; 9 of 10 frames within "

@@ -166,10 +166,16 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
                 for camera, image in enumerate(images)
             ]
             keypoints = torch.cat(found, dim=1)
-            numbers = torch.cat([keypoints, self.normalized(state)], dim=1)
-            # Most targets are nearly linear in where things are seen; a network alone is half as precise from afar.
-            targets: torch.Tensor = self.linear_targets(numbers) + self.targets(numbers)
-        return keypoints, targets
+            return keypoints, self.targets_of(keypoints, state)
+
+    def targets_of(self, keypoints: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """(B, num_targets) from keypoints (B, 3 K num_cameras) and the state (B, S).
+
+        Most are nearly linear in where things are seen; a network alone tells them half as precisely from afar.
+        """
+        numbers = torch.cat([keypoints, self.normalized(state)], dim=1)
+        targets: torch.Tensor = self.linear_targets(numbers) + self.targets(numbers)
+        return targets
 
     def normalized(self, state: torch.Tensor) -> torch.Tensor:
         """(B, S)."""

@@ -39,6 +39,9 @@ _OPENING = "gripper.width"
 _HELD_OUT_SHARE, _JUDGED_FRAMES = 0.05, 1000
 _WARM_UP, _WEIGHT_DECAY, _GRADIENT_NORM = 100, 1e-3, 1.0
 _SMOOTHING = 0.95
+_LAST_UPDATES, _LAST_BATCH = 4, 4
+"""Updates, and frames of each, of the last part of a training, in units of those of its first part: they cost little,
+since images are encoded once. The next keyframe is told twice as precisely by it."""
 
 Rows = NDArray[np.int64]
 
@@ -85,17 +88,19 @@ def pretrain(
     out: Path,
     *,
     frame_cache_bytes: int,
-    on_progress: Callable[[int, float], None],
+    on_progress: Callable[[str], None],
     save_every: int = 50,
 ) -> PretrainResult:
     """Teach the encoder that the ACT policy of a training will have, and save the policy; go on with what was begun.
+
+    At last what tells the targets is trained further, alone, with keypoints that no longer change.
 
     Args:
         config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count.
         plan: How.
         out: Folder of the policy.
         frame_cache_bytes: Limit of the decoded frames that are kept.
-        on_progress: Called with the updates done and the smoothed loss.
+        on_progress: Called with the updates done and the smoothed loss, in words.
         save_every: Updates from one to the next state that a stopped call can go on from.
 
     Raises:
@@ -132,6 +137,7 @@ def pretrain(
         training = _EncoderTraining(config.policy, plan, dataset, targets)
         started = time.process_time()
         training.run(out / UNFINISHED_NAME, on_progress, save_every)
+        training.finish_targets(on_progress)
         result = training.evaluate(time.process_time() - started)
         training.save(out)
         replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "result": asdict(result)}, indent=1))
@@ -186,7 +192,7 @@ class _EncoderTraining:
         )
         self._done, self._loss = 0, math.nan
 
-    def run(self, unfinished: Path, on_progress: Callable[[int, float], None], save_every: int) -> None:
+    def run(self, unfinished: Path, on_progress: Callable[[str], None], save_every: int) -> None:
         """From where a stopped call was to the last update."""
         if unfinished.exists():
             self._load(unfinished)
@@ -197,7 +203,28 @@ class _EncoderTraining:
             self._done += 1
             if self._done % save_every == 0 or self._done == self._plan.updates:
                 self._store(unfinished)
-                on_progress(self._done, self._loss)
+                on_progress(f"update {self._done:,} of {self._plan.updates:,}, loss {self._loss:.3f}")
+
+    def finish_targets(self, on_progress: Callable[[str], None]) -> None:
+        """Train what tells the targets, alone, on frames evenly over the dataset; a stopped call begins it anew."""
+        plan, network = self._plan, self._network
+        updates, batch_size = _LAST_UPDATES * plan.updates, _LAST_BATCH * plan.batch_size
+        rows = self._training[:: max(1, len(self._training) // updates)]
+        on_progress(f"what it tells of {len(rows):,} frames, {updates:,} updates of {batch_size}")
+        network.eval()
+        with torch.no_grad():
+            parts = [self._encoded(part) for part in np.array_split(rows, math.ceil(len(rows) / plan.batch_size))]
+        keypoints, state = (torch.cat(part) for part in zip(*parts, strict=True))
+        telling = (network.linear_targets, network.targets)
+        optimizer = torch.optim.AdamW(
+            [weight for part in telling for weight in part.parameters()],
+            lr=plan.learning_rate,
+            weight_decay=_WEIGHT_DECAY,
+        )
+        for update in range(updates):
+            chosen = np.random.default_rng([plan.seed, update, 1]).integers(len(rows), size=batch_size)
+            at = torch.from_numpy(chosen).to(self._device)
+            self._learn(optimizer, update / updates, network.targets_of(keypoints[at], state[at]), rows[chosen])
 
     def evaluate(self, cpu_seconds: float) -> PretrainResult:
         """On the held-out episodes."""
@@ -231,25 +258,36 @@ class _EncoderTraining:
         plan = self._plan
         # Which frames are seen follows from the seed and the update alone, so that a stopped call goes on as if not.
         rows = np.random.default_rng([plan.seed, self._done]).choice(self._training, plan.batch_size)
+        return self._learn(self._optimizer, self._done / plan.updates, self._predict(rows), rows)
+
+    def _learn(self, optimizer: torch.optim.Optimizer, passed: float, predicted: torch.Tensor, rows: Rows) -> float:
+        """One update, after a share of all of them, by what was predicted for some rows; its loss."""
+        plan = self._plan
         wanted = (self._targets.values[rows] - self._mean) / self._spread
-        rate = min(1.0, (self._done + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * self._done / plan.updates))
-        for group in self._optimizer.param_groups:
+        rate = min(1.0, (passed * plan.updates + 1) / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * passed))
+        for group in optimizer.param_groups:
             group["lr"] = plan.learning_rate * rate
         is_known = torch.from_numpy(~np.isnan(wanted)).to(self._device)
-        error = self._predict(rows) - torch.from_numpy(np.nan_to_num(wanted)).to(self._device)
+        error = predicted - torch.from_numpy(np.nan_to_num(wanted)).to(self._device)
         # Closings count as much as openings, which are ahead for longer.
         loss = ((error.abs() * is_known).sum(0) / is_known.sum(0).clamp(min=1)).mean()
-        self._optimizer.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self._network.parameters(), _GRADIENT_NORM)
-        self._optimizer.step()
+        torch.nn.utils.clip_grad_norm_([w for group in optimizer.param_groups for w in group["params"]], _GRADIENT_NORM)
+        optimizer.step()
         return float(loss.item())
+
+    def _encoded(self, rows: Rows) -> tuple[torch.Tensor, torch.Tensor]:
+        """Keypoints and state."""
+        batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
+        images = [batch[key] for key in self._policy.config.image_features]
+        keypoints, _ = self._network(images, batch[_STATE], batch["task"])
+        return keypoints, batch[_STATE]
 
     def _predict(self, rows: Rows) -> torch.Tensor:
         """(B, K) normalised targets, as the encoder predicts them now."""
-        batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
-        images = [batch[key] for key in self._policy.config.image_features]
-        _, predicted = self._network(images, batch[_STATE], batch["task"])
+        keypoints, state = self._encoded(rows)
+        predicted: torch.Tensor = self._network.targets_of(keypoints, state)
         return predicted
 
     def _store(self, path: Path) -> None:
