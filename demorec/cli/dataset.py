@@ -44,7 +44,7 @@ _FLAGS = {
 }
 """The commands that each flag is for."""
 _SHOWN = 20
-"""Differences of each level that are printed."""
+"""Differences of each level, and ranges of episodes, that are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,7 +228,10 @@ class Dataset:
                 f"{episode.score:.2f}  episode {episode.episode_index}" + (f": {'; '.join(reasons)}" if reasons else "")
             )
         if self.out is not None:
-            write_scores(self.out, found)
+            try:
+                write_scores(self.out, found)
+            except OSError as error:
+                raise ExportError(f"The scores cannot be written ({error.strerror}): {self.out}") from error
             tell(f"Scores of {counted(len(found), 'episode')}: {self.out}")
         return 0
 
@@ -322,6 +325,9 @@ class Dataset:
         frames = sum(cut.last - cut.first for cut in plan.cuts)
         text = f"{begin}{len(plan.cuts)} of {counted(len(lengths), 'episode')}, {frames} of {sum(lengths)} frames"
         place = str(self.out / name) if self.out is not None else name
+        numbers = [cut.episode for cut in plan.cuts]
+        if self.dry_run and len(plan.sources) == 1 and numbers != list(range(len(lengths))):
+            say(f"episodes {_listed(numbers)}")
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
 
 
@@ -360,6 +366,16 @@ def _numbers(texts: Sequence[str]) -> list[int]:
     if texts and not found:
         raise ConfigError(f"Episodes are numbers and ranges, such as 0,3,5:9, not {' '.join(texts)!r}.")
     return found
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Some of them, as `_numbers` reads them."""
+    parts: list[tuple[int, int]] = []
+    for number in numbers:
+        joins = parts and parts[-1][1] == number
+        parts[-1:] = [(parts[-1][0], number + 1)] if joins else [*parts[-1:], (number, number + 1)]
+    texts = [f"{first}:{end}" if end - first > 1 else str(first) for first, end in parts]
+    return ",".join(texts[:_SHOWN]) + (",..." if len(texts) > _SHOWN else "")
 
 
 def _pairs(words: Sequence[str], example: str) -> dict[str, str]:

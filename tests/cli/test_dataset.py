@@ -77,7 +77,9 @@ def test_no_part_is_written_into_the_source_and_none_where_one_is_in_the_way(
 def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("dataset", "select", "cups", "--episodes", "0", "--dry-run")
     assert exit_code(*words) == 0  # no --out
-    assert capsys.readouterr().out == "Would be 1 of 5 episodes, 8 of 40 frames\n"
+    assert capsys.readouterr().out == "episodes 0\nWould be 1 of 5 episodes, 8 of 40 frames\n"
+    assert exit_code("dataset", "drop", "cups", "--episodes", "1", "--dry-run") == 0
+    assert capsys.readouterr().out.startswith("episodes 0,2:5\n")
     assert exit_code(*words, "--out", "cups", "--overwrite") == 2
     assert "This is never replaced, since this command reads it" in capsys.readouterr().err
     assert exit_code(*words[:-1]) == 2
@@ -142,3 +144,5 @@ def test_the_home_folder_within_quotes(
     assert exit_code("dataset", "score", "cups", "--no-images", "--workers", "1", "--out", "~/scores.json") == 0
     assert f"Scores of 5 episodes: {cups.parent}/scores.json" in capsys.readouterr().err
     assert not Path("~").exists()
+    assert exit_code("dataset", "score", "cups", "--no-images", "--workers", "1", "--out", "x" * 250) == 1
+    assert "The scores cannot be written (File name too long)" in capsys.readouterr().err
