@@ -72,6 +72,8 @@ def test_no_part_is_written_into_the_source_and_none_where_one_is_in_the_way(
     printed = capsys.readouterr().out
     assert "3 of 5 episodes, 24 of 40 frames: parts/a" in printed
     assert "2 of 5 episodes, 16 of 40 frames: parts/b" in printed
+    assert exit_code("dataset", "score", "parts") == 2
+    assert "it holds datasets, name one (a, b): parts" in capsys.readouterr().err
 
 
 def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
