@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.output import counted, say, say_json
+from demorec.cli.shared.output import counted, say, say_json, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, ExportError, check_option
@@ -44,7 +44,7 @@ _FLAGS = {
 }
 """The commands that each flag is for."""
 _SHOWN = 20
-"""Differences of each level that are printed."""
+"""Differences of each level, and ranges of episodes, that are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,42 +140,52 @@ class Dataset:
             return self._diff()
         if self.command == "score":
             return self._score()
-        if not self.words or self.out is None:
-            raise ConfigError(
-                f"Give a dataset and where the new one goes: demorec dataset {self.command} DATASET --out NEW."
-            )
-        refuse_inside([self.out])
-        from demorec.datasets.editing.left_out import left_out
-        from demorec.datasets.editing.plan import Source
         from demorec.datasets.editing.write import write_plan
 
-        num_sources = len(self.words) if self.command == "merge" else 1
-        takes_words = self.command in ("rename", "drop-features")
-        if len(self.words) > num_sources and not takes_words:
-            raise ConfigError(f"demorec dataset {self.command} takes one dataset; demorec dataset merge joins several.")
-        sources = [Source(_dataset(word)) for word in self.words[:num_sources]]
-        self._add_scores(sources[0])
-        plans = self._split(sources[0]) if self.command == "split" else {"": self._plan(sources)}
-        for name, plan in plans.items():
-            out = self.out / name
+        for name, plan in self._plans().items():
             self._tell(plan)
-            frames = sum(cut.last - cut.first for cut in plan.cuts)
-            missing = left_out(plan)
-            if self.dry_run:
-                say(f"Would be {counted(len(plan.cuts), 'episode')}, {frames} frames: {out}")
-                for text in missing:
-                    say(f"Would not be taken over: {text}.")
+            if self.out is None or self.dry_run:
+                self._tell_result("Would be ", name, plan, "Would not be taken over")
                 continue
             with ProgressBar("writing") as bar:
-                report = write_plan(plan, out, overwrite=self.overwrite, decode=self.decode, progress=bar.set)
-            say(f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames: {out}")
+                report = write_plan(
+                    plan, self.out / name, overwrite=self.overwrite, decode=self.decode, progress=bar.set
+                )
+            self._tell_result("", name, plan, "Not taken over")
             if report.around:
                 say(f"{counted(report.around, 'image')} beside cuts stay in the videos, since others need them.")
             if report.decoded:
                 say(f"Images of {counted(report.decoded, 'episode')} were decoded for their statistics.")
-            for text in missing:
-                say(f"Not taken over: {text}.")
         return 0
+
+    def _plans(self) -> Mapping[str, Plan]:
+        """Name within --out -> what is to be written there; everything that stands in the way is refused here."""
+        from demorec.datasets.editing.plan import Source
+        from demorec.datasets.editing.write import check_target
+
+        usage = f"demorec dataset {self.command} DATASET --out NEW"
+        if not self.words:
+            raise ConfigError(f"Name a dataset, before the flags: {usage}.")
+        if self.out is None and not self.dry_run:
+            raise ConfigError(f"Say where the new dataset goes, or ask by --dry-run what it would be: {usage}.")
+        num_sources = len(self.words) if self.command == "merge" else 1
+        if len(self.words) > num_sources and self.command not in ("rename", "drop-features"):
+            raise ConfigError(
+                f"demorec dataset {self.command} takes one dataset, and demorec dataset merge joins several: "
+                f"what is {self.words[1]!r}?"
+            )
+        sources = [Source(_dataset(word)) for word in self.words[:num_sources]]
+        shares = self._shares() if self.command == "split" else {"": 1.0}
+        outs = [self.out / name for name in shares] if self.out is not None else []
+        refuse_inside(outs)
+        for out in outs:
+            check_target(out, [source.root for source in sources], overwrite=self.overwrite)
+        self._add_scores(sources[0])
+        if self.command != "split":
+            return {"": self._plan(sources)}
+        from demorec.datasets.editing.operations import split
+
+        return split(sources[0], shares, self.seed, by=self.by)
 
     def _diff(self) -> int:
         from demorec.datasets.editing.compare import LEVELS
@@ -210,16 +220,19 @@ class Dataset:
             refuse_inside([self.out])
             check_target(self.out, source=root, overwrite=self.overwrite)
         found = scored(root, images=self.images, workers=self.workers)
-        if self.out is not None:
-            write_scores(self.out, found)
         if self.json:
             say_json(to_json(found))
-            return 0
-        for episode in sorted(found, key=lambda episode: episode.score):
+        for episode in () if self.json else sorted(found, key=lambda episode: episode.score):
             reasons = [f"{reason.text} (frames {reason.first} to {reason.last})" for reason in episode.reasons]
             say(
                 f"{episode.score:.2f}  episode {episode.episode_index}" + (f": {'; '.join(reasons)}" if reasons else "")
             )
+        if self.out is not None:
+            try:
+                write_scores(self.out, found)
+            except OSError as error:
+                raise ExportError(f"The scores cannot be written ({error.strerror}): {self.out}") from error
+            tell(f"Scores of {counted(len(found), 'episode')}: {self.out}")
         return 0
 
     def _add_scores(self, source: Source) -> None:
@@ -238,7 +251,6 @@ class Dataset:
 
     def _plan(self, sources: Sequence[Source]) -> Plan:
         from demorec.datasets.editing import operations
-        from demorec.datasets.editing.merge import merge
 
         source, words = sources[0], self.words[1:]
         match self.command:
@@ -253,9 +265,9 @@ class Dataset:
                     return operations.trim_idle(source, self.idle_feature, self.idle_threshold, self.idle_margin)
                 return operations.trim(source, self.head, self.tail)
             case "merge":
-                return merge(sources, self.mapping)
+                return self._merge(sources)
             case "rename":
-                return operations.rename(source, _pairs(words, "old=new"))
+                return operations.rename(source, _pairs(words, "rename DATASET OLD=NEW"))
             case "drop-features":
                 return operations.drop_features(source, words)
             case "set-task":
@@ -265,16 +277,30 @@ class Dataset:
             case _:
                 return operations.shuffle(source, self.seed)
 
-    def _split(self, source: Source) -> Mapping[str, Plan]:
-        from demorec.datasets.editing.operations import split
+    def _merge(self, sources: Sequence[Source]) -> Plan:
+        from demorec.datasets.editing.merge import DatasetsDifferError, merge
 
         try:
-            shares = {name: float(share) for name, share in _pairs(self.shares, "train=0.8").items()}
+            return merge(sources, self.mapping)
+        except DatasetsDifferError as error:
+            if not error.mapping:
+                raise
+            say(*error.mapping)
+            raise ConfigError(
+                f"{error} A mapping could be the lines above: look at each, save them (> FILE) and give --mapping FILE."
+            ) from error
+
+    def _shares(self) -> Mapping[str, float]:
+        """Name of each part -> its share."""
+        example = "--shares train=0.8 val=0.2"
+        try:
+            pairs = _pairs(" ".join(self.shares).replace(",", " ").split(), example)
+            shares = {name: float(share) for name, share in pairs.items()}
         except ValueError as error:
-            raise ConfigError("A share is a number: --shares train=0.8 val=0.2.") from error
+            raise ConfigError(f"A share is a number: {example}.") from error
         if wrong := [name for name in shares if Path(name).name != name or name in ("", ".", "..")]:
             raise ConfigError(f"A part cannot be called {wrong[0]!r}: its name is that of its folder.")
-        return split(source, shares, self.seed, by=self.by)
+        return shares
 
     def _chosen(self, source: Source) -> list[int]:
         from demorec.datasets.editing.operations import chosen
@@ -282,11 +308,27 @@ class Dataset:
         return chosen(source, self.where, _numbers(self.episodes) if self.episodes else None)
 
     def _tell(self, plan: Plan) -> None:
-        """List what is cut off of episodes."""
+        """List what is done to episodes."""
+        if new := sum(bool(cut.task) for cut in plan.cuts):
+            say(f"New instruction: {new} of {counted(len(plan.cuts), 'episode')}")
         for cut in plan.cuts:
             length = plan.sources[cut.source].places[cut.episode].length
             if (cut.first, cut.last) != (0, length):
-                say(f"episode {cut.episode}: {cut.first} frames cut at the beginning, {length - cut.last} at the end")
+                head = counted(cut.first, "frame")
+                say(f"episode {cut.episode}: {head} cut at the beginning, {length - cut.last} at the end")
+
+    def _tell_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
+        """What of the sources is in the result, and what is not."""
+        from demorec.datasets.editing.left_out import left_out
+
+        lengths = [place.length for source in plan.sources for place in source.places]
+        frames = sum(cut.last - cut.first for cut in plan.cuts)
+        text = f"{begin}{len(plan.cuts)} of {counted(len(lengths), 'episode')}, {frames} of {sum(lengths)} frames"
+        place = str(self.out / name) if self.out is not None else name
+        numbers = [cut.episode for cut in plan.cuts]
+        if self.dry_run and len(plan.sources) == 1 and numbers != list(range(len(lengths))):
+            say(f"episodes {_listed(numbers)}")
+        say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
 
 
 def _dataset(word: str) -> Path:
@@ -326,8 +368,19 @@ def _numbers(texts: Sequence[str]) -> list[int]:
     return found
 
 
+def _listed(numbers: Sequence[int]) -> str:
+    """Some of them, as `_numbers` reads them."""
+    parts: list[tuple[int, int]] = []
+    for number in numbers:
+        joins = parts and parts[-1][1] == number
+        parts[-1:] = [(parts[-1][0], number + 1)] if joins else [*parts[-1:], (number, number + 1)]
+    texts = [f"{first}:{end}" if end - first > 1 else str(first) for first, end in parts]
+    return ",".join(texts[:_SHOWN]) + (",..." if len(texts) > _SHOWN else "")
+
+
 def _pairs(words: Sequence[str], example: str) -> dict[str, str]:
     found = dict(word.partition("=")[::2] for word in words)
     if not words or any("=" not in word for word in words) or len(found) != len(words):
-        raise ConfigError(f"Each name is given once, with what it gets, such as {example}.")
+        given = f", not {' '.join(words)!r}" if words else ""
+        raise ConfigError(f"Each name is given once, with what it gets: {example}{given}.")
     return found

@@ -108,7 +108,8 @@ class View:
             else:
                 for source, target in zip(sources, targets, strict=True):
                     save(source, target)
-                    say(f"{size_in_words(target.stat().st_size)}: {target}")
+                    of = f" ({source.name})" if len(targets) > 1 else ""
+                    say(f"{size_in_words(target.stat().st_size)}: {target}{of}")
             if self.screenshot is None:
                 return 0
         with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Result
@@ -19,7 +21,7 @@ from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA
-from demorec.datasets.lerobot.videos import EpisodeVideo
+from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import ACTION, IMAGE_PREFIX, STATE
 from demorec.episode.validity import read_episode_info
@@ -44,6 +46,7 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
     rows, left_out, configs = _read_sidecar(root)
     missing = list(_missing(info, has_sidecar=bool(rows)))
     key = _camera_key(info, camera, root)
+    stored = None if key is None or info.features[key].is_video else StoredImages(root, info, key)
     wanted = {
         name: item
         for name, item in info.features.items()
@@ -61,7 +64,8 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
         strip, problem = None, ""
         odd = flags.get(place.episode_index, ())
         if key is not None and (odd or number % stride == 0):
-            strip, problem = _strip(root, info, key, place)
+            images_at = partial(stored.read, place) if stored else EpisodeVideo(root, info, key, place).images_at
+            strip, problem = _strip(root, info, key, place, images_at)
         episode = _episode(place, info.fps, columns, rows.get(place.episode_index))
         episodes.append(replace(episode, filmstrip=strip, problem=problem, flags=odd))
         advance(len(episodes), total)
@@ -139,30 +143,36 @@ def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row], _Row]:
 
 
 def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:
-    """The feature whose images are shown; None in a dataset without color videos.
+    """The feature whose images are shown; None in a dataset without color images.
 
     Raises:
         ConfigError: There is no such camera.
     """
-    keys = [key for key in info.video_keys if not info.features[key].is_depth]
+    keys = [key for key in _cameras(info) if not info.features[key].is_depth]
     if not camera:
         return keys[0] if keys else None
     for key in keys:
         if camera in (key, key.removeprefix(IMAGE_PREFIX)):
             return key
     there = ", ".join(key.removeprefix(IMAGE_PREFIX) for key in keys) or "none"
-    raise ConfigError(f"There is no camera {camera!r} with color videos, the cameras are {there}: {root}")
+    raise ConfigError(f"There is no camera {camera!r} with color images, the cameras are {there}: {root}")
 
 
-def _strip(root: Path, info: DatasetInfo, key: str, place: EpisodePlace) -> tuple[Filmstrip | None, str]:
+def _cameras(info: DatasetInfo) -> list[str]:
+    return [key for key, feature in info.features.items() if feature.is_camera]
+
+
+def _strip(
+    root: Path,
+    info: DatasetInfo,
+    key: str,
+    place: EpisodePlace,
+    images_at: Callable[[Sequence[int]], Iterable[NDArray[np.uint8]]],
+) -> tuple[Filmstrip | None, str]:
     """The filmstrip, or why there is none."""
     try:
-        strip = filmstrip(
-            key.removeprefix(IMAGE_PREFIX),
-            place.length,
-            EpisodeVideo(root, info, key, place).images_at,
-            max_bytes=strip_budget(info.total_episodes),
-        )
+        name, max_bytes = key.removeprefix(IMAGE_PREFIX), strip_budget(info.total_episodes)
+        strip = filmstrip(name, place.length, images_at, max_bytes=max_bytes)
     except ExportError as error:
         return None, without_path(error, root)
     return strip, ""
@@ -232,10 +242,8 @@ def _missing(info: DatasetInfo, *, has_sidecar: bool) -> Iterator[str]:
         )
         if _SUCCESS not in info.features:
             yield f"No column {_SUCCESS} states which episodes succeeded."
-    if any(item.dtype == "image" for item in info.features.values()):
-        yield "Its images lie as single files in the data tables, which are not shown."
-    elif all(info.features[key].is_depth for key in info.video_keys):
-        yield "It has no color videos, so there are no filmstrips."
+    if all(info.features[key].is_depth for key in _cameras(info)):
+        yield "It has no color images, so there are no filmstrips."
     for feature in (STATE, ACTION):
         item = info.features.get(feature)
         if item is None:
@@ -256,8 +264,8 @@ def _facts(
     yield "robot", info.robot_type or "unknown"
     cameras = (
         f"{key.removeprefix(IMAGE_PREFIX)} {'x'.join(str(n) for n in info.features[key].shape[1::-1])}"
-        for key in info.video_keys
+        for key in _cameras(info)
     )
     yield "cameras", ", ".join(cameras) or "none"
     yield "tasks", str(info.total_tasks)
-    yield "format", "LeRobot v3.0"
+    yield "format", f"LeRobot {info.version}"

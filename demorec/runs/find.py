@@ -256,7 +256,7 @@ def _nothing_in(found: Found, entries: Sequence[str]) -> str:
     if found.left:
         return f"{reason}; {found.left}"
     path = found.path
-    below = sorted(name for name in entries if _is_there(path / name / RUN_NAME) or _is_there(path / name / EPISODES))
-    if below:
-        return f"{reason}; it holds runs, name one ({shown(below)})"
+    for what, marks in (("runs", (RUN_NAME, EPISODES)), ("datasets", (INFO_PATH,))):
+        if below := sorted(name for name in entries if any(_is_there(path / name / mark) for mark in marks)):
+            return f"{reason}; it holds {what}, name one ({shown(below)})"
     return reason

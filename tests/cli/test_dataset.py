@@ -36,10 +36,115 @@ def test_a_run_stands_for_its_dataset(tmp_path: Path, capsys: pytest.CaptureFixt
     assert exit_code("dataset", "score", run, "--no-images", "--workers", "1", "--json") == 0
     assert len(json.loads(capsys.readouterr().out)["episodes"]) == 3
     assert exit_code("dataset", "select", run, "--episodes", "1", "--out", tmp_path / "one") == 0
-    assert "1 episode, 8 frames" in capsys.readouterr().out
+    assert "1 of 3 episodes, 8 of 24 frames" in capsys.readouterr().out
     assert exit_code("dataset", "drop", run, "--episodes", "0,", "2", "--out", tmp_path / "rest") == 0
-    assert "1 episode, 8 frames" in capsys.readouterr().out
+    assert "1 of 3 episodes, 8 of 24 frames" in capsys.readouterr().out
     assert exit_code("dataset", "drop", run, "--episodes", "2:2", "--out", tmp_path / "none") == 2
     assert "Episodes are numbers and ranges, such as 0,3,5:9, not '2:2'" in capsys.readouterr().err
     assert exit_code("dataset", "select", run / "run.json", "--episodes", "1", "--out", tmp_path / "two") == 2
     assert "The file is no recording" in capsys.readouterr().err
+
+
+@pytest.fixture
+def cups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A dataset `cups` of 5 episodes in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    return write_foreign(tmp_path / "cups", episodes=5)
+
+
+def files_of(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def test_no_part_is_written_into_the_source_and_none_where_one_is_in_the_way(
+    cups: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files_of(cups)
+    words = ("dataset", "split", "cups", "--shares", "a=0.6,b=0.4", "--out")
+    assert exit_code(*words, "cups") == 2
+    assert "Nothing else is written into a dataset" in capsys.readouterr().err
+    write_foreign(cups.parent / "parts" / "b")
+    assert exit_code(*words, "parts") == 2
+    assert "choose --overwrite or another --out" in capsys.readouterr().err
+    assert not (cups.parent / "parts" / "a").exists()
+    assert files_of(cups) == before
+    assert exit_code(*words, "parts", "--overwrite") == 0
+    printed = capsys.readouterr().out
+    assert "3 of 5 episodes, 24 of 40 frames: parts/a" in printed
+    assert "2 of 5 episodes, 16 of 40 frames: parts/b" in printed
+    assert exit_code("dataset", "score", "parts") == 2
+    assert "it holds datasets, name one (a, b): parts" in capsys.readouterr().err
+
+
+def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("dataset", "select", "cups", "--episodes", "0", "--dry-run")
+    assert exit_code(*words) == 0  # no --out
+    assert capsys.readouterr().out == "episodes 0\nWould be 1 of 5 episodes, 8 of 40 frames\n"
+    assert exit_code("dataset", "drop", "cups", "--episodes", "1", "--dry-run") == 0
+    assert capsys.readouterr().out.startswith("episodes 0,2:5\n")
+    assert exit_code(*words, "--out", "cups", "--overwrite") == 2
+    assert "This is never replaced, since this command reads it" in capsys.readouterr().err
+    assert exit_code(*words[:-1]) == 2
+    assert "--dry-run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("select", "--where", "success"), "There are: episode_index, num_frames, "),
+        (("select", "--where", "num_frames = 8"), "compare by == "),
+        (("select", "--where", 'task == "push it" or "pull it"'), "'pull it' alone is none"),
+        (("select", "--where", "episode_index in 1, 2"), "alone is none"),
+        (("select", "more", "--episodes", "1"), "what is 'more'?"),
+        (("trim", "--head", "5", "--tail", "3"), "drop them first: 0,1,2,3,4"),
+        (("trim", "--idle", "--idle-feature", "state"), "Allowed: observation.state, action."),
+        (("split",), "--shares train=0.8 val=0.2."),
+        (("split", "--shares", "a=0.8", "b=0.3"), "whose sum is 1, not 1.1"),
+        (("split", "--shares", "a=nan", "b=0.3"), "whose sum is 1, not nan"),
+        (("rename", "actoin=act"), "Did you mean 'action'?"),
+        (("drop-features",), "Name the features to leave out"),
+        (("set-task",), "--task 'pick up the cup'"),
+        (("set-task", "--task", "pull it", "--where", "num_frames > 8"), "No episode is chosen"),
+    ],
+)
+def test_a_mistake_is_named_with_what_to_do(
+    cups: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
+) -> None:
+    assert exit_code("dataset", words[0], "cups", *words[1:], "--out", "new") == 2
+    assert told in capsys.readouterr().err
+    assert not (cups.parent / "new").exists()
+
+
+def test_what_is_chosen_is_counted(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--task", "pull it", "--where", "episode_index in (1, 2)", "--out", "new")
+    assert exit_code("dataset", "set-task", "cups", *words) == 0
+    assert capsys.readouterr().out.splitlines()[0] == "New instruction: 2 of 5 episodes"
+
+
+def test_a_merge_prints_a_mapping_that_can_be_saved(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("dataset", "rename", "cups", "action=act", "--out", "häuser 2") == 0
+    capsys.readouterr()
+    assert exit_code("dataset", "merge", "cups", "häuser 2", "--out", "both") == 2
+    printed = capsys.readouterr()
+    assert "häuser 2 has no action" in printed.err
+    merged = ("dataset", "merge", "cups", "häuser 2", "--mapping", "m.toml", "--out", "both")
+    Path("m.toml").write_text(printed.out)
+    assert exit_code(*merged) == 0
+    assert "action" not in json.loads(Path("both/meta/info.json").read_text())["features"]
+    chosen = printed.out.replace('drop = ["action"]\n', "").replace('drop = ["act"]\n', "").replace("# [", "[")
+    Path("m.toml").write_text(chosen.replace("# from", "from"))
+    assert exit_code(*merged, "--overwrite") == 0
+    assert "action" in json.loads(Path("both/meta/info.json").read_text())["features"]
+
+
+def test_the_home_folder_within_quotes(
+    cups: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("HOME", str(cups.parent))
+    assert exit_code("dataset", "select", "~/cups", "--episodes", "0", "--out=~/new") == 0
+    assert (cups.parent / "new/meta/info.json").is_file()
+    assert exit_code("dataset", "score", "cups", "--no-images", "--workers", "1", "--out", "~/scores.json") == 0
+    assert f"Scores of 5 episodes: {cups.parent}/scores.json" in capsys.readouterr().err
+    assert not Path("~").exists()
+    assert exit_code("dataset", "score", "cups", "--no-images", "--workers", "1", "--out", "x" * 250) == 1
+    assert "The scores cannot be written (File name too long)" in capsys.readouterr().err

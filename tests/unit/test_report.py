@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from support.commands import exit_code
 from support.export import export, make_run, recode
+from support.foreign_dataset import DATA, write_foreign
 from support.mcap import rewritten
 from support.recording import frame_number, write_episode
 
@@ -175,18 +176,39 @@ def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path)
     plain = json.loads(file.read_text())
     for name in ("next.success", "action"):
         del plain["features"][name]
-    plain["features"]["observation.images.front"]["dtype"] = "image"
-    del plain["features"]["observation.images.wrist"]
+    for name in ("front", "wrist"):
+        del plain["features"][f"observation.images.{name}"]
     file.write_text(json.dumps(plain))
     found = report_on(other)
     for words in (
         "No column next.success states which episodes succeeded.",
-        "Its images lie as single files in the data tables",
+        "It has no color images, so there are no filmstrips.",
         "It has no column action",
     ):
         assert words in found.words
     assert list(found.all("img")) == []
     assert all("outcome unknown" in words for words in found.articles)
+
+
+def test_images_in_rows_are_shown(tmp_path: Path) -> None:
+    """Frame t of episode e is as bright as 10 + 20 t + 40 e."""
+    root = write_foreign(tmp_path / "rows")
+    table = pq.read_table(root / DATA)
+    files = [io.BytesIO() for _ in range(16)]
+    for row, file in enumerate(files):
+        Image.new("RGB", (64, 48), (10 + 20 * (row % 8) + 40 * (row // 8),) * 3).save(file, "PNG")
+    place = table.schema.get_field_index("observation.images.top")
+    images = pa.array([{"bytes": file.getvalue(), "path": None} for file in files], table.schema.field(place).type)
+    pq.write_table(table.set_column(place, "observation.images.top", images), root / DATA)
+    found = report_on(root)
+    assert "top 64x48" in found.words
+    strips = [
+        Image.open(io.BytesIO(base64.b64decode((image["src"] or "").partition(",")[2]))) for image in found.all("img")
+    ]
+    assert len(strips) == 2
+    for episode, strip in enumerate(strips):
+        parts = np.asarray(strip.convert("L")).reshape(strip.height, 8, -1)[:, :, 16:-16].mean(axis=(0, 2))
+        assert parts == pytest.approx(10 + 20 * np.arange(8) + 40 * episode, abs=3)
 
 
 def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import codecs
 import dataclasses
 import inspect
 import io
+import re
 import shutil
 import sys
 import textwrap
@@ -40,6 +41,7 @@ FLAG_TYPES = ConstructorRegistry()
 OTHERS = "others"
 """Field of a command that takes the words that are not its own, for another program."""
 
+_HOME = re.compile(r"^(--[\w-]+=|)~(?=/|$)")
 _NARROWEST = 40
 """Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
 _HINTED = object()
@@ -64,6 +66,8 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     """
     defaults = command.defaults(args) if hasattr(command, "defaults") else MISSING_NONPROP
     takes_others = OTHERS in command.__dataclass_fields__
+    if not takes_others:  # ~ within quotes and in --out=~/new, which bash leaves as it is
+        args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
     # Python would take an empty path for the current folder.
     if not takes_others and any(not word and not before.startswith("--") for before, word in pairwise(["", *args])):
         tell(f"{prog}: one of the paths is empty (an unset variable of the shell?); the current folder is written as .")

@@ -104,7 +104,7 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
               *episode_statistics_differences(sources, shared, found, pairs)]  # fmt: skip
     found.sort(key=lambda item: LEVELS.index(item.level))
     return DatasetDiff(pairs=pairs, num_episodes=result.num_episodes, num_same=result.num_same,
-                       differences=tuple(found), notes=tuple(_notes(sources, result)))  # fmt: skip
+                       differences=tuple(found), notes=tuple(_notes(sources, result, found)))  # fmt: skip
 
 
 def _contents(
@@ -270,12 +270,15 @@ def _seen_at(seen: SeenByCamera | None, frame: int) -> list[Any]:
     return [] if seen is None else [(noun, values) for row, noun, values in seen[2] if row == frame]
 
 
-def _notes(sources: tuple[Source, Source], result: DatasetDiff) -> Iterator[str]:
+def _notes(sources: tuple[Source, Source], result: DatasetDiff, found: Sequence[Difference]) -> Iterator[str]:
     a, b = (source.info for source in sources)
     if result.is_reordered:
         moved = [f"{n} is {m}" for n, m in result.pairs.items() if n != m]
         more = f" and {len(moved) - 8} more" if len(moved) > 8 else ""
         yield f"The same episodes in another order, A to B: {', '.join(moved[:8])}{more}."
+    keys = {key for item in found if item.level == "statistics" for key in item.details.get("of", ("all",))}
+    if keys and all(key.startswith("q") for key in keys):
+        yield "Only quantiles differ in the statistics: LeRobot estimates them, demorec takes them from the rows."
     tasks = [source.tasks for source in sources]
     if tasks[0] != tasks[1] and set(tasks[0]) == set(tasks[1]):
         yield "The same tasks under other numbers."

@@ -37,11 +37,28 @@ _KEYS = ("path", "robot_type", "drop", "feature")
 _FEATURE_KEYS = ("from", "elements", "fill", "unit", "low", "high")
 
 
+class DatasetsDifferError(ConfigError):
+    """Datasets that cannot be joined as they are.
+
+    Args:
+        sentence: All differences.
+        mapping: Lines of a mapping under which those of one rate fit, as far as any does.
+    """
+
+    def __init__(self, sentence: str, mapping: Sequence[str]) -> None:
+        super().__init__(sentence, mapping)
+        self.mapping = mapping
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 def merge(sources: Sequence[Source], mapping: Path | None = None) -> Plan:
     """All episodes of all datasets, one after the other.
 
     Raises:
-        ConfigError: They differ; all differences in one message, with a mapping that would solve what one can.
+        DatasetsDifferError: They differ; with all differences, and a mapping that would solve what one can.
+        ConfigError: The mapping cannot be used.
     """
     if len(sources) < 2:
         raise ConfigError("Name two or more datasets to merge.")
@@ -52,11 +69,7 @@ def merge(sources: Sequence[Source], mapping: Path | None = None) -> Plan:
         plans.append(_mapped(Plan.whole(source), entry, plans[0] if plans else None, mapping))
     wrong = [text for plan in plans[1:] for text in _differences(plans[0], plan)]
     if wrong:
-        suggestion = "\n".join(_suggested(plans))
-        raise ConfigError(
-            f"These datasets differ: {'; '.join(wrong)}. What a mapping can solve, --mapping FILE with this in it does"
-            f" (look at every line):\n{suggestion}"
-        )
+        raise DatasetsDifferError(f"These datasets differ: {'; '.join(wrong)}.", list(_suggested(plans)))
     takes = [{name: plan.takes[0][name] for name in plans[0].takes[0]} for plan in plans]
     return joined([replace(plan, takes=(take,)) for plan, take in zip(plans, takes, strict=True)])
 
@@ -161,7 +174,10 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
 
 
 def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
-    """Lines of a mapping under which the datasets would fit, as far as any does."""
+    plans = [plan for plan in plans if plan.info.fps == plans[0].info.fps]
+    if len(plans) < 2:
+        return
+    robots = [plan.info.robot_type for plan in plans if plan.info.robot_type]
     numeric = [{n: f for n, f in plan.info.features.items() if _is_vector(f)} for plan in plans]
     common = {
         name
@@ -174,20 +190,35 @@ def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
         )
     }
     for number, plan in enumerate(plans):
-        yield from ("[[dataset]]", f"path = {json.dumps(str(plan.sources[0].root))}")
-        if plan.info.robot_type != plans[0].info.robot_type:
-            yield f"robot_type = {json.dumps(plans[0].info.robot_type)}"
+        yield from ("[[dataset]]", f"path = {_quoted(str(plan.sources[0].root))}")
+        if robots and plan.info.robot_type != robots[0]:
+            yield f"robot_type = {_quoted(robots[0])}"
         if dropped := [name for name in plan.info.features if name not in common]:
-            yield f"drop = {json.dumps(dropped)}"
+            yield f"drop = {_quoted(dropped)}"
+        yield from _other_names(plans[0], plan)
         for name in common & set(numeric[number]) if number else ():
             mine, first = plan.info.features[name], plans[0].info.features[name]
             if (mine.shape, mine.names) != (first.shape, first.names):
                 own = mine.names or tuple(map(str, range(mine.shape[0])))
                 wanted = first.names or tuple(map(str, range(first.shape[0])))
                 elements = [text if text in own else "" for text in wanted]
-                yield from (f"[dataset.feature.{json.dumps(name)}]", f"elements = {json.dumps(elements)}")
+                yield from (f"[dataset.feature.{_quoted(name)}]", f"elements = {_quoted(elements)}")
                 yield from ["fill = 0.0"] if "" in elements else []
         yield ""
+
+
+def _other_names(first: Plan, plan: Plan) -> Iterator[str]:
+    """Comments: which features may be one under two names, which nobody but the user knows."""
+    there, here = first.info.features, plan.info.features
+    for name in [name for name in there if name not in here]:
+        for own in [own for own in here if own not in there and _fits(here[own], there[name])]:
+            yield f"# If {_quoted(own)} is what the first one calls {_quoted(name)}, drop neither, and add:"
+            yield from (f"# [dataset.feature.{_quoted(name)}]", f"# from = {_quoted(own)}")
+
+
+def _quoted(value: object) -> str:
+    """As TOML has it, which knows no surrogates."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _is_vector(*features: DatasetFeature) -> bool:

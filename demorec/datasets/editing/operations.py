@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from demorec.core.errors import ConfigError
-from demorec.core.registry import nearest_match
+from demorec.core.registry import check_choice, nearest_match
 from demorec.datasets.editing.plan import Plan, Source, Take
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
@@ -19,6 +19,7 @@ from demorec.datasets.lerobot.reader import RowStream
 
 _SHARE_TOLERANCE = 1e-6
 _MAX = 2000
+_MOST_LISTED = 30
 _CONSTANTS = {"true": True, "false": False, "none": None, "null": None}
 _COMPARED: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
     ast.Eq: operator.eq,
@@ -49,6 +50,11 @@ def _names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
+def _no_column(name: str, names: Sequence[str]) -> ConfigError:
+    listed = ", ".join(names[:_MOST_LISTED]) + (", ..." if len(names) > _MOST_LISTED else "")
+    return ConfigError(f"There is no column {name!r}.{nearest_match(name, names)} There are: {listed}.")
+
+
 def select(source: Source, numbers: Sequence[int], *, drop: bool = False) -> Plan:
     """Those episodes, in the dataset's order, or all others."""
     plan = Plan.whole(source)
@@ -67,7 +73,7 @@ def reorder(source: Source, by: str = "", order: Sequence[int] = (), *, descendi
         return plan.with_cuts([plan.cuts[number] for number in order])
     rows = source.columns()
     if by not in (names := _names(rows)):
-        raise ConfigError(f"There is no column {by!r}.{nearest_match(by, names)}")
+        raise _no_column(by, names)
     known = [number for number, row in enumerate(rows) if row.get(by) is not None]
     try:
         known.sort(key=lambda number: rows[number][by], reverse=descending)
@@ -89,8 +95,9 @@ def trim(source: Source, head: int, tail: int) -> Plan:
     if min(head, tail) < 0:
         raise ConfigError("A number of frames is cut off, at least 0.")
     plan = Plan.whole(source)
-    if short := [cut.episode for cut in plan.cuts if cut.last <= head + tail]:
-        raise ConfigError(f"Nothing would be left of {len(short)} episodes, {short[0]} among them: drop them first.")
+    if short := [str(cut.episode) for cut in plan.cuts if cut.last <= head + tail]:
+        listed = ",".join(short[:_MOST_LISTED]) + (",..." if len(short) > _MOST_LISTED else "")
+        raise ConfigError(f"Nothing would be left of these episodes, drop them first: {listed}")
     return plan.with_cuts([replace(cut, first=head, last=cut.last - tail) for cut in plan.cuts])
 
 
@@ -103,9 +110,8 @@ def trim_idle(source: Source, feature: str, threshold: float, margin: int) -> Pl
         threshold: Nothing moves where no number changes by more than this share of its range over the dataset.
         margin: Frames that stay at either end.
     """
-    if feature not in source.info.features or not source.info.features[feature].is_numeric:
-        numeric = [name for name, item in source.info.features.items() if item.is_numeric]
-        raise ConfigError(f"There are no numbers called {feature!r}.{nearest_match(feature, numeric)}")
+    numeric = [name for name in _own(source) if source.info.features[name].is_numeric]
+    check_choice("feature of numbers", feature, numeric)
     if not threshold > 0 or margin < 0:
         raise ConfigError("The threshold is a share above 0, the margin a number of frames of at least 0.")
     plan = Plan.whole(source)
@@ -139,11 +145,14 @@ def split(source: Source, shares: Mapping[str, float], seed: int, *, by: str = "
 
     Episodes stay in the dataset's order. Raises ConfigError for impossible shares.
     """
-    if len(shares) < 2 or min(shares.values()) <= 0 or abs(sum(shares.values()) - 1) > _SHARE_TOLERANCE:
-        raise ConfigError("Shares are two or more numbers above 0 whose sum is 1, such as train=0.8 val=0.2.")
+    total = sum(shares.values())
+    if len(shares) < 2 or not all(share > 0 for share in shares.values()) or abs(total - 1) > _SHARE_TOLERANCE:
+        raise ConfigError(
+            f"Shares are two or more numbers above 0 whose sum is 1, not {total:g}, such as train=0.8 val=0.2."
+        )
     plan, rows = Plan.whole(source), source.columns()
     if by and by not in (names := _names(rows)):
-        raise ConfigError(f"There is no column {by!r}.{nearest_match(by, names)}")
+        raise _no_column(by, names)
     groups: dict[str, list[int]] = {}
     for number, row in enumerate(rows):
         groups.setdefault(str(row.get(by)) if by else "", []).append(number)
@@ -163,7 +172,9 @@ def split(source: Source, shares: Mapping[str, float], seed: int, *, by: str = "
 def set_task(source: Source, task: str, numbers: Sequence[int]) -> Plan:
     """All episodes, some with another instruction."""
     if not task.strip() or not task.isprintable():
-        raise ConfigError("An instruction is a line of text.")
+        raise ConfigError("An instruction is a line of text, such as --task 'pick up the cup'.")
+    if not numbers:
+        raise ConfigError("No episode is chosen, so that none would get the new instruction.")
     plan = Plan.whole(source)
     wanted = set(numbers)
     return plan.with_cuts([replace(cut, task=task) if cut.episode in wanted else cut for cut in plan.cuts])
@@ -186,6 +197,8 @@ def rename(source: Source, names: Mapping[str, str]) -> Plan:
 def drop_features(source: Source, names: Sequence[str]) -> Plan:
     """All episodes without some features."""
     plan = Plan.whole(source)
+    if not names:
+        raise ConfigError("Name the features to leave out: demorec dataset drop-features DATASET NAME... --out NEW.")
     _check_features(source, names)
     features = {name: feature for name, feature in plan.info.features.items() if name not in names}
     if set(features) <= set(AUTOMATIC_FEATURES):
@@ -195,9 +208,12 @@ def drop_features(source: Source, names: Sequence[str]) -> Plan:
 
 def _check_features(source: Source, names: Mapping[str, str] | Sequence[str]) -> None:
     for name in names:
-        if name in AUTOMATIC_FEATURES or source.info.features.get(name, None) is None:
-            own = [known for known in source.info.features if known not in AUTOMATIC_FEATURES]
-            raise ConfigError(f"There is no feature {name!r} that can be changed.{nearest_match(name, own)}")
+        check_choice("feature that can be changed", name, _own(source))
+
+
+def _own(source: Source) -> list[str]:
+    """Its features but for those that each dataset has."""
+    return [name for name in source.info.features if name not in AUTOMATIC_FEATURES]
 
 
 def joined(plans: Sequence[Plan]) -> Plan:
@@ -231,8 +247,11 @@ class Condition:
                 raise SyntaxError
             self._tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            raise ConfigError(f"This is no condition, write for example success and length < 300: {text}") from error
-        self._value(self._tree, dict.fromkeys(columns), checks=True)
+            raise ConfigError(
+                "This is no condition: compare by == != < <= > >= in, join by and, or, not, and put text in quotes, "
+                f'such as num_frames < 300 and "cube" in task: {text}'
+            ) from error
+        self._truth(self._tree, dict.fromkeys(columns), checks=True)
 
     def holds(self, row: Mapping[str, Any]) -> bool:
         """Whether it is true of these values; a comparison with a value that is not known is false."""
@@ -247,9 +266,9 @@ class Condition:
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
                 return -value
             case ast.UnaryOp(op=ast.Not(), operand=part):
-                return not self._value(part, row, checks=checks)
+                return not self._truth(part, row, checks=checks)
             case ast.BoolOp(op=joined, values=parts):
-                values = [self._value(part, row, checks=checks) for part in parts]
+                values = [self._truth(part, row, checks=checks) for part in parts]
                 return all(values) if isinstance(joined, ast.And) else any(values)
             case ast.Compare(left=left, ops=kinds, comparators=rights):
                 values = [self._value(part, row, checks=checks) for part in (left, *rights)]
@@ -257,6 +276,13 @@ class Condition:
                 return True if checks and self._known(kinds) else all(self._compare(*pair) for pair in pairs)
             case _:
                 return self._column(node, row)
+
+    def _truth(self, node: ast.expr, row: Mapping[str, Any], *, checks: bool) -> bool:
+        """Of what and, or, not join: not of a value alone, as "b" in `task == "a" or "b"`, which would always hold."""
+        value = self._value(node, row, checks=checks)
+        if isinstance(node, ast.Constant | ast.Tuple | ast.List) and not isinstance(value, bool):
+            raise ConfigError(f"A condition joins comparisons, and {ast.unparse(node)} alone is none: {self._text}")
+        return bool(value)
 
     def _known(self, kinds: Sequence[ast.cmpop]) -> bool:
         if not all(type(kind) in _COMPARED for kind in kinds):
@@ -284,7 +310,7 @@ class Condition:
             return _CONSTANTS[name]
         if name in self._columns:
             return None
-        raise ConfigError(f"There is no column {name!r}.{nearest_match(name, self._columns)} Condition: {self._text}")
+        raise _no_column(name, self._columns)
 
 
 def names_in(text: str) -> set[str]:

@@ -68,9 +68,8 @@ def statistics_differences(
         a, b = (entry if isinstance(entry, dict) else {} for entry in entries)
         wrong = [key for key in dict.fromkeys((*a, *b)) if not _is_close(a, b, key)]
         if wrong:
-            shown = f"{_numbers(a, wrong[0])} and {_numbers(b, wrong[0])}"
             yield Difference(level="statistics", name=name, details={"of": wrong},
-                             text=f"{name} differs in {', '.join(wrong)}: {shown}")  # fmt: skip
+                             text=f"{name} differs in {', '.join(wrong)}: {_worst(a, b, wrong[0])}")  # fmt: skip
 
 
 def episode_statistics_differences(
@@ -98,10 +97,11 @@ def episode_statistics_differences(
         ]
         if wrong:
             n, m, keys = wrong[0]
-            shown = f"{_numbers(tables[0][n], keys[0])} and {_numbers(tables[1][m], keys[0])}"
+            shown = _worst(tables[0][n], tables[1][m], keys[0])
             text = f"{name} of {len(wrong)} of {len(pairs)} episodes, in episode {n} {', '.join(keys)}: {shown}"
+            of = [key for key in NAMES if any(key in keys for _, _, keys in wrong)]
             yield Difference(level="statistics", name=name, text=text,
-                             details={"episodes": [[n, m] for n, m, _ in wrong]})  # fmt: skip
+                             details={"of": of, "episodes": [[n, m] for n, m, _ in wrong]})  # fmt: skip
 
 
 def _of_episodes(source: Source, name: str) -> list[dict[str, Any]]:
@@ -141,8 +141,12 @@ def _is_close(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:
         return False
 
 
-def _numbers(entry: Mapping[str, Any], key: str) -> str:
-    if key not in entry:
-        return "nothing"
-    text = str(np.asarray(entry[key]).ravel().tolist())
-    return text if len(text) <= 80 else f"{text[:80]}..."
+def _worst(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> str:
+    """A number in words, of the element that differs most."""
+    try:
+        x, y = (np.asarray(entry[key], dtype=np.float64).ravel() for entry in (a, b))
+        place = int(np.nan_to_num(np.abs(x - y), nan=np.inf).argmax())
+        return f"{key}{f'[{place}]' if x.size > 1 else ''} is {x[place]:.7g}, in B {y[place]:.7g}"
+    except (KeyError, ValueError, TypeError, IndexError):
+        shown = ["not there" if key not in entry else str(entry[key])[:80] for entry in (a, b)]
+        return f"{key} is {shown[0]}, in B {shown[1]}"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.core.errors import ExportError
+from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import Beside
 from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
 from demorec.datasets.editing.packets import PacketCutter, VideoFiles
@@ -34,6 +35,7 @@ from demorec.datasets.staging import staged_folder
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
 
+_RESULT = replace(DATASET, advice="choose --overwrite or another --out")
 _OLD_STATS = "meta/episodes_stats.jsonl"
 _NUMBERS = tuple(name for name in NAMES if name != "count")
 _EPISODES_AT_ONCE = 64
@@ -58,6 +60,11 @@ class EditReport:
     around: int
 
 
+def check_target(out: Path, roots: Sequence[Path], *, overwrite: bool) -> None:
+    """Raise ConfigError where `write_plan` would: something is in the way at `out`, or it is one of the sources."""
+    check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=roots)
+
+
 def write_plan(
     plan: Plan, out: Path, *, overwrite: bool = False, decode: bool = False, progress: ProgressCallback | None = None
 ) -> EditReport:
@@ -75,7 +82,7 @@ def write_plan(
         ExportError: A source is damaged, or the disk is full; what was at `out` is still there then.
     """
     roots = [source.root for source in plan.sources]
-    with staged_folder(out, DATASET, replace=overwrite, sources=roots) as folder:
+    with staged_folder(out, _RESULT, replace=overwrite, sources=roots) as folder:
         videos = VideoFiles()
         readers = [_Reader(plan, number, videos, decode=decode) for number in range(len(plan.sources))]
         with (
