@@ -234,13 +234,24 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
         return
     free = dynamics.is_judged.copy()
     free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
-    of_wrench, of_motors = _peaks_of_wrench(episode, hand, dynamics), np.zeros(len(free))
-    for index, torque in _of_loaded(episode, dynamics):
-        peaks = _unexplained(episode.columns.joint_effort[:, index, None], torque[:, None])
-        of_motors = np.maximum(of_motors, peaks / np.sqrt((torque[dynamics.is_judged] ** 2).mean()))
-    # What accelerates the arm otherwise than the servo, as an impact does, shows in both.
-    yield worst_frame(np.where(free, np.maximum(of_wrench - of_motors, 0.0), 0.0), "wrench")
-    yield worst_frame(np.where(free, np.maximum(of_motors - of_wrench, 0.0), 0.0), "efforts")
+    of_wrench, (of_motors, of_all) = _peaks_of_wrench(episode, hand, dynamics), _peaks_of_motors(episode, dynamics)
+    # What accelerates the arm otherwise than the servo, as an impact does, shows in both: in the wrench less, if the
+    # links are accelerated more than the hand, and in motors that bear no weight, if it goes sideways.
+    yield worst_frame(np.where(free, np.maximum(of_wrench - of_all, 0.0), 0.0), "wrench")
+    yield worst_frame(np.where(free, np.maximum(of_motors - 2 * of_wrench, 0.0), 0.0), "efforts")
+
+
+def _peaks_of_motors(episode: CheckedEpisode, dynamics: Dynamics) -> tuple[Array, Array]:
+    """(T,) of the motors that bear weight, in units of what each bears; of all, in units of the most that one bears."""
+    known = {joint.name: joint for joint in episode.urdf.joints}
+    loaded = [index for index, _ in _of_loaded(episode, dynamics)]
+    peaks, borne = [], []
+    for index, name in enumerate(episode.info.robot.arm_joints):
+        torque = dynamics.torque(known[name])
+        peaks.append(_unexplained(episode.columns.joint_effort[:, index, None], torque[:, None]))
+        borne.append(float(np.sqrt((torque[dynamics.is_judged] ** 2).mean())))
+    of_loaded = np.max([np.zeros(len(peaks[0])), *(peaks[index] / borne[index] for index in loaded)], axis=0)
+    return of_loaded, np.maximum(of_loaded, np.max(peaks, axis=0) / max(*borne, 1e-12))
 
 
 def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, dynamics: Dynamics) -> Array:
