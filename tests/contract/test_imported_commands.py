@@ -25,7 +25,7 @@ ROWS: dict[str, tuple[int, str]] = {
     "replay RECORDING": (1, EXTERNAL),
     "replay DATASET": (2, EXTERNAL),
     "render RECORDING --out NEW": (1, EXTERNAL),
-    "dataset select DATASET --episodes 0 --out NEW": (0, "1 episode, 24 frames"),
+    "dataset select DATASET --episodes 0 --out NEW": (0, "1 of 1 episode, 24 of 24 frames"),
     "export lerobot RUN --out NEW": (0, "1 episode, 24 frames"),
     "export hdf5 RUN --out NEW.hdf5": (0, "1 episode, 24 frames"),
     "evaluate --policy RUN": (2, "No policy"),
