@@ -93,8 +93,6 @@ def pretrain(
 ) -> PretrainResult:
     """Teach the encoder that the ACT policy of a training will have, and save the policy; go on with what was begun.
 
-    At last what tells the targets is trained further, alone, with keypoints that no longer change.
-
     Args:
         config: TrainPipelineConfig of LeRobot, of which the dataset and the policy count.
         plan: How.
