@@ -207,11 +207,19 @@ def effort_in_each_frame(episode: CheckedEpisode) -> Found:
 
 def _of_loaded(episode: CheckedEpisode, dynamics: Dynamics) -> Iterator[tuple[int, Array]]:
     """Number of each joint that bears weight, and the torque (T,) that it needs, N m."""
+    for index, torque in _of_joints(episode, dynamics):
+        if _is_loaded(torque, dynamics):
+            yield index, torque
+
+
+def _of_joints(episode: CheckedEpisode, dynamics: Dynamics) -> Iterator[tuple[int, Array]]:
     known = {joint.name: joint for joint in episode.urdf.joints}
     for index, name in enumerate(episode.info.robot.arm_joints):
-        torque = dynamics.torque(known[name])
-        if np.median(np.abs(torque[dynamics.is_judged])) >= MIN_LOAD:
-            yield index, torque
+        yield index, dynamics.torque(known[name])
+
+
+def _is_loaded(torque: Array, dynamics: Dynamics) -> bool:
+    return bool(np.median(np.abs(torque[dynamics.is_judged])) >= MIN_LOAD)
 
 
 @physics_check(
@@ -243,15 +251,15 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
 
 def _peaks_of_motors(episode: CheckedEpisode, dynamics: Dynamics) -> tuple[Array, Array]:
     """(T,) of the motors that bear weight, in units of what each bears; of all, in units of the most that one bears."""
-    known = {joint.name: joint for joint in episode.urdf.joints}
-    loaded = [index for index, _ in _of_loaded(episode, dynamics)]
-    peaks, borne = [], []
-    for index, name in enumerate(episode.info.robot.arm_joints):
-        torque = dynamics.torque(known[name])
-        peaks.append(_unexplained(episode.columns.joint_effort[:, index, None], torque[:, None]))
-        borne.append(float(np.sqrt((torque[dynamics.is_judged] ** 2).mean())))
-    of_loaded = np.max([np.zeros(len(peaks[0])), *(peaks[index] / borne[index] for index in loaded)], axis=0)
-    return of_loaded, np.maximum(of_loaded, np.max(peaks, axis=0) / max(*borne, 1e-12))
+    of_loaded: Array = np.zeros(len(dynamics.is_judged))
+    of_all, most = of_loaded, 1e-12
+    for index, torque in _of_joints(episode, dynamics):
+        peaks = _unexplained(episode.columns.joint_effort[:, index, None], torque[:, None])
+        borne = float(np.sqrt((torque[dynamics.is_judged] ** 2).mean()))
+        of_all, most = np.maximum(of_all, peaks), max(most, borne)
+        if _is_loaded(torque, dynamics):
+            of_loaded = np.maximum(of_loaded, peaks / borne)
+    return of_loaded, np.maximum(of_loaded, of_all / most)
 
 
 def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, dynamics: Dynamics) -> Array:

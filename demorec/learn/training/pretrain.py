@@ -212,7 +212,7 @@ class _EncoderTraining:
         network.eval()
         with torch.no_grad():
             parts = [self._encoded(part) for part in np.array_split(rows, math.ceil(len(rows) / plan.batch_size))]
-        keypoints, state = (torch.cat(part) for part in zip(*parts, strict=True))
+        keypoints, state, _ = (torch.cat(part) for part in zip(*parts, strict=True))
         telling = (network.linear_targets, network.targets)
         optimizer = torch.optim.AdamW(
             [weight for part in telling for weight in part.parameters()],
@@ -231,7 +231,8 @@ class _EncoderTraining:
         outputs = []
         with torch.no_grad():
             for start in range(0, len(rows), self._plan.batch_size):
-                outputs.append(self._predict(rows[start : start + self._plan.batch_size]).cpu().numpy())
+                _, _, told = self._encoded(rows[start : start + self._plan.batch_size])
+                outputs.append(told.cpu().numpy())
         spread = np.where(np.isinf(self._spread), 0, self._spread)
         true, mean = self._targets.values[rows], np.broadcast_to(self._mean, (len(rows), len(self._mean)))
         predicted = np.concatenate(outputs) * spread + mean
@@ -256,7 +257,8 @@ class _EncoderTraining:
         plan = self._plan
         # Which frames are seen follows from the seed and the update alone, so that a stopped call goes on as if not.
         rows = np.random.default_rng([plan.seed, self._done]).choice(self._training, plan.batch_size)
-        return self._learn(self._optimizer, self._done / plan.updates, self._predict(rows), rows)
+        _, _, predicted = self._encoded(rows)
+        return self._learn(self._optimizer, self._done / plan.updates, predicted, rows)
 
     def _learn(self, optimizer: torch.optim.Optimizer, passed: float, predicted: torch.Tensor, rows: Rows) -> float:
         """One update, after a share of all of them, by what was predicted for some rows; its loss."""
@@ -275,18 +277,12 @@ class _EncoderTraining:
         optimizer.step()
         return float(loss.item())
 
-    def _encoded(self, rows: Rows) -> tuple[torch.Tensor, torch.Tensor]:
-        """Keypoints and state."""
+    def _encoded(self, rows: Rows) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Keypoints, state, and the normalised targets (B, K) that the encoder predicts now."""
         batch = self._before(default_collate(self._dataset.__getitems__(rows.tolist())))
         images = [batch[key] for key in self._policy.config.image_features]
-        keypoints, _ = self._network(images, batch[_STATE], batch["task"])
-        return keypoints, batch[_STATE]
-
-    def _predict(self, rows: Rows) -> torch.Tensor:
-        """(B, K) normalised targets, as the encoder predicts them now."""
-        keypoints, state = self._encoded(rows)
-        predicted: torch.Tensor = self._network.targets_of(keypoints, state)
-        return predicted
+        keypoints, predicted = self._network(images, batch[_STATE], batch["task"])
+        return keypoints, batch[_STATE], predicted
 
     def _store(self, path: Path) -> None:
         state = {
