@@ -19,7 +19,7 @@ from demorec.check.dataset_video import EpisodeImages, episode_images
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, draw, frames_to_draw
 from demorec.check.dynamics import Dynamics
 from demorec.check.episode_drawn import drawable_scene
-from demorec.check.evidence import Motion, motions_of_dataset
+from demorec.check.evidence import Motion, Named, motions_of_dataset, quaternions
 from demorec.check.films import Film, Films, likeness_of_films
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices
@@ -151,6 +151,12 @@ class Dataset:
             return dict.fromkeys(range(len(self.places)), robot_of_motors(self.motors))
         return {number: self.robots[name] for number, name in self.robot_digests.items() if name is not None}
 
+    def quaternions(self) -> Iterator[Named]:
+        """All rotations, by the names of their elements."""
+        known = {name: feature.names for name, feature in self.info.features.items() if feature.is_numeric}
+        for number, rows in enumerate(self.rows):
+            yield from ((f"{name}, episode {number}", table) for name, table in quaternions(rows, known))
+
     def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
         """The torques that a motion needs."""
         return point_masses(motion)
@@ -216,6 +222,13 @@ class Dataset:
             "deliberate_miss_frames", "episode_info",
         ]  # fmt: skip
         return read_rows(self.path / SIDECAR_DIR, names, schema=EPISODE_SCHEMA)
+
+    @cached_property
+    def details(self) -> dict[int, dict[str, Any]]:
+        """Episode -> whatever else the sidecar's rows have; those of older versions have less."""
+        paths = sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+        known = [n for n in EPISODE_SCHEMA.names if all(n in open_table(path).schema_arrow.names for path in paths)]
+        return {row["episode_index"]: row for row in read_rows(self.path / SIDECAR_DIR, known)}
 
     @cached_property
     def robot_digests(self) -> dict[int, str | None]:

@@ -8,20 +8,16 @@ from typing import Any
 import numpy as np
 
 from demorec.check.base import Measurement, sidecar_check
-from demorec.check.dataset import Dataset, DescribedEpisode, read_rows
+from demorec.check.dataset import Dataset, DescribedEpisode
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import open_table, read_json, read_table
+from demorec.datasets.lerobot.files import read_json, read_table
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.episode.features import STATE
 from demorec.episode.scene import SceneCamera
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 
-_COLUMNS = (
-    "task", "root_seed", "attempt", "run_episode_index", "config_digest", "behaviour", "objects", "goals", "cameras",
-    "phases", "checks", "success", "failure_phase",
-)  # fmt: skip
 _STARTS = 0.06
 """Metres by which an object may have moved before the first frame: in 0.1 s, while physics settles, it falls 5.5 cm."""
 _POSE = 1e-3
@@ -35,9 +31,6 @@ def dataset_details(dataset: Dataset) -> Measurement | None:
     """Task, seed, behaviour, cameras, goals, objects, phases, conditions; the poses of cameras that move."""
     if not (described := dataset.described()):
         return None
-    paths = sorted((dataset.path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-    known = [name for name in _COLUMNS if all(name in open_table(path).schema_arrow.names for path in paths)]
-    details = {row["episode_index"]: row for row in read_rows(dataset.path / SIDECAR_DIR, ["episode_index", *known])}
     config_path = dataset.path / SIDECAR_DIR / "configs.json"
     configs = read_json(config_path) if config_path.exists() else {}
     poses = dict(_camera_poses(dataset))
@@ -45,7 +38,7 @@ def dataset_details(dataset: Dataset) -> Measurement | None:
         f"episode {each.number}: {words}"
         for each in described
         for words in (
-            *_contradictions(each, details[each.number], configs),
+            *_contradictions(each, dataset.details[each.number], configs),
             *_wrong_poses(dataset, each, poses),
         )
     ]

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from demorec.check.base import Measurement, dataset_check, sidecar_check
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import Dataset, DescribedEpisode
 from demorec.core.errors import ExportError, without_path
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, STAGE_COLUMNS, facts_of, progress_table, read_progress
+from demorec.datasets.lerobot.facts import (
+    PROGRESS_PATH,
+    STAGE_COLUMNS,
+    facts_after,
+    facts_before,
+    facts_of,
+    first_goal,
+    progress_table,
+    read_progress,
+)
 from demorec.datasets.lerobot.files import open_table, read_table
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import read_robot
+from demorec.episode.episode import SuccessCheck
+
+
+_KEPT = ("success", "failure_phase", "failure_reason", "num_retries")
+_ATTEMPT = ("source", "run_episode_index", "attempt", "success", "failure_reason")
+_START = ("object", "object_x", "object_y", "goal_x", "goal_y")
 
 
 @sidecar_check(
@@ -50,31 +68,51 @@ def dataset_robots(dataset: Dataset) -> Measurement | None:
     measures="columns of the table of episodes that the sidecar contradicts",
 )
 def dataset_facts(dataset: Dataset) -> Measurement | None:
-    """Outcome, retries, task, seed and length of each episode are those that the sidecar keeps."""
-    known = set(facts_of(dataset.path))
-    if not dataset.sidecar or not known:
+    """Every column by which episodes are chosen is what the sidecar's scene and conditions give, and each episode is
+    one of the attempts."""
+    names = [name for name in facts_of(dataset.path) if name not in STAGE_COLUMNS]
+    if not dataset.sidecar or not names:
         return None
-    names = [name for name in ("success", "num_retries", "task_name", "seed", "attempt", "num_goals") if name in known]
     rows: dict[int, dict[str, Any]] = {}
     for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
         if set(names) <= set(open_table(path).schema_arrow.names):  # LeRobot's own recordings have none of them
             rows.update({row["episode_index"]: row for row in read_table(path, ["episode_index", *names]).to_pylist()})
-    wrong = []
+    wrong = list(_strange_attempts(dataset))
     for each in dataset.described():
-        number, kept, info = each.number, each.kept, each.info
-        if (row := rows.get(number)) is None:
-            wrong.append(f"episode {number} has none")
+        if (row := rows.get(each.number)) is None:
+            wrong.append(f"episode {each.number} has none")
             continue
-        expected = {
-            "success": kept["success"],
-            "num_retries": kept["num_retries"],
-            "task_name": info.task,
-            "seed": info.root_seed,
-            "attempt": info.attempt,
-            "num_goals": len(info.scene.goals),
-        }
-        wrong += [f"episode {number}: {name} is {row[name]}" for name in names if row[name] != expected[name]]
+        expected = _expected_facts(dataset, each)
+        differing = [name for name in names if name in expected and row[name] != expected[name]]
+        wrong += [f"episode {each.number}: {name} is {row[name]}" for name in differing]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(rows)} episodes")
+
+
+def _expected_facts(dataset: Dataset, each: DescribedEpisode) -> dict[str, Any]:
+    """Those that the sidecar gives; of a recording whose frames were not all taken the duration is not known."""
+    kept = each.kept | dataset.details.get(each.number, {})
+    facts = {name: kept[name] for name in _KEPT if name in kept} | facts_before(each.info)
+    if kept["frame_stride"] == 1:
+        facts["duration_s"] = len(each.rows["index"]) / dataset.info.fps
+        facts["has_deliberate_miss"] = bool(kept["deliberate_miss_frames"])
+    return facts | facts_after(SuccessCheck(**check) for check in kept.get("checks", ()))
+
+
+def _strange_attempts(dataset: Dataset) -> Iterator[str]:
+    """Attempts that are said to be in the dataset, against its episodes; starts and goals of these."""
+    paths = sorted((dataset.path / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+    if not paths or not set(_ATTEMPT) <= set(next(iter(dataset.details.values()), {})):
+        return
+    rows = [row for path in paths for row in read_table(path).to_pylist() if row["in_dataset"]]
+    told = Counter(tuple(row[name] for name in _ATTEMPT) for row in rows)
+    there = Counter(tuple(row[name] for name in _ATTEMPT) for row in dataset.details.values())
+    yield from (f"of the attempts, {key[0]} is no episode" for key in told - there)
+    yield from (f"{key[0]} is none of the attempts" for key in there - told)
+    starts = Counter(tuple(row[name] for name in _START) for row in rows)
+    for each in dataset.described():
+        goal = first_goal(each.info.scene)
+        if not told - there and starts[tuple(goal[name] for name in _START)] < 1:
+            yield f"the attempt of episode {each.number} has another start"
 
 
 @dataset_check(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import reprlib
@@ -20,8 +21,13 @@ from demorec.core.errors import ExportError, MissingDependencyError, ResourceErr
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
+from demorec.datasets.lerobot.layout import EPISODES_PATH, VIDEO_PATH, FilePosition
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
+
+
+_OWN_PLACE = ("meta/episodes/chunk_index", "meta/episodes/file_index")
+"""Columns that say in which file a row of the episodes' table is."""
 
 
 @dataset_check(
@@ -69,13 +75,18 @@ def dataset_counts(dataset: Dataset) -> Measurement:
 
 
 def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
-    """Ends of the ranges in the episodes' table, where it has them: rows of the dataset, and seconds of each video."""
+    """Where the episodes' table says that things are: its own file; rows of the dataset, and seconds of each video."""
     ends = [f"videos/{key}/to_timestamp" for key in dataset.info.video_keys]
     for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
         columns = open_table(path).schema_arrow.names
         names = [name for name in ("dataset_to_index", *ends) if name in columns]
         begins = [name.replace("to_", "from_") for name in names]
-        for row in read_table(path, ["episode_index", "length", *names, *begins]).to_pylist():
+        own = [name for name in _OWN_PLACE if set(_OWN_PLACE) <= set(columns)]
+        for row in read_table(path, ["episode_index", "length", *names, *begins, *own]).to_pylist():
+            if own and FilePosition(chunk=row[own[0]], file=row[own[1]]).path(EPISODES_PATH) != path.relative_to(
+                dataset.path
+            ).as_posix():
+                yield f"the file of the table's row of episode {row['episode_index']}"
             for begin, end in zip(begins, names, strict=True):
                 unit = 1 if end == "dataset_to_index" else dataset.info.fps
                 if not abs((row[end] - row[begin]) * unit - row["length"]) < 0.5:
@@ -95,16 +106,37 @@ def _stray_rows(dataset: Dataset) -> Iterator[str]:
 
 
 def _wrong_ends(dataset: Dataset) -> Iterator[str]:
-    """Where an episode is said to be done, if most are at their last row; a reward where there is no success."""
+    """Where an episode is said to be done, if most are at their last row, and goes on after that; a reward where there
+    is no success, if nothing is rewarded but that."""
     if DONE in dataset.info.features:
         done = [rows[DONE].reshape(-1) for rows in dataset.rows]
+        for number, flags in enumerate(done):
+            if (flags[:-1] > flags[1:]).any():
+                yield f"episode {number} goes on after its {DONE}"
         last = [bool(flags[-1]) and int(flags.sum()) == 1 for flags in done]
         if sum(last) > len(last) / 2:
             yield from (f"{DONE} of episode {number}" for number, is_last in enumerate(last) if not is_last)
-    if dataset.sidecar and {REWARD, SUCCESS} <= dataset.info.features.keys():
-        for number, rows in enumerate(dataset.rows):
+    if {REWARD, SUCCESS} <= dataset.info.features.keys():
+        sparse = all(np.isin(rows[REWARD], (0, 1)).all() for rows in dataset.rows)
+        for number, rows in enumerate(dataset.rows if dataset.sidecar or sparse else ()):
             if not np.array_equal(rows[REWARD].reshape(-1) > 0, rows[SUCCESS].reshape(-1)):
                 yield f"{REWARD} of episode {number}"
+
+
+@dataset_check(
+    measures="files of images that no episode has",
+    warn=0,
+    fail=math.inf,
+)
+def dataset_strays(dataset: Dataset) -> Measurement | None:
+    """Every mp4 file is of a camera and an episode: catches what merges, deleted episodes and renamed cameras leave."""
+    if dataset.info.is_old:
+        return None
+    template = dataset.info.video_path or VIDEO_PATH
+    used = {position.path(template, key) for place in dataset.places for key, (position, _) in place.videos.items()}
+    found = {path.relative_to(dataset.path).as_posix() for path in (dataset.path / "videos").rglob("*.mp4")}
+    strays = sorted(found - used)
+    return Measurement(value=len(strays), detail=", ".join(strays[:3])) if found else None
 
 
 @dataset_check(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -16,14 +16,19 @@ from demorec.check.drawn import judge_lag, judge_unlike
 from demorec.core.geometry import Array
 
 
+_IN_ORDER = ("min", "q01", "q10", "q50", "q90", "q99", "max")
+"""Statistics from the smallest to the largest."""
+
+
 @dataset_check(
-    measures="mean colour in the statistics against decoded images, of 1",
+    measures="colours in the statistics against decoded images, of 1",
     warn=0.04,
     fail=0.08,
     needs_images=True,
 )
 def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
-    """The mean colours of each camera, over all episodes and in each of them, are those of all its images."""
+    """Mean and deviation of each camera's colours, of all episodes and in each of them, are those of its images; its
+    other statistics are colours of 0 to 1 in their order, as many as of other features."""
     if dataset.info.is_old:
         return
     stats = read_statistics(dataset)
@@ -31,17 +36,35 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
         images = dataset.images(key)
         if not images:
             continue
-        mean = np.average([p.mean for p in images], axis=0, weights=[p.count for p in images])
-        yield _off_colour(stats.get(key, {}).get("mean"), mean, key)
-        stated = episode_column(dataset, f"stats/{key}/mean")
-        for number, (said, p) in enumerate(zip(stated, images, strict=False)):
-            yield _off_colour(said, p.mean, f"{key}, episode {number}")
+        told, weights = stats.get(key, {}), [p.count for p in images]
+        mean = np.average([p.mean for p in images], axis=0, weights=weights)
+        squares = [p.std**2 + p.mean**2 for p in images]
+        std = np.sqrt(np.maximum(np.average(squares, axis=0, weights=weights) - mean**2, 0.0))
+        yield _off_colour(told.get("mean"), mean, key)
+        yield _off_colour(told.get("std"), std, f"deviation of {key}")
+        yield _disordered(told, stats, key)
+        for quantity in ("mean", "std"):
+            stated = episode_column(dataset, f"stats/{key}/{quantity}")
+            for number, (said, p) in enumerate(zip(stated, images, strict=False)):
+                yield _off_colour(said, getattr(p, quantity), f"{quantity} of {key}, episode {number}")
 
 
-def _off_colour(said: Any, mean: Array, detail: str) -> Measurement:
+def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
     stated = numbers_of(said)
-    value = float(np.abs(stated - mean).max()) if stated.shape == (3,) else math.inf
-    return Measurement(value=value, detail=detail)
+    off = np.abs(stated - true) if stated.shape == (3,) else np.full(3, math.inf)
+    return Measurement(value=float(np.nan_to_num(off, nan=0.0 if np.isnan(true).any() else math.inf).max()), detail=detail)
+
+
+def _disordered(told: Mapping[str, Any], stats: Mapping[str, Any], key: str) -> Measurement | None:
+    """How far statistics of a camera are beyond those that they must not exceed."""
+    names = [name for name in _IN_ORDER if any(name in entry for entry in stats.values())]
+    if lacking := [name for name in names if name not in told]:
+        return Measurement(value=math.inf, detail=f"{key} has no {', '.join(lacking)}")
+    rows = [numbers_of(told[name]) for name in names]
+    if any(row.shape != (3,) or not np.isfinite(row).all() for row in rows):
+        return Measurement(value=math.inf, detail=f"{', '.join(names)} of {key}")
+    steps = np.diff([np.zeros(3), *rows, np.ones(3)], axis=0)
+    return Measurement(value=max(float(-steps.min()), 0.0), detail=f"order of {', '.join(names)} of {key}")
 
 
 drawn_check = partial(

@@ -29,6 +29,7 @@ from demorec.episode.info import EpisodeInfo
 Row = dict[str, Any]
 _ABOUT_IMAGES = ("vqa", "trace")
 _EVENTS = {*_ABOUT_IMAGES, "interjection", None}
+_WORD, _FEWEST_WORDS = re.compile(r"[^\W\d_]{2,}"), 2
 _ROLES = ("user", "assistant", "system", "tool")
 
 
@@ -46,6 +47,18 @@ def dataset_language(dataset: Dataset) -> Measurement | None:
     ]
     entries = sum(len(episode.persistent) + sum(map(len, episode.events.values())) for episode in dataset.spoken)
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{entries} entries")
+
+
+@dataset_check(
+    measures="instructions that say nothing, or the same as another one",
+    warn=0,
+    fail=math.inf,
+)
+def dataset_instructions(dataset: Dataset) -> Measurement:
+    """Each task says in words what to do: catches names of files, placeholders, and one text under two numbers."""
+    wrong = [text for text in dataset.tasks if len(_WORD.findall(text)) < _FEWEST_WORDS]
+    wrong += [text for number, text in enumerate(dataset.tasks) if text in dataset.tasks[:number]]
+    return Measurement(value=len(wrong), detail="; ".join(map(repr, wrong[:3])) or f"{len(dataset.tasks)} tasks")
 
 
 def _malformed(dataset: Dataset, episode: SpokenEpisode) -> Iterator[str]:
@@ -97,7 +110,10 @@ def _answer_faults(row: Row, dataset: Dataset) -> Iterator[str]:
     if feature is None:
         return
     height, width = feature.shape[:2]
-    for x, y in _points(answer):
+    points = list(_points(answer))
+    if points and all(0 <= x <= 1 and 0 <= y <= 1 for x, y in points) and any(x % 1 or y % 1 for x, y in points):
+        yield "points that are shares of the image"
+    for x, y in points:
         if not (0 <= x < width and 0 <= y < height):
             yield f"a point at ({x:g}, {y:g}), outside of the image"
             return

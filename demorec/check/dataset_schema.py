@@ -98,6 +98,8 @@ def _videos(dataset: Dataset) -> Iterator[str]:
                     yield f"{key}: {quantity} is {said[quantity]} in info.json, {value} in {path.name}"
             if not abs(rate - dataset.info.fps) <= _RATE_TOLERANCE * dataset.info.fps:
                 yield f"{key}: fps is {dataset.info.fps} in info.json, {rate:.4g} in {path.name}"
+        if feature.is_depth and feature.shape[2] != 1:
+            yield f"{key} is a depth map of {feature.shape[2]} channels"
         for quantity, value in (("height", height), ("width", width), ("channels", feature.shape[2])):
             if info.get(f"video.{quantity}", value) != value:
                 yield f"{key}: video.{quantity} is {info[f'video.{quantity}']}, the shape has {value}"

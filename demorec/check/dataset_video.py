@@ -31,11 +31,13 @@ class EpisodeImages:
     Attributes:
         count: How many there are.
         mean: (3,) mean red, green and blue, of 1.
+        std: (3,) their standard deviations over all pixels, of 1, by some of the images.
         cells: (count, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
     """
 
     count: int
     mean: Array
+    std: Array
     cells: NDArray[np.uint8]
 
 
@@ -45,7 +47,7 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
     Raises:
         ExportError: A video cannot be decoded, or has too few images.
     """
-    files: dict[Path, Iterator[NDArray[np.uint8]]] = {}
+    files: dict[Path, Iterator[_Decoded]] = {}
     ends: dict[Path, int] = {}
     found = []
     for place in places:
@@ -59,14 +61,24 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
             raise ExportError(
                 f"Episode {place.episode_index} has {place.length} frames, {len(images)} images decode: {path}"
             )
-        cells = np.stack(images)
+        cells = np.stack([cell for cell, _ in images])
         mean = cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255
-        found.append(EpisodeImages(count=len(cells), mean=mean, cells=cells))
+        moments = [moment for _, moment in images if moment is not None]
+        first, second = np.mean(moments, axis=0) if moments else np.full((2, 3), np.nan)
+        std = np.sqrt(np.maximum(second - first**2, 0.0))
+        found.append(EpisodeImages(count=len(cells), mean=mean, std=std, cells=cells))
     return found
 
 
-def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
-    """(rows, columns, 3) mean colours of the parts of every image, 0 to 255."""
+_Decoded = tuple[NDArray[np.uint8], Array | None]
+_EVERY = 8
+"""Of so many images one is looked at pixel by pixel."""
+
+
+def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
+    """(rows, columns, 3) mean colours of the parts of every image, 0 to 255; of some (2, 3) means of colours of 1, and
+    of their squares, over all pixels.
+    """
     import av
     from av.video.reformatter import VideoReformatter
 
@@ -78,11 +90,17 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
         with av.open(str(path), format="mp4") as container:
             for stream in container.streams.video:  # a few bytes can announce images of gigabytes
                 stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
-            for frame in container.decode(video=0):
+            for number, frame in enumerate(container.decode(video=0)):
                 small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
-                yield cast("NDArray[np.uint8]", small.to_ndarray())
+                cells = cast("NDArray[np.uint8]", small.to_ndarray())
+                yield cells, None if number % _EVERY else _moments(frame.to_ndarray(format="rgb24"))
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error
+
+
+def _moments(image: NDArray[np.uint8]) -> Array:
+    values = image.reshape(-1, 3) / np.float32(255)
+    return np.stack([values.mean(axis=0), (values**2).mean(axis=0)]).astype(np.float64)
 
 
 def part_counts(width: int, height: int) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from demorec.check.cells import ImageKind, correlation
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, strays
 from demorec.check.dynamics import Dynamics, dynamics_by_frames
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size, drawable_world
-from demorec.check.evidence import Motion, motion_of_recording, motion_of_simulated
+from demorec.check.evidence import Motion, Named, motion_of_recording, motion_of_simulated, quaternions
 from demorec.check.films import Films, films_of_recording, likeness_of_films
 from demorec.check.full_size import FullSize, compare_with_encoder, frames_to_compare, share_off, with_lead
 from demorec.check.motion import Motions, point_masses
@@ -152,6 +152,17 @@ class CheckedEpisode(ExitStack):
         if self.form == "external":
             return motion_of_recording(self.info, self.columns, self._named_urdf)
         return motion_of_simulated(self.info, self.columns, self.urdf) if self.num_frames else None
+
+    def quaternions(self) -> Iterator[Named]:
+        """All rotations."""
+        c = self.columns
+        if self.form == "external":
+            yield from quaternions(c.features, {feature.name: feature.names for feature in self.info.features})
+            return
+        poses = {"EE": c.base_from_tcp, "action EE": c.action_base_from_tcp, "command EE": c.command_base_from_tcp}
+        poses |= {f"object {name}": table for name, table in c.object_poses.items()}
+        poses |= {f"camera {name}": table for name, table in c.world_from_camera.items()}
+        yield from ((name, table[:, 3:]) for name, table in poses.items())
 
     def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
         """The torques that its motion needs."""

@@ -20,7 +20,7 @@ from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
 from demorec.episode.episode import Columns
-from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
+from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.robots.urdf import Urdf
 
@@ -33,6 +33,7 @@ _SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
 _QUATERNION = ("qx", "qy", "qz", "qw")
 
 Flags = NDArray[np.bool_]
+Named = tuple[str, Array]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,6 +97,23 @@ class Motion:
         """Names of some elements, with the episode."""
         where = f", {self.where}" if self.where else ""
         return [f"{name}{where}" for name, is_known in zip(self.names, known, strict=True) if is_known]
+
+
+def quaternion_places(names: Sequence[str]) -> list[int]:
+    """Where four elements in a row are x, y, z and w of one thing: orientation.x to orientation.w, qw to qz."""
+    fours = [(start, names[start : start + 4]) for start in range(len(names) - 3)]
+    return [
+        start
+        for start, four in fours
+        if "".join(each[-1:] for each in four) in ("xyzw", "wxyz") and len({each[:-1] for each in four}) == 1
+    ]
+
+
+def quaternions(features: Mapping[str, NDArray[Any]], described: Mapping[str, Sequence[str] | None]) -> Iterator[Named]:
+    """(what, (T, 4)) of all quaternions, by the names of their elements."""
+    for feature, names in described.items():
+        for place in quaternion_places(names or ()):
+            yield f"{feature}, {(names or ())[place][:-1]}", features[feature].reshape(-1, len(names or ()))[:, place : place + 4]
 
 
 def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:
@@ -275,12 +293,11 @@ def _motion(
 
 
 def _sensors(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> dict[str, NDArray[Any]]:
-    """What is observed beside the state, and is no truth of the simulator's."""
-    others = (STATE, ENVIRONMENT_STATE)
+    """What is observed beside the state."""
     return {
         name: values
         for name, values in features.items()
-        if name.startswith("observation.") and name in names and name not in others
+        if name.startswith("observation.") and name in names and name != STATE
     }
 
 

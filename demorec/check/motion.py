@@ -50,6 +50,8 @@ _MIDWAY = 1e-6
 """Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
 _MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
+_FAR = 0.2
+"""rad or m that no element goes by itself."""
 _SETTLE_S = 0.6
 """After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
 _LEAST_STROKE = 0.2
@@ -182,12 +184,13 @@ def joint_speed(subject: Moving) -> Iterator[Found]:
     fail=0.16,
     needs=VELOCITIES,
 )
-def velocity_matches_position(subject: Moving) -> Found:
-    """States change by velocity over time, each joint by itself, all episodes together: catches a wrong rate,
-    other units, and other joints' velocities."""
+def velocity_matches_position(subject: Moving) -> Iterator[Found]:
+    """States change by velocity over time, each joint by itself, all episodes together, and all joints in each episode:
+    catches a wrong rate, also of one episode, other units, and other joints' velocities."""
     pairs = [motion for motion in subject.motions.all if motion.velocity is not None and len(motion.state) > 1]
     if not pairs:
-        return Lacking(need=VELOCITIES)
+        yield Lacking(need=VELOCITIES)
+        return
     sums, count = np.zeros((3, len(pairs[0].names))), 0
     for motion in pairs:
         assert motion.velocity is not None
@@ -196,10 +199,13 @@ def velocity_matches_position(subject: Moving) -> Found:
         reach = min(max(1, round(_VELOCITY_S * motion.fps)), len(ways) - 1)
         integrated, moved = ways[reach:] - ways[:-reach], motion.state[reach:] - motion.state[:-reach]
         count += len(moved)
-        sums += [(moved * integrated).sum(axis=0), (integrated * integrated).sum(axis=0), (moved * moved).sum(axis=0)]
+        own = np.array([(moved * integrated).sum(axis=0), (integrated**2).sum(axis=0), (moved**2).sum(axis=0)])
+        sums += own
+        if len(pairs) > 1 and len(moved) >= FEWEST:
+            yield _whole_ratio(motion, own)
     known = np.flatnonzero(np.isfinite(sums[0]) & (sums[2] > 0))
     if not len(known):
-        return None
+        return
     names = [pairs[0].names[element] for element in known]
     found = sums[:, known]
     if pairs[0].fps < _FEW_FPS:  # two velocities say little of the way between: what joints do in truth shows in all
@@ -210,21 +216,33 @@ def velocity_matches_position(subject: Moving) -> Found:
     moves = (total > 0.01 * total.max()) | (total > count * (_SLOW * _VELOCITY_S) ** 2)
     off = np.abs(ratio - 1) * moves * min(1.0, pairs[0].fps / _FEW_FPS)
     worst = int(np.argmax(off))
-    return Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
+    yield Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
+
+
+def _whole_ratio(motion: Motion, sums: Array) -> Measurement | None:
+    """Of all joints of an episode that is one of many, by half: of what single episodes have, noise is a part."""
+    product, square, total = np.nansum(np.where(np.isfinite(sums[0]), sums, 0.0), axis=1)
+    if not total > 0:
+        return None
+    ratio = product / max(square, 1e-12)
+    return Measurement(value=abs(ratio - 1) * 0.5, detail=f"{motion.where}: ratio {ratio:.3f}")
 
 
 @motion_check(
-    measures="elements of the state that never change while their action does",
+    measures="elements of the state that never change while their action does, or the other way round",
     needs=ACTIONS,
 )
 def elements_alive(subject: Moving) -> Found:
-    """Encoders are alive: no element stays at one value in all episodes while what it is sent changes."""
+    """Encoders and commands are alive: of no element one stays at one value in all episodes while the other changes."""
     pairs = [motion for motion in subject.motions.all if motion.action is not None and len(motion.state) >= FEWEST]
     if not pairs:
         return Lacking(need=ACTIONS)
     stands = np.all([np.ptp(motion.state, axis=0) == 0 for motion in pairs], axis=0)
     sent = np.any([np.ptp(_action(motion), axis=0) > 50 * _MOVES for motion in pairs], axis=0)
-    dead = [name for name, is_dead in zip(pairs[0].names, stands & sent, strict=True) if is_dead]
+    unsent = np.all([np.ptp(_action(motion), axis=0) == 0 for motion in pairs], axis=0)
+    moves = np.any([np.ptp(motion.state, axis=0) > _FAR for motion in pairs], axis=0)
+    is_dead = (stands & sent) | (unsent & moves)
+    dead = [name for name, row in zip(pairs[0].names, is_dead, strict=True) if row]
     return Measurement(value=len(dead), detail=", ".join(dead))
 
 

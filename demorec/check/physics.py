@@ -19,6 +19,8 @@ from demorec.check.base import (
 )
 from demorec.check.dynamics import MIN_FRAMES
 from demorec.check.episode import CheckedEpisode
+from demorec.check.evidence import Named
+from demorec.check.motion import EVERYWHERE
 from demorec.check.rows import displacement, matrices
 from demorec.core.geometry import Array
 from demorec.episode.episode import POLICY_PHASE
@@ -119,19 +121,26 @@ def forward_kinematics(subject: Handed) -> Iterator[Found]:
         yield Lacking(need="EE poses, and the robot and TCP link that demorec recorded")
 
 
+class Turning(Protocol):
+    """What has rotations."""
+
+    def quaternions(self) -> Iterator[Named]:
+        """(what, (T, 4)) of each."""
+        ...
+
+
 @physics_check(
+    on=EVERYWHERE,
+    needs="quaternions, by the names of elements",
     measures="deviation of a quaternion's length from 1",
-    warn=1e-6,
-    fail=1e-3,
+    warn=1e-3,
+    fail=1e-2,
+    simulated=(1e-6, 1e-3),
 )
-def unit_quaternions(episode: CheckedEpisode) -> Iterator[Found]:
+def unit_quaternions(subject: Turning) -> Iterator[Found]:
     """Every rotation is one."""
-    c = episode.columns
-    poses = {"EE": c.base_from_tcp, "action EE": c.action_base_from_tcp, "command EE": c.command_base_from_tcp}
-    poses |= {f"object {name}": table for name, table in c.object_poses.items()}
-    poses |= {f"camera {name}": table for name, table in c.world_from_camera.items()}
-    for name, table in poses.items():
-        yield worst_frame(np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1.0), name)
+    for name, table in subject.quaternions():
+        yield worst_frame(np.abs(np.linalg.norm(table, axis=1) - 1.0), name)
 
 
 @physics_check(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from demorec.check.base import (
     check,
     worst_entry,
 )
-from demorec.check.evidence import Motion
+from demorec.check.evidence import Motion, quaternion_places
 from demorec.check.motion import FEWEST, Moving, correlations
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
@@ -47,17 +47,6 @@ _NO_TARGETS = "the action is no target of the state's elements (by their names a
 
 target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
 """Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
-
-
-def quaternion_elements(names: Sequence[str]) -> set[str]:
-    """Those of four elements in a row that are x, y, z and w of one thing: orientation.x to orientation.w, qx to qw."""
-    fours = [names[start : start + 4] for start in range(len(names) - 3)]
-    return {
-        name
-        for four in fours
-        if "".join(each[-1:] for each in four) == "xyzw" and len({each[:-1] for each in four}) == 1
-        for name in four
-    }
 
 
 @target_check(
@@ -103,13 +92,14 @@ def actions_in_order(subject: Moving) -> Found:
         return NotMeasured(why=_NO_TARGETS)
     table = correlations(targets)
     count = len(table)
-    names = [name for name, moves in zip(subject.motions.all[0].names, subject.motions.moving, strict=True) if moves]
+    kept = np.flatnonzero(subject.motions.moving).tolist()
+    names = [subject.motions.all[0].names[i] for i in kept]
     best = table.argmax(axis=1)
     # Two joints of one motion may go alike; an exchange shows where an element hardly follows its own action at all.
     # A quaternion is left out: its elements are of one rotation, and a small one follows any other.
-    turns = quaternion_elements(subject.motions.all[0].names)
+    turns = {i for place in quaternion_places(subject.motions.all[0].names) for i in range(place, place + 4)}
     wrong = [
-        i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3 and names[i] not in turns
+        i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3 and kept[i] not in turns
     ]
     words = [f"{names[i]} follows that of {names[best[i]]}" for i in wrong]
     return Measurement(value=len(wrong), detail="; ".join(words[:3]))
@@ -231,7 +221,8 @@ def dead_band(subject: Moving) -> Found:
                 continue
             changes = np.flatnonzero(np.abs(np.diff(motion.state[:, element])) > _STAYS) + 1
             begins, ends = np.append(0, changes), np.append(changes, len(action)) - 1
-            way = np.abs(action[ends] - action[begins]) * (measured[ends] > measured[begins])
+            acted = np.maximum(ends - 1, begins)  # what the last frame is sent, moves the one after it
+            way = np.abs(action[acted] - action[begins]) * (measured[ends] > measured[begins])
             ways.setdefault(motion.names[element], []).extend(way[way > _GOES].tolist())
     if not ways:
         return Lacking(need=URDF)

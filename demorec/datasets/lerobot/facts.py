@@ -40,6 +40,7 @@ from demorec.datasets.staging import sync_file
 
 if TYPE_CHECKING:
     from demorec.episode.episode import Columns, SuccessCheck
+    from demorec.episode.info import EpisodeInfo
     from demorec.episode.scene import Scene
     from demorec.mcap import Recording
 
@@ -207,6 +208,13 @@ def episode_facts(recording: Recording, columns: Columns) -> dict[str, Any]:
         "num_retries": 0 if outcome is None else outcome.num_retries,
         "has_deliberate_miss": bool(columns.is_deliberate_miss.any()),
         "duration_s": columns.num_frames / info.fps,
+    }
+    return facts | facts_before(info) | facts_after(checks)
+
+
+def facts_before(info: EpisodeInfo) -> dict[str, Any]:
+    """Those of a simulated episode that are known before its first frame."""
+    facts = {
         "task_name": info.task,
         "split": str(info.config.get("split", "")),
         "variation": str(info.config.get("variation", "")),
@@ -216,8 +224,12 @@ def episode_facts(recording: Recording, columns: Columns) -> dict[str, Any]:
         "num_goals": len(info.scene.goals),
         **first_goal(info.scene),
     }
-    facts |= {DRAWN + name: value for name, value in sorted(_drawn(recording).items())}
-    return facts | {CHECKED + name: value for name, value in _nearest_to_limit(checks).items()}
+    return facts | {DRAWN + name: value for name, value in sorted(_drawn(info).items())}
+
+
+def facts_after(checks: Iterable[SuccessCheck]) -> dict[str, float]:
+    """Those of its conditions."""
+    return {CHECKED + name: value for name, value in _nearest_to_limit(checks).items()}
 
 
 def first_goal(scene: Scene | None) -> dict[str, Any]:
@@ -231,9 +243,9 @@ def first_goal(scene: Scene | None) -> dict[str, Any]:
     return found
 
 
-def _drawn(recording: Recording) -> Mapping[str, float]:
+def _drawn(info: EpisodeInfo) -> Mapping[str, float]:
     """What was drawn for the episode: behaviour, the first object's size, mass and friction, gravity, light."""
-    info, scene = recording.info, recording.info.scene
+    scene = info.scene
     drawn = dict(info.behaviour)
     light = scene.light
     drawn |= {"light_ambient": light.ambient, "light_diffuse": light.diffuse, "light_shadow": light.shadow}

@@ -40,6 +40,8 @@ ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
 _DIGEST = re.compile(r"[0-9a-f]{16}")
 IN_MOTOR_UNITS = {"so101": SO101_FOLLOWER}
 """Rows of `ROBOTS` whose joints LeRobot itself has, in other units -> the arm as LeRobot drives it."""
+_IN_METRES = "gripper.width"
+"""A gripper's element whose name says so; LeRobot's is gripper.pos."""
 _KEPT = ("material", "link", "joint")
 """What of a URDF places and draws links; the rest is for simulators and controllers, and full of paths."""
 _IN_PACKAGE = re.compile(r"^(?:file:/*)?/.*/share/([^/]+/.+)$")
@@ -133,15 +135,15 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
 def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     """The arm of ours whose joints the elements of observation.state are called after, "panda_joint1.pos" or the like.
 
-    Of a dataset that does not say what its robot is; lengths are those of the model. LeRobot's own arms are left out:
-    their joints are called the same in degrees and in shares of their ranges.
+    Of a dataset that does not say what its robot is; lengths are those of the model. LeRobot's own arms are left out
+    unless the gripper is called in metres: their joints are called the same in degrees and in shares of their ranges.
     """
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
     stems = [ELEMENT_SUFFIX.sub("", name) for name in names]
     for row in ROBOTS.names():
         robot = ROBOTS.load(row)
-        if robot.name in IN_MOTOR_UNITS:
+        if robot.name in IN_MOTOR_UNITS and _IN_METRES not in names:
             continue
         if set(robot.arm_joints) <= set(stems):
             urdf = robot_description(robot.urdf, 1.0)

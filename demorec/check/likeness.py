@@ -1,0 +1,177 @@
+"""Is each episode of a dataset like the others in what its robot keeps: how actions and motions go together, its mounts,
+where episodes begin and end. Whoever recorded them: nothing has to be known of the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.dataset import Dataset, Rows
+from demorec.check.rows import finest_lag
+from demorec.core.geometry import Array
+from demorec.episode.features import ACTION, EE_POSE, STATE
+
+_FEWEST_EPISODES, _FEWEST_FRAMES = 3, 30
+_AHEAD_S = (0.0, 0.1, 0.3)
+"""How far ahead the states are looked at that an action leads to, seconds; the first is one frame."""
+_RIDGE = 1e-3
+_CLEAR = 0.6
+"""Correlation of an action with what the states of other episodes make of it, from which one that is not is strange."""
+_MOVES = 0.5
+"""Share of an action's usual deviation by which the states say that it moves in an episode."""
+_REACH_S = 1.0
+_LATEST_S = 0.35
+"""How far behind its action a motion may be, seconds: as for states that follow targets."""
+
+_END_S = 0.15
+_MOST, _RESTS, _RUNS = 0.6, 0.15, 0.5
+"""Share of the episodes that are at rest at an end, and shares of an episode's mean speed: of rest, and of motion."""
+
+likeness_check = partial(check, on=("dataset",), needs="actions of three episodes")
+
+
+def _states(rows: Rows) -> Array:
+    """(T, D) of what is known of the robot's place."""
+    parts = [rows[name].reshape(len(rows[name]), -1) for name in (STATE, EE_POSE) if name in rows]
+    return np.concatenate(parts, axis=1).astype(np.float64)
+
+
+def _evidence(states: Array, fps: float) -> Array:
+    """(T, N) states, and how far they go from each frame on."""
+    ahead = sorted({max(1, round(seconds * fps)) for seconds in _AHEAD_S})
+    last = len(states) - 1
+    steps = [states[np.minimum(np.arange(last + 1) + k, last)] - states for k in ahead]
+    return np.concatenate([states, *steps], axis=1)
+
+
+def _usable(dataset: Dataset) -> list[tuple[int, Array, Array]] | Found:
+    """(episode, actions (T, K), evidence (T, N)), both less the dataset's means and in units of its deviations."""
+    features = dataset.info.features
+    if not {STATE, ACTION} <= features.keys() or not all(features[n].is_numeric for n in (STATE, ACTION)):
+        return Lacking(need="actions of three episodes")
+    long = [(number, rows) for number, rows in enumerate(dataset.rows) if len(rows[STATE]) >= _FEWEST_FRAMES]
+    if len(long) < _FEWEST_EPISODES:
+        return NotMeasured(why=f"fewer than {_FEWEST_EPISODES} episodes have {_FEWEST_FRAMES} frames")
+    found = [
+        (number, rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64), _evidence(_states(rows), dataset.info.fps))
+        for number, rows in long
+    ]
+    means, scales = [], []
+    for part in (1, 2):
+        together = np.concatenate([each[part] for each in found])
+        means.append(together.mean(axis=0))
+        scales.append(np.where(together.std(axis=0) > 1e-9, together.std(axis=0), np.inf))
+    return [(n, (a - means[0]) / scales[0], (e - means[1]) / scales[1]) for n, a, e in found]
+
+
+@likeness_check(
+    group="alignment",
+    measures="by how much less than usual an episode's action goes with its states, as a correlation",
+    warn=0.35,
+    fail=0.5,
+)
+def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
+    """What an action does to the states is the same in each episode: catches actions of another episode, zeros, joints
+    exchanged in one episode, whatever kind of action it is.
+
+    The action as a linear function of states and the ways that they go next, by all other episodes.
+    """
+    found = _usable(dataset)
+    if not isinstance(found, list):
+        yield found
+        return
+    grams = [(e.T @ e, e.T @ a, len(a)) for _, a, e in found]
+    square, product, count = (sum(part) for part in zip(*grams, strict=True))
+    size = found[0][2].shape[1]
+    own = np.zeros((len(found), found[0][1].shape[1]))
+    moves = np.zeros_like(own)
+    for row, ((_, action, evidence), (its_square, its_product, frames)) in enumerate(zip(found, grams, strict=True)):
+        ridge = _RIDGE * (count - frames) * np.eye(size)
+        expected = evidence @ np.linalg.solve(square - its_square + ridge, product - its_product)
+        a, b = action - action.mean(axis=0), expected - expected.mean(axis=0)
+        own[row] = (a * b).sum(axis=0) / np.maximum(np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0)), 1e-9)
+        moves[row] = b.std(axis=0)
+    usual = np.median(own, axis=0)
+    below = np.where((usual > _CLEAR) & (moves > _MOVES * np.median(moves, axis=0)), usual - own, 0.0)
+    if not (usual > _CLEAR).any():
+        yield NotMeasured(why="the actions do not go with the states")
+        return
+    row, element = divmod(int(below.argmax()), below.shape[1])
+    names = dataset.info.features[ACTION].names or tuple(map(str, range(below.shape[1])))
+    yield Measurement(value=max(float(below[row, element]), 0.0), detail=f"{names[element]}, episode {found[row][0]}")
+
+
+@likeness_check(
+    group="alignment",
+    measures="frames by which the states' motion is too early for actions that are none of their targets, or too late",
+    warn=2.5,
+    fail=4.5,
+)
+def motion_follows_action(dataset: Dataset) -> Found:
+    """Increments, deltas of a pose and velocities make the state move in the same frame and soon after: catches those
+    that were recorded late, early, or filtered. Targets are left to `state_follows_action`.
+
+    By the lag at which an action is best told as a linear function of the ways that the states go in one frame.
+    """
+    if dataset.motions.targets:
+        return NotMeasured(why="the action is a target of the state, which state_follows_action judges")
+    found = _usable(dataset)
+    if not isinstance(found, list):
+        return found
+    fps = dataset.info.fps
+    reach = max(2, round(_REACH_S * fps))
+    lags = range(-reach, reach + 1)
+    steps = [np.diff(_states(dataset.rows[number]), axis=0) for number, _, _ in found]
+    scale = np.concatenate(steps).std(axis=0)
+    told, all_of = np.zeros((len(lags), found[0][1].shape[1])), np.zeros(found[0][1].shape[1])
+    square = np.zeros((len(scale), len(scale)))
+    products = np.zeros((len(lags), len(scale), told.shape[1]))
+    for (_, action, _), step in zip(found, steps, strict=True):
+        if len(step) <= 3 * reach:
+            continue
+        core = slice(reach, len(step) - reach)
+        way = step[core] / np.maximum(scale, 1e-9)
+        square += way.T @ way
+        all_of += (action[core] ** 2).sum(axis=0)
+        products += [way.T @ np.roll(action[:-1], lag, axis=0)[core] for lag in lags]
+    if not all_of.any():
+        return NotMeasured(why="the episodes are too short to tell which of state and action is first")
+    inverse = np.linalg.inv(square + _RIDGE * max(float(np.trace(square)) / len(square), 1e-9) * np.eye(len(square)))
+    told = np.einsum("lnk,nm,lmk->lk", products, inverse, products) / np.maximum(all_of, 1e-9)
+    clear = np.flatnonzero(told.max(axis=0) > _CLEAR**2)
+    if not len(clear):
+        return NotMeasured(why="the actions do not go with the states' motion")
+    lag = float(np.median([finest_lag(lags, (-told[:, element]).tolist()) for element in clear]))
+    return Measurement(value=max(-lag, lag - _LATEST_S * fps, 0.0), detail=f"the states follow by {lag:+.2f} frames")
+
+
+@check(
+    group="alignment",
+    on=("dataset",),
+    needs=STATE_ALONE,
+    measures="episodes that end or begin in the middle of a motion, while others are at rest there",
+    warn=0,
+    fail=math.inf,
+)
+def whole_episodes(dataset: Dataset) -> Found:
+    """An episode begins and ends as the others do: catches recordings that were cut off, and halves of episodes."""
+    motions = [motion for motion in dataset.motions.all if len(motion.state) >= _FEWEST_FRAMES]
+    if len(motions) < _FEWEST_EPISODES:
+        return NotMeasured(why=f"fewer than {_FEWEST_EPISODES} episodes have {_FEWEST_FRAMES} frames")
+    spread = np.concatenate([motion.state for motion in motions]).std(axis=0) + 1e-3
+    ends = []
+    for motion in motions:
+        speed = np.linalg.norm(np.diff(motion.state / spread, axis=0), axis=1)
+        few, usual = max(1, round(_END_S * motion.fps)), float(np.sqrt((speed**2).mean()))
+        ends.append([speed[:few].mean() / max(usual, 1e-9), speed[-few:].mean() / max(usual, 1e-9)])
+    shares = np.array(ends)
+    at_rest = np.quantile(shares, _MOST, axis=0) < _RESTS
+    cut = (shares > _RUNS) & at_rest
+    wrong = [f"{motion.where} {word}" for motion, row in zip(motions, cut, strict=True)
+             for word, is_cut in zip(("begins", "ends"), row, strict=True) if is_cut]  # fmt: skip
+    return Measurement(value=len(wrong), detail=", ".join(wrong[:3]))
