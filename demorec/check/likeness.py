@@ -12,6 +12,7 @@ import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check
 from demorec.check.dataset import Dataset, Rows
+from demorec.check.evidence import Motion
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE
@@ -29,8 +30,10 @@ _LATEST_S = 0.35
 """How far behind its action a motion may be, seconds: as for states that follow targets."""
 
 _END_S = 0.15
-_MOST, _RESTS, _RUNS = 0.6, 0.15, 0.5
-"""Share of the episodes that are at rest at an end, and shares of an episode's mean speed: of rest, and of motion."""
+"""How long the first and last moments of an episode are, seconds."""
+_MOST, _ALIKE, _OTHER, _RARE = 0.7, 0.1, 0.5, 0.05
+"""Share of the episodes that are alike, how alike (in deviations of the opening, and shares of the mean speed), how far
+one is off that is not, and the share of those that are not from which on it is another way to do it."""
 
 likeness_check = partial(check, on=("dataset",), needs="actions of three episodes")
 
@@ -118,7 +121,8 @@ def motion_follows_action(dataset: Dataset) -> Found:
 
     By the lag at which an action is best told as a linear function of the ways that the states go in one frame.
     """
-    if dataset.motions.targets:
+    arm = np.arange(len(dataset.motions.moving)) != (dataset.motions.all[0].gripper if dataset.motions.all else None)
+    if dataset.motions.targets and dataset.motions.moving[arm].any():
         return NotMeasured(why="the action is a target of the state, which state_follows_action judges")
     found = _usable(dataset)
     if not isinstance(found, list):
@@ -154,24 +158,34 @@ def motion_follows_action(dataset: Dataset) -> Found:
     group="alignment",
     on=("dataset",),
     needs=STATE_ALONE,
-    measures="episodes that end or begin in the middle of a motion, while others are at rest there",
+    measures="episodes that alone begin or end in the middle of a motion, or with another opening of the gripper",
     warn=0,
     fail=math.inf,
 )
 def whole_episodes(dataset: Dataset) -> Found:
-    """An episode begins and ends as the others do: catches recordings that were cut off, and halves of episodes."""
+    """An episode begins and ends as the others do, if these are alike: catches recordings that were cut off, halves
+    of episodes, and two in one."""
     motions = [motion for motion in dataset.motions.all if len(motion.state) >= _FEWEST_FRAMES]
     if len(motions) < _FEWEST_EPISODES:
         return NotMeasured(why=f"fewer than {_FEWEST_EPISODES} episodes have {_FEWEST_FRAMES} frames")
     spread = np.concatenate([motion.state for motion in motions]).std(axis=0) + 1e-3
-    ends = []
-    for motion in motions:
-        speed = np.linalg.norm(np.diff(motion.state / spread, axis=0), axis=1)
-        few, usual = max(1, round(_END_S * motion.fps)), float(np.sqrt((speed**2).mean()))
-        ends.append([speed[:few].mean() / max(usual, 1e-9), speed[-few:].mean() / max(usual, 1e-9)])
-    shares = np.array(ends)
-    at_rest = np.quantile(shares, _MOST, axis=0) < _RESTS
-    cut = (shares > _RUNS) & at_rest
-    wrong = [f"{motion.where} {word}" for motion, row in zip(motions, cut, strict=True)
-             for word, is_cut in zip(("begins", "ends"), row, strict=True) if is_cut]  # fmt: skip
-    return Measurement(value=len(wrong), detail=", ".join(wrong[:3]))
+    gripper, wrong = motions[0].gripper, list[str]()
+    for word, row in (("begins", 0), ("ends", -1)):
+        speeds = np.array([_speed_at(motion, row, spread) for motion in motions])
+        told = {"in the middle of a motion": speeds}
+        if gripper is not None:
+            opening = np.array([motion.state[row, gripper] / spread[gripper] for motion in motions])
+            told["with another opening"] = np.abs(opening - np.median(opening))
+        for words, off in told.items():
+            alike = np.quantile(off, _MOST, method="lower") < _ALIKE
+            strange = np.flatnonzero(off > _OTHER) if alike else []
+            if len(strange) <= max(1, _RARE * len(motions)):
+                wrong += [f"{motions[number].where} {word} {words}, unlike the others" for number in strange]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+
+
+def _speed_at(motion: Motion, row: int, spread: Array) -> float:
+    """At the first row or the last one, as a share of its mean."""
+    speed = np.linalg.norm(np.diff(motion.state / spread, axis=0), axis=1)
+    few = max(1, round(_END_S * motion.fps))
+    return float(speed[row * few :][:few].mean() / max(float(np.sqrt((speed**2).mean())), 1e-9))
