@@ -4,7 +4,8 @@
     python benchmarks/dataset_faults.py --half looked      # only the half that was looked at when laws were written
     python benchmarks/dataset_faults.py --all              # every fault, with the checks that find it
 
-Datasets of three arms and kinds of action are spoilt on disk, one fault at a time (`dataset_fault_list.py`), in turns.
+Datasets of three arms and kinds of action are spoilt on disk, one fault at a time (`dataset_row_faults.py`,
+`dataset_file_faults.py`), in turns.
 Statistics follow the numbers and images, as they do when a converter has the fault. Every second fault belongs to the
 half that was only measured (`held`). Without the sidecar the columns that only demorec writes into `meta/episodes` are
 gone, too. LeRobot itself, which `demorec check` lets open each dataset, is not asked.
@@ -19,16 +20,25 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow.parquet as pq
-from dataset_fault_list import FAULTS, Fault
-from support import loose
+from dataset_file_faults import FILES, LANGUAGE, META, SIDECAR
+from dataset_row_faults import NUMBERS, ROWS, VIDEOS
 
 from demorec.check import dataset_files
 from demorec.check.base import Result
 from demorec.check.report import CheckOptions, Subject, check_subject
+
+FAULTS: list[tuple[str, str, Fault]] = [
+    (kind, name, fault)
+    for kind, faults in {
+        "numbers": NUMBERS, "rows": ROWS, "meta": META, "files": FILES, "videos": VIDEOS, "language": LANGUAGE,
+        "sidecar": SIDECAR,
+    }.items()
+    for name, fault in faults
+]  # fmt: skip
+"""Kind, name and fault; those of the sidecar tell nothing where there is none."""
 
 BASES = {
     "joint_increment": (("pick_place", "panda", "mild", 30, 3), ("stack", "panda", "mild", 30, 3)),
@@ -144,7 +154,9 @@ def main() -> None:
                 shares[half, sidecar, level] += 1
                 if args.all or level != "fail":
                     by = ", ".join(f"{r.check} ({r.level})" for r in found)
-                    print(f"{half:6} {'with' if sidecar else 'bare'} {base:15} {level:4} {kind}: {name}: {by}", flush=True)
+                    print(
+                        f"{half:6} {'with' if sidecar else 'bare'} {base:15} {level:4} {kind}: {name}: {by}", flush=True
+                    )
     for half in ("looked", "held"):
         for sidecar in (True, False):
             counts = [shares[half, sidecar, level] for level in LEVELS]

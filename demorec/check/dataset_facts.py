@@ -26,7 +26,6 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import read_robot
 from demorec.episode.episode import SuccessCheck
 
-
 _KEPT = ("success", "failure_phase", "failure_reason", "num_retries")
 _ATTEMPT = ("source", "run_episode_index", "attempt", "success", "failure_reason")
 _START = ("object", "object_x", "object_y", "goal_x", "goal_y")

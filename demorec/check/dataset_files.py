@@ -25,7 +25,6 @@ from demorec.datasets.lerobot.layout import EPISODES_PATH, VIDEO_PATH, FilePosit
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
 
-
 _OWN_PLACE = ("meta/episodes/chunk_index", "meta/episodes/file_index")
 """Columns that say in which file a row of the episodes' table is."""
 
@@ -83,9 +82,11 @@ def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
         begins = [name.replace("to_", "from_") for name in names]
         own = [name for name in _OWN_PLACE if set(_OWN_PLACE) <= set(columns)]
         for row in read_table(path, ["episode_index", "length", *names, *begins, *own]).to_pylist():
-            if own and FilePosition(chunk=row[own[0]], file=row[own[1]]).path(EPISODES_PATH) != path.relative_to(
-                dataset.path
-            ).as_posix():
+            if (
+                own
+                and FilePosition(chunk=row[own[0]], file=row[own[1]]).path(EPISODES_PATH)
+                != path.relative_to(dataset.path).as_posix()
+            ):
                 yield f"the file of the table's row of episode {row['episode_index']}"
             for begin, end in zip(begins, names, strict=True):
                 unit = 1 if end == "dataset_to_index" else dataset.info.fps

@@ -15,7 +15,6 @@ from demorec.check.dataset_statistics import episode_column, numbers_of, read_st
 from demorec.check.drawn import judge_lag, judge_unlike
 from demorec.core.geometry import Array
 
-
 _IN_ORDER = ("min", "q01", "q10", "q50", "q90", "q99", "max")
 """Statistics from the smallest to the largest."""
 
@@ -51,8 +50,9 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
 
 def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
     stated = numbers_of(said)
-    off = np.abs(stated - true) if stated.shape == (3,) else np.full(3, math.inf)
-    return Measurement(value=float(np.nan_to_num(off, nan=0.0 if np.isnan(true).any() else math.inf).max()), detail=detail)
+    if stated.shape != (3,) or not np.isfinite(stated).all():
+        return Measurement(value=math.inf, detail=detail)
+    return Measurement(value=float(np.nan_to_num(np.abs(stated - true)).max()), detail=detail)  # NaN: no image was seen
 
 
 def _disordered(told: Mapping[str, Any], stats: Mapping[str, Any], key: str) -> Measurement | None:

@@ -113,7 +113,9 @@ def quaternions(features: Mapping[str, NDArray[Any]], described: Mapping[str, Se
     """(what, (T, 4)) of all quaternions, by the names of their elements."""
     for feature, names in described.items():
         for place in quaternion_places(names or ()):
-            yield f"{feature}, {(names or ())[place][:-1]}", features[feature].reshape(-1, len(names or ()))[:, place : place + 4]
+            assert names is not None
+            table = features[feature].reshape(-1, len(names)).astype(np.float64)
+            yield f"{feature}, {names[place][:-1]}", table[:, place : place + 4]
 
 
 def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:

@@ -1,5 +1,6 @@
-"""Is each episode of a dataset like the others in what its robot keeps: how actions and motions go together, its mounts,
-where episodes begin and end. Whoever recorded them: nothing has to be known of the robot.
+"""Is each episode of a dataset like the others: how actions and states go together, how episodes begin and end.
+
+Whoever recorded them: nothing has to be known of the robot.
 """
 
 from __future__ import annotations
@@ -61,7 +62,11 @@ def _usable(dataset: Dataset) -> list[tuple[int, Array, Array]] | Found:
     if len(long) < _FEWEST_EPISODES:
         return NotMeasured(why=f"fewer than {_FEWEST_EPISODES} episodes have {_FEWEST_FRAMES} frames")
     found = [
-        (number, rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64), _evidence(_states(rows), dataset.info.fps))
+        (
+            number,
+            rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64),
+            _evidence(_states(rows), dataset.info.fps),
+        )
         for number, rows in long
     ]
     means, scales = [], []
@@ -132,9 +137,9 @@ def motion_follows_action(dataset: Dataset) -> Found:
     lags = range(-reach, reach + 1)
     steps = [np.diff(_states(dataset.rows[number]), axis=0) for number, _, _ in found]
     scale = np.concatenate(steps).std(axis=0)
-    told, all_of = np.zeros((len(lags), found[0][1].shape[1])), np.zeros(found[0][1].shape[1])
-    square = np.zeros((len(scale), len(scale)))
-    products = np.zeros((len(lags), len(scale), told.shape[1]))
+    width = found[0][1].shape[1]
+    square, all_of = np.zeros((len(scale), len(scale))), np.zeros(width)
+    products = np.zeros((len(lags), len(scale), width))
     for (_, action, _), step in zip(found, steps, strict=True):
         if len(step) <= 3 * reach:
             continue

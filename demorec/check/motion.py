@@ -13,7 +13,6 @@ from typing import Protocol
 import numpy as np
 
 from demorec.check.base import (
-    ACTIONS,
     EFFORTS,
     GRIPPER,
     STATE_ALONE,
@@ -48,10 +47,8 @@ _SLOW = 0.05
 """Root mean square speed, rad/s or m/s, above which a joint is judged even where others move ten times as far."""
 _MIDWAY = 1e-6
 """Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
-_MOVES = 1e-3
+MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
-_FAR = 0.2
-"""rad or m that no element goes by itself."""
 _SETTLE_S = 0.6
 """After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
 _LEAST_STROKE = 0.2
@@ -93,7 +90,7 @@ class Motions:
     def moving(self) -> Flags:
         """(D,) elements that have an action, and of which state and action change in some episode."""
         moves = [
-            (np.ptp(motion.state, axis=0) > _MOVES) & (np.ptp(_action(motion), axis=0) > _MOVES)
+            (np.ptp(motion.state, axis=0) > MOVES) & (np.ptp(_action(motion), axis=0) > MOVES)
             for motion in self.all
             if motion.action is not None
         ]
@@ -106,7 +103,7 @@ def _action(motion: Motion) -> Array:
 
 
 def _scaled(values: Array, state: Array) -> Array:
-    return np.asarray((values - values.mean(axis=0)) / np.maximum(state.std(axis=0), _MOVES))
+    return np.asarray((values - values.mean(axis=0)) / np.maximum(state.std(axis=0), MOVES))
 
 
 def correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
@@ -226,24 +223,6 @@ def _whole_ratio(motion: Motion, sums: Array) -> Measurement | None:
         return None
     ratio = product / max(square, 1e-12)
     return Measurement(value=abs(ratio - 1) * 0.5, detail=f"{motion.where}: ratio {ratio:.3f}")
-
-
-@motion_check(
-    measures="elements of the state that never change while their action does, or the other way round",
-    needs=ACTIONS,
-)
-def elements_alive(subject: Moving) -> Found:
-    """Encoders and commands are alive: of no element one stays at one value in all episodes while the other changes."""
-    pairs = [motion for motion in subject.motions.all if motion.action is not None and len(motion.state) >= FEWEST]
-    if not pairs:
-        return Lacking(need=ACTIONS)
-    stands = np.all([np.ptp(motion.state, axis=0) == 0 for motion in pairs], axis=0)
-    sent = np.any([np.ptp(_action(motion), axis=0) > 50 * _MOVES for motion in pairs], axis=0)
-    unsent = np.all([np.ptp(_action(motion), axis=0) == 0 for motion in pairs], axis=0)
-    moves = np.any([np.ptp(motion.state, axis=0) > _FAR for motion in pairs], axis=0)
-    is_dead = (stands & sent) | (unsent & moves)
-    dead = [name for name, row in zip(pairs[0].names, is_dead, strict=True) if row]
-    return Measurement(value=len(dead), detail=", ".join(dead))
 
 
 @motion_check(

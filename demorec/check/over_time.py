@@ -31,8 +31,6 @@ _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
-_FEWEST_VIEWS, _SAME = 4, 0.03
-"""Episodes from which on one is told from the others, and the share by which views differ that are the same."""
 _CLEAR_LEVELS, _REPEATED = 0.5, 0.1
 """Of 255, by which the images around one differ from theirs that shows motion, and the share of it below which it
 shows none."""
@@ -239,34 +237,6 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
             wrong = exchanged < _OTHER_VIEW * as_named
             frame = int(a.frames[int(np.argmax(wrong))]) if wrong.any() else None
             yield Measurement(value=int(wrong.sum()), frame=frame, detail=f"{a.where} and {other}")
-
-
-@film_check(
-    measures="how many times as far as the other episodes' an episode's view is from the usual one",
-    warn=3.0,
-    fail=float("inf"),
-    needs="images of four episodes",
-)
-def views_alike(subject: Filmed) -> Iterator[Found]:
-    """A camera shows the same place in the same colours in each episode: catches one that was moved, mirrored, cut
-    otherwise, or whose colours were converted twice. A view is the median of an episode's images.
-    """
-    for films in subject.films.values():
-        films = [film for film in films if len(film.cells) and not is_blank(film)]
-        if len(films) < _FEWEST_VIEWS or len({film.cells.shape[1:] for film in films}) > 1:
-            yield Lacking(need="images of four episodes")
-            continue
-        views = np.stack([np.median(film.cells, axis=0) for film in films])
-        # Light may be another one each time: what counts are the forms, and the colours beside each other.
-        grey = views.mean(axis=3)
-        centred = grey - grey.mean(axis=(1, 2), keepdims=True)
-        forms = centred / np.maximum(centred.std(axis=(1, 2), keepdims=True), 1.0)
-        colours = views / np.maximum(views.mean(axis=3, keepdims=True), 1.0)
-        for told in (forms, colours):
-            off = np.sqrt(((told - np.median(told, axis=0)) ** 2).mean(axis=tuple(range(1, told.ndim))))
-            strange = int(off.argmax())
-            others = float(np.delete(off, strange).max())
-            yield Measurement(value=float(off[strange]) / max(others, _SAME), detail=films[strange].where)
 
 
 @film_check(

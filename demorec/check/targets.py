@@ -20,7 +20,7 @@ from demorec.check.base import (
     worst_entry,
 )
 from demorec.check.evidence import Motion, quaternion_places
-from demorec.check.motion import FEWEST, Moving, correlations
+from demorec.check.motion import FEWEST, MOVES, Moving, correlations, motion_check
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 
@@ -34,6 +34,8 @@ _ALIKE = 3.0
 """Times the movement of the state that an action of its unit may move: teleoperation is scaled to half or double."""
 _COPIED = 1e-6
 """Share of the state's range within which an action is a state."""
+_FAR = 0.2
+"""rad or m that no element goes by itself."""
 _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
@@ -98,9 +100,7 @@ def actions_in_order(subject: Moving) -> Found:
     # Two joints of one motion may go alike; an exchange shows where an element hardly follows its own action at all.
     # A quaternion is left out: its elements are of one rotation, and a small one follows any other.
     turns = {i for place in quaternion_places(subject.motions.all[0].names) for i in range(place, place + 4)}
-    wrong = [
-        i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3 and kept[i] not in turns
-    ]
+    wrong = [i for i in range(count) if best[i] != i and table[i, best[i]] - table[i, i] > 0.3 and kept[i] not in turns]
     words = [f"{names[i]} follows that of {names[best[i]]}" for i in wrong]
     return Measurement(value=len(wrong), detail="; ".join(words[:3]))
 
@@ -138,6 +138,28 @@ def state_reaches_action(subject: Moving) -> Found:
         return NotMeasured(why="no joint is known whose action stays where it is for a while")
     name = max(least, key=lambda key: least[key])
     return Measurement(value=least[name], detail=name)
+
+
+@motion_check(
+    measures="elements of the state that never change while their action does, or the other way round",
+    needs=ACTIONS,
+)
+def elements_alive(subject: Moving) -> Found:
+    """Encoders and commands are alive: of no element one stays at one value in all episodes while the other changes."""
+    pairs = [
+        (motion.state, motion.action)
+        for motion in subject.motions.all
+        if motion.action is not None and len(motion.state) >= FEWEST
+    ]
+    if not pairs:
+        return Lacking(need=ACTIONS)
+    stands = np.all([np.ptp(state, axis=0) == 0 for state, _ in pairs], axis=0)
+    sent = np.any([np.ptp(action, axis=0) > 50 * MOVES for _, action in pairs], axis=0)
+    unsent = np.all([np.ptp(action, axis=0) == 0 for _, action in pairs], axis=0)
+    moves = np.any([np.ptp(state, axis=0) > _FAR for state, _ in pairs], axis=0)
+    is_dead = (stands & sent) | (unsent & moves)
+    dead = [name for name, row in zip(subject.motions.all[0].names, is_dead, strict=True) if row]
+    return Measurement(value=len(dead), detail=", ".join(dead))
 
 
 @check(

@@ -16,7 +16,7 @@ from support.check import checked, copy, edit_column, edit_json, simulate_run
 from support.export import rewrite_video
 
 from demorec.check.dataset import Dataset
-from demorec.check.targets import quaternion_elements
+from demorec.check.evidence import quaternion_places
 from demorec.cli import main
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
@@ -394,6 +394,7 @@ def test_images_of_an_episode_that_run_backwards(strange: Path, tmp_path: Path) 
 def test_only_quaternions_are_left_out_of_the_order_of_actions() -> None:
     joints = [f"arm.q{number}" for number in range(1, 8)]
     pose = ["position.x", "position.y", "position.z", *(f"orientation.{axis}" for axis in "xyzw")]
-    assert quaternion_elements([*joints, *pose]) == set(pose[3:])
-    assert quaternion_elements(["x", "y", "z", "qx", "qy", "qz", "qw", "gripper.width"]) == {"qx", "qy", "qz", "qw"}
-    assert quaternion_elements(joints) == set()
+    assert quaternion_places([*joints, *pose]) == [len(joints) + 3]
+    assert quaternion_places(["x", "y", "z", "qx", "qy", "qz", "qw", "gripper.width"]) == [3]
+    assert quaternion_places(["qw", "qx", "qy", "qz", "w"]) == [0]
+    assert quaternion_places(joints) == []

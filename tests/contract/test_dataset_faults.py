@@ -161,6 +161,25 @@ ALONE: dict[str, tuple[Fault, str]] = {
     ),
     "rows of no episode": (of_table("data", lambda t: pa.concat_tables([t, t.slice(0, 5)])), "dataset_counts"),
     "an episode that is done early": (value_of("next.done", 10, True), "dataset_counts"),
+    "a row of the episodes' table that is said to be in another file": (
+        value_of("meta/episodes/file_index", 1, 3, "meta/episodes"), "dataset_counts"
+    ),
+    "a reward without a success": (value_of("next.reward", 10, 1.0), "dataset_counts"),
+    "a depth map of three channels": (
+        of_info(lambda d: d["features"][CAMERA]["info"].update(is_depth_map=True)), "dataset_schema"
+    ),
+    "a deviation of images of 255": (
+        of_stats(CAMERA, "std", lambda v: [[[255 * row[0][0]]] for row in v]), "dataset_image_statistics"
+    ),
+    "quantiles of images out of order": (of_stats(CAMERA, "q10", lambda v: [[[0.99]]] * 3), "dataset_image_statistics"),
+    "image statistics without a maximum": (
+        lambda dataset: edit_json(dataset / "meta/stats.json", lambda data: data[CAMERA].pop("max")),
+        "dataset_image_statistics",
+    ),
+    "quaternions of another length": (
+        lambda dataset: edit_column(dataset, "observation.ee_pose", lambda rows: rows * [1, 1, 1, 1.1, 1.1, 1.1, 1.1]),
+        "unit_quaternions",
+    ),
     "statistics that are gone": (lambda dataset: (dataset / "meta/stats.json").unlink(), "dataset_statistics"),
 }  # fmt: skip
 """Name -> what is done to the files of a dataset without sidecar, and the check that fails."""
@@ -176,6 +195,49 @@ def test_the_files_alone_give_it_away(name: str, dataset: Path) -> None:
 
 def at(frame: int, change: Callable[[Any], Any]) -> Callable[[list[Any]], list[Any]]:
     return lambda images: [change(p) if number == frame else p for number, p in enumerate(images)]
+
+
+def second_video(dataset: Path) -> None:
+    path = next(dataset.glob("videos/*/*/*.mp4"))
+    shutil.copy(path, path.with_name("file-001.mp4"))
+
+
+def placeholder(dataset: Path) -> None:
+    path = dataset / "meta/tasks.parquet"
+    table = pq.read_table(path)
+    pq.write_table(replaced(table, "task", [f"task_{number}" for number in range(table.num_rows)]), path)
+
+
+WARNED: dict[str, tuple[Fault, str]] = {
+    "a file of images that no episode has": (second_video, "dataset_strays"),
+    "placeholders for instructions": (placeholder, "dataset_instructions"),
+}
+
+
+@pytest.mark.parametrize("name", WARNED)
+def test_what_is_warned_of(name: str, dataset: Path) -> None:
+    fault, check = WARNED[name]
+    assert level_of(dataset, check, "dataset") == "pass"
+    fault(dataset)
+    assert level_of(dataset, check, "dataset") == "warn"
+
+
+FACTS: dict[str, Fault] = {
+    "another duration": value_of("duration_s", 1, 99.0, "meta/episodes"),
+    "another mass": value_of("drawn/object_mass", 1, 99.0, "meta/episodes"),
+    "another measure of a condition": value_of("success_checks/tilt", 1, 0.3, "meta/episodes"),
+    "another start": value_of("object_x", 1, 0.1, "meta/episodes"),
+    "an attempt that is said to be left out": value_of("in_dataset", 1, False, "demorec/attempts"),
+    "an attempt of another start": value_of("object_x", 1, 0.1, "demorec/attempts"),
+}
+"""Name -> what is done to columns by which episodes are chosen, and to the attempts."""
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_a_fact_that_the_sidecar_contradicts(name: str, dataset: Path) -> None:
+    assert level_of(dataset, "dataset_facts", "dataset") == "pass"
+    FACTS[name](dataset)
+    assert level_of(dataset, "dataset_facts", "dataset") == "fail"
 
 
 IMAGES: dict[str, Callable[[list[Any]], list[Any]]] = {

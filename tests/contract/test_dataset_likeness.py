@@ -1,0 +1,90 @@
+"""Faults of one episode among others, and of actions that are no targets, in datasets of which only names are known."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import loose
+from support.check import level_of, simulate_run
+from support.dataset_edits import late, numbers
+from support.export import export, rewrite_video
+
+Fault = Callable[[Path], None]
+LAWS = ("actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position")
+
+
+@pytest.fixture(scope="module")
+def increments(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four episodes of increments, one camera, nothing of demorec beside them."""
+    folder = tmp_path_factory.mktemp("likeness")
+    run = simulate_run(folder / "run", 4, seed=3, fps=10, cameras=("wrist",), width=64, height=64)
+    export(run, folder / "dataset", action="joint_increment")
+    shutil.rmtree(folder / "dataset" / "demorec")
+    return folder / "dataset"
+
+
+def cut_off(dataset: Path) -> None:
+    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
+    loose.reframe(dataset, [parts[0], parts[1][: 2 * len(parts[1]) // 3], *parts[2:]])
+
+
+def at_half_the_rate(dataset: Path) -> None:
+    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
+    loose.reframe(dataset, [parts[0], parts[1][::2], *parts[2:]])
+
+
+FAULTS: dict[str, tuple[Fault, str, str]] = {
+    "zeros for the actions of one episode": (
+        numbers("action", np.zeros_like, only=(1,)), "actions_go_with_states", "fail"
+    ),
+    "actions of one episode backwards": (
+        numbers("action", lambda rows: rows[::-1], only=(1,)), "actions_go_with_states", "fail"
+    ),
+    "actions eight frames late": (numbers("action", lambda rows: late(rows, 8)), "motion_follows_action", "fail"),
+    "an episode that was cut off": (cut_off, "whole_episodes", "warn"),
+    "an episode of half the rate": (at_half_the_rate, "velocity_matches_position", "fail"),
+}  # fmt: skip
+
+
+def test_good_ones_pass(increments: Path) -> None:
+    assert [level_of(increments, law, "dataset") for law in LAWS] == ["pass"] * len(LAWS)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Path) -> None:
+    fault, law, level = FAULTS[name]
+    dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
+    fault(dataset)
+    assert level_of(dataset, law, "dataset") == level
+
+
+def test_images_that_are_the_ones_before(increments: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
+    assert level_of(dataset, "images_repeated", "dataset") == "pass"
+    rewrite_video(
+        dataset,
+        "observation.images.wrist",
+        lambda images: [images[n - 1] if n % 6 == 5 else image for n, image in enumerate(images)],
+    )
+    assert level_of(dataset, "images_repeated", "dataset") == "warn"
+
+
+def test_an_arm_that_begins_to_move_has_no_dead_band(tmp_path: Path) -> None:
+    """What is sent to an arm at rest is 0.02 rad away within one frame of ten a second."""
+    run = simulate_run(tmp_path / "run", 3, robot="so101", variation="mild", seed=3604, fps=10)
+    export(run, tmp_path / "dataset")
+    assert level_of(tmp_path / "dataset", "dead_band", "dataset") == "pass"
+
+
+def test_an_so101_in_metres_is_known_by_its_names(tmp_path: Path) -> None:
+    """LeRobot's own arms call the gripper gripper.pos, in degrees or shares, and say nothing of lengths."""
+    run = simulate_run(tmp_path / "run", 1, robot="so101", seed=3, fps=10)
+    export(run, tmp_path / "dataset")
+    shutil.rmtree(tmp_path / "dataset" / "demorec")
+    assert level_of(tmp_path / "dataset", "joint_limits", "dataset") == "pass"
+    numbers("observation.state", np.degrees)(tmp_path / "dataset")
+    assert level_of(tmp_path / "dataset", "joint_limits", "dataset") == "fail"
