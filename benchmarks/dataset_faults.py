@@ -25,6 +25,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from dataset_file_faults import FILES, LANGUAGE, META, SIDECAR
 from dataset_row_faults import NUMBERS, ROWS, VIDEOS
+from support.dataset_edits import Fault
 
 from demorec.check import dataset_files
 from demorec.check.base import Result

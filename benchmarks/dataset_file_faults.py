@@ -1,4 +1,4 @@
-"""Faults in tables, files, language and sidecar of LeRobot datasets, for `dataset_faults.py`: what converters, merges, edits, resampling and downloads do.
+"""Faults in tables, files, words and sidecar of LeRobot datasets, for `dataset_faults.py`.
 
 The order is fixed: every second fault belongs to the half that was never looked at when laws were written.
 """
@@ -20,36 +20,38 @@ from support.dataset_edits import (
     WRIST,
     Fault,
     at,
-    both_tables,
     cells,
     cut,
+    hole,
+    info,
+    numbers,
+    of_json,
+    on_disk,
+    pointer,
+    said,
+    spoken,
+    stats,
+    swap,
+    table,
+)
+from support.dataset_particular import (
+    both_tables,
     exchange,
     exchanged_files,
     exchanged_films,
     exchanged_paths,
     first_subtask,
     heavier,
-    hole,
-    info,
-    numbers,
-    of_json,
-    on_disk,
     one_file_for_both,
     other_camera,
     other_measure,
     other_tcp,
     phases_late,
-    pointer,
     points,
     range_late,
     renamed,
-    said,
-    spoken,
-    stats,
     stats_mean_of_means,
     stats_of_first,
-    swap,
-    table,
     turned_mount,
 )
 

@@ -1,4 +1,4 @@
-"""Faults in rows and images of LeRobot datasets, for `dataset_faults.py`: what converters, merges, edits, resampling and downloads do.
+"""Faults in rows and images of LeRobot datasets, for `dataset_faults.py`.
 
 The order is fixed: every second fault belongs to the half that was never looked at when laws were written.
 """
@@ -19,33 +19,35 @@ from support.dataset_edits import (
     WRIST,
     Fault,
     alike,
-    bar,
-    blocks,
     blurred,
     both,
     columns,
     exchanged,
-    exchanged_features,
     film,
-    film_of_other,
     filtered,
-    first_of_other,
     frozen,
     halved,
-    held,
     late,
     middle,
-    middle_all,
     noisy,
-    normalised,
     numbers,
     one,
     pixels,
     reframed,
-    repeats,
     scaled,
-    spot,
     table,
+)
+from support.dataset_particular import (
+    bar,
+    blocks,
+    exchanged_features,
+    film_of_other,
+    first_of_other,
+    held,
+    middle_all,
+    normalised,
+    repeats,
+    spot,
     turned,
 )
 

@@ -31,9 +31,6 @@ _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
-_CLEAR_LEVELS, _REPEATED = 0.5, 0.1
-"""Of 255, by which the images around one differ from theirs that shows motion, and the share of it below which it
-shows none."""
 _STANDS = 0.02
 """Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
 
@@ -237,26 +234,3 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
             wrong = exchanged < _OTHER_VIEW * as_named
             frame = int(a.frames[int(np.argmax(wrong))]) if wrong.any() else None
             yield Measurement(value=int(wrong.sum()), frame=frame, detail=f"{a.where} and {other}")
-
-
-@film_check(
-    measures="share of moving frames whose image is the one before again",
-    warn=0.05,
-    fail=float("inf"),
-)
-def images_repeated(subject: Filmed) -> Iterator[Found]:
-    """Each image is one of its own where the camera sees the robot move: catches a camera that is slower than the
-    frames, lost images that were filled up, and images that were made of their neighbours.
-    """
-    for films in subject.films.values():
-        for film in films:
-            if film.state is None or len(film.cells) < _FEWEST_IMAGES or is_blank(film):
-                continue
-            speed = np.linalg.norm(np.diff(film.state / (film.state.std(axis=0) + 1e-3), axis=0), axis=1)
-            shown, moves = film.step, _moves(speed)
-            around = np.minimum(np.append(shown[1:], 0.0), np.append(0.0, shown[:-1]))
-            rows = moves & (around > _CLEAR_LEVELS)
-            if rows.sum() < _FEWEST_IMAGES:
-                continue
-            same = rows & (shown < _REPEATED * around)
-            yield Measurement(value=float(same.sum() / rows.sum()), detail=film.where)
