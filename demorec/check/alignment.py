@@ -143,6 +143,10 @@ def gripper_lag(episode: CheckedEpisode) -> Iterator[Found]:
         yield Measurement(value=off, frame=frame, detail=f"starts {late} frames after the command")
 
 
+_BLURRED_S = 1 / 15
+"""By which the noise that increments take back moves their course, seconds."""
+
+
 @sidecar_check(
     measures="lag between action and state, off the contract's, frames",
 )
@@ -152,7 +156,7 @@ def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
     Poses are compared by position. Exploration noise is in the states and not in the actions: what counts is the
     third of the moving frames in which the two are nearest. Increments are summed up first; where noise was executed,
     it is taken back in them and they cannot be: then their course, smoothed, is compared with that of the changes of
-    state, all episodes together, and two frames are allowed.
+    state, all episodes together, and two frames of 30 a second are allowed.
     """
     wishes, changes = [], []
     for each in dataset.described():
@@ -184,11 +188,12 @@ def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
             value, words = (math.inf, "unrelated") if off > 3.0 else (abs(lag), f"{lag:+d} frames")
             yield Measurement(value=value, detail=f"episode {each.number}: {words}")
     if wishes:
-        yield _course_lag(wishes, changes)
+        yield _course_lag(wishes, changes, allowed=max(2, round(_BLURRED_S * dataset.info.fps)))
 
 
-def _course_lag(wishes: list[Array], changes: list[Array], *, reach: int = 4, window: int = 9) -> Measurement:
-    """By how many whole frames changes run behind wishes, by the correlation of their smoothed courses."""
+def _course_lag(wishes: list[Array], changes: list[Array], *, allowed: int, window: int = 9) -> Measurement:
+    """By how many whole frames beyond those allowed changes run behind wishes, by their smoothed courses' correlation."""
+    reach = 2 * allowed
     box = np.ones(window) / window
 
     def smooth(table: Array) -> Array:
@@ -205,4 +210,6 @@ def _course_lag(wishes: list[Array], changes: list[Array], *, reach: int = 4, wi
     lag = best - reach
     if likeness < 0.5:
         return Measurement(value=math.inf, detail=f"actions and changes of state are unrelated ({likeness:.2f})")
-    return Measurement(value=max(abs(lag) - 2, 0), detail=f"all episodes: {lag:+d} frames, likeness {likeness:.2f}")
+    return Measurement(
+        value=max(abs(lag) - allowed, 0), detail=f"all episodes: {lag:+d} frames, likeness {likeness:.2f}"
+    )

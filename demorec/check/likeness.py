@@ -80,8 +80,8 @@ def _usable(dataset: Dataset) -> list[tuple[int, Array, Array]] | Found:
 @likeness_check(
     group="alignment",
     measures="by how much less than usual an episode's action goes with its states, as a correlation",
-    warn=0.35,
-    fail=0.5,
+    warn=0.5,
+    fail=0.7,
 )
 def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     """What an action does to the states is the same in each episode: catches actions of another episode, zeros, joints
