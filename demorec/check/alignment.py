@@ -192,7 +192,7 @@ def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
 
 
 def _course_lag(wishes: list[Array], changes: list[Array], *, allowed: int, window: int = 9) -> Measurement:
-    """By how many whole frames beyond those allowed changes run behind wishes, by their smoothed courses' correlation."""
+    """By how many frames beyond those allowed changes run behind wishes, by the correlation of smoothed courses."""
     reach = 2 * allowed
     box = np.ones(window) / window
 
