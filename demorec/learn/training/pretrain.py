@@ -29,7 +29,7 @@ from demorec.core.errors import ConfigError, DemorecError, describe_error
 from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
 from demorec.learn.training.columns import numbers
 from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
-from demorec.learn.training.reader import FastDataset
+from demorec.learn.training.reader import INTERVENTION, FastDataset, expert_acts
 from demorec.lerobot_policy import vocabulary_of
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
@@ -161,7 +161,11 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
     places = [_names(features[pose]).index(name) for name in _TCP]
     tcp = _column(dataset, pose)[:, places]
     opening = _column(dataset, _ACTION)[:, _names(features[_ACTION]).index(_OPENING)]
-    keyframes = find_keyframes(opening, _column(dataset, "episode_index").reshape(-1))
+    episode = _column(dataset, "episode_index").reshape(-1)
+    keyframes = find_keyframes(opening, episode)
+    if INTERVENTION in features:  # where a policy closed and was corrected, is where not to close
+        is_expert = expert_acts(episode, _column(dataset, INTERVENTION))
+        keyframes = np.where(is_expert[keyframes], keyframes, -1)
     return keyframe_targets(tcp[:, :3], tcp[:, 3:], keyframes)
 
 
