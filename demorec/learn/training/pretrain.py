@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.transforms import ImageTransforms
+from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
@@ -113,16 +113,9 @@ def pretrain(
     """
     if getattr(config.policy, "type", None) != "act_keypoints":
         raise ConfigError("Only the encoder of one type of policy can be pretrained: --policy.type=act_keypoints.")
-    chosen, is_changing = config.dataset, config.dataset.image_transforms.enable
-    dataset = FastDataset(
-        chosen.repo_id,
-        root=chosen.root,
-        episodes=chosen.episodes,
-        revision=chosen.revision,
-        video_backend=chosen.video_backend,
-        image_transforms=ImageTransforms(chosen.image_transforms) if is_changing else None,
-        frame_cache_bytes=frame_cache_bytes,
-    )
+    chosen = config.dataset
+    changes = chosen.image_transforms if chosen.image_transforms.enable else None
+    dataset = _opened(chosen, changes, frame_cache_bytes)
     targets = read_targets(dataset)
     if not dataset.meta.camera_keys:
         raise ConfigError(f"The dataset has no images to learn from: {dataset.root}")
@@ -131,7 +124,7 @@ def pretrain(
         "dataset": _digest(dataset),
         "episodes": chosen.episodes,
         "policy": _deciding(config.policy),
-        "image_transforms": json.loads(json.dumps(asdict(chosen.image_transforms))) if is_changing else None,
+        "image_transforms": changes and json.loads(json.dumps(asdict(changes))),
         "targets": list(targets.names),
     }
     out.mkdir(parents=True, exist_ok=True)
@@ -148,6 +141,18 @@ def pretrain(
         replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "result": asdict(result)}, indent=1))
         (out / UNFINISHED_NAME).unlink(missing_ok=True)
         return result
+
+
+def _opened(chosen: Any, changes: ImageTransformsConfig | None, frame_cache_bytes: int) -> FastDataset:
+    return FastDataset(
+        chosen.repo_id,
+        root=chosen.root,
+        episodes=chosen.episodes,
+        revision=chosen.revision,
+        video_backend=chosen.video_backend,
+        image_transforms=changes and ImageTransforms(changes),
+        frame_cache_bytes=frame_cache_bytes,
+    )
 
 
 def read_targets(dataset: FastDataset) -> KeyframeTargets:
