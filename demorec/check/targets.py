@@ -243,7 +243,7 @@ def dead_band(subject: Moving) -> Found:
                 continue
             changes = np.flatnonzero(np.abs(np.diff(motion.state[:, element])) > _STAYS) + 1
             begins, ends = np.append(0, changes), np.append(changes, len(action)) - 1
-            acted = np.maximum(ends - 1, begins)  # what the last frame is sent, moves the one after it
+            acted = np.maximum(ends - 1, begins)  # what the last frame is sent moves the one after it
             way = np.abs(action[acted] - action[begins]) * (measured[ends] > measured[begins])
             ways.setdefault(motion.names[element], []).extend(way[way > _GOES].tolist())
     if not ways:

@@ -142,7 +142,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     names = options.cameras or tuple(camera.name for camera in info.scene.cameras)
     if not names:
         raise ConfigError("The recording has no cameras: name some with --cameras.")
-    if len(set(names)) != len(names):
+    if len(set(map(camera_name, names))) != len(names):
         raise ConfigError(f"A camera is named twice: {' '.join(names)}.")
     recorded = {camera.name: camera for camera in info.scene.cameras}
     true = {camera.name: camera for camera in old.true_cameras}

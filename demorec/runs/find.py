@@ -177,7 +177,7 @@ def _file(path: Path) -> Found:
         if kind == "recording" and _is_foreign(file):
             kind = "rosbag"
     if kind is None:
-        reason = "The file is no recording (.mcap)" if head else "The file is empty"
+        reason = "The file is no recording (.mcap), HDF5 file or bag" if head else "The file is empty"
         return Found(path=path, kind="nothing", reason=reason)
     return Found(path=path, kind=kind, recordings=(path,) if kind == "recording" else ())
 

@@ -122,7 +122,7 @@ def test_lerobot_loads_the_policy_by_its_name_and_it_acts(pretrained: Path) -> N
     batch["task"] = ["put the red cube on the green target"] * 3
     actions = policy.predict_action_chunk(batch)
     assert actions.shape == (3, config.chunk_size, 7)
-    changed = batch | {"observation.images.wrist": batch["observation.images.wrist"] + 1}
+    changed = batch | {"observation.images.wrist": 5 * batch["observation.images.wrist"].flip(-1)}
     assert not torch.allclose(actions, policy.predict_action_chunk(changed), atol=1e-4)
     changed = batch | {"task": ["move the red cube to the green target"] * 3}
     assert {"put", "move", "red", "green"} <= set(config.vocabulary)
@@ -185,6 +185,33 @@ def test_one_stopped_in_its_last_part_ends_with_the_same_weights(
     one, other = weights(pretrained), weights(tmp_path / "out")
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_changed_images_are_the_same_after_a_stop(
+    settings: Path, pretrained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from demorec.learn.training import pretrain as pretraining
+    from demorec.learn.training.command import training_config
+
+    def stop(text: str) -> None:
+        if text.startswith("update 2 "):
+            raise KeyboardInterrupt
+
+    changing = "--dataset.image_transforms.enable=true"
+    assert pretrain(settings, tmp_path / "whole", changing) == 0
+    plan = pretraining.PretrainConfig(updates=6, batch_size=4, seed=1000)
+    config = training_config([f"--config_path={settings}", changing])
+    with pytest.raises(KeyboardInterrupt):
+        pretraining.pretrain(
+            config, plan, tmp_path / "stopped", frame_cache_bytes=1 << 28, on_progress=stop, save_every=2
+        )
+    assert pretrain(settings, tmp_path / "stopped") == 2
+    assert "another image_transforms" in capsys.readouterr().err
+    assert pretrain(settings, tmp_path / "stopped", changing) == 0
+    whole, stopped, plain = (weights(folder) for folder in (tmp_path / "whole", tmp_path / "stopped", pretrained))
+    for name in whole:
+        np.testing.assert_array_equal(whole[name], stopped[name], err_msg=name)
+    assert any((whole[name] != plain[name]).any() for name in whole)
 
 
 def test_another_pretraining_in_the_folder_is_refused(

@@ -174,6 +174,12 @@ def test_a_state_that_is_measured_less_often_than_frames_are_is_no_dead_band(str
     assert level(held, "dead_band") == "pass"
 
 
+def test_a_joint_that_waits_and_goes_has_no_dead_band_at_few_frames_a_second(tmp_path: Path) -> None:
+    run = simulate_run(tmp_path / "run", 5, seed=91, task="stack", robot="so101", variation="full", fps=10, cameras=())
+    export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False))
+    assert level(tmp_path / "ds", "dead_band") == "pass"
+
+
 def test_a_wrong_rate_is_found(strange: Path, tmp_path: Path) -> None:
     spoilt = copy(strange, tmp_path / "ds")
     edit_json(spoilt / "meta/info.json", slower)

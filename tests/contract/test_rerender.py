@@ -123,7 +123,9 @@ def test_a_camera_of_ones_own_stands_where_it_is_said(
     filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(own_camera(tmp_path))
-    assert exit_code("render", filmed, "--out", tmp_path / "out", "--cameras", "rerender_cameras:SIDE") == 0
+    twice = ("rerender_cameras:SIDE", "rerender_cameras:Side")
+    assert exit_code("render", filmed, "--out", tmp_path / "out", "--cameras", *twice) == 2
+    assert exit_code("render", filmed, "--out", tmp_path / "out", "--cameras", twice[0]) == 0
     with Recording(tmp_path / "out" / "filmed.mcap") as recording:
         (camera,) = recording.info.scene.cameras
     assert camera.name == "side"

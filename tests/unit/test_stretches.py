@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.export import export
 from support.recording import make_episode
@@ -15,11 +16,12 @@ from demorec.core.errors import ConfigError
 from demorec.mcap import EpisodeWriter
 
 
-def write(path: Path, episode_index: int, phases: Sequence[str]) -> None:
+def write(path: Path, episode_index: int, phases: Sequence[str], openings: Sequence[float] | None = None) -> None:
     info, frames, outcome = make_episode(num_frames=len(phases), cameras=(), episode_index=episode_index)
     with EpisodeWriter(path, info) as writer:
-        for frame, phase in zip(frames, phases, strict=True):
-            writer.write(replace(frame, phase=phase))
+        for number, (frame, phase) in enumerate(zip(frames, phases, strict=True)):
+            action = replace(frame.action, gripper_target=openings[number]) if openings else frame.action
+            writer.write(replace(frame, phase=phase, action=action))
         writer.finish(outcome)
 
 
@@ -46,3 +48,28 @@ def test_a_dataset_shows_the_expert_alone(tmp_path: Path) -> None:
     export(tmp_path / "run", tmp_path / "silent")
     with pytest.raises(ConfigError, match="--intervention"):
         FastDataset("local/d", root=tmp_path / "silent", expert_only=True)
+
+
+@pytest.mark.usefixtures("hf_datasets_cache")
+def test_where_a_policy_closed_and_was_corrected_is_nothing_to_see(tmp_path: Path) -> None:
+    from demorec.learn.training import FastDataset
+    from demorec.learn.training.pretrain import read_targets
+
+    (tmp_path / "run").mkdir()
+    closes_and_opens = [0.08, 0.08, 0.0, 0.0, 0.08, 0.08]
+    phases = ["policy"] * 4 + ["expert"] * 8
+    write(tmp_path / "run" / "episode_000000.mcap", 0, phases[4:10], closes_and_opens)
+    write(tmp_path / "run" / "episode_000001.mcap", 1, phases, closes_and_opens * 2)  # first the policy closes
+    choice: dict[str, Any] = {"action": "ee_delta", "state": "joint_ee"}
+    export(tmp_path / "run", tmp_path / "d", intervention=True, **choice)
+    export(tmp_path / "run", tmp_path / "silent", **choice)
+    ahead = {}
+    for name in ("d", "silent"):
+        targets = read_targets(FastDataset("local/d", root=tmp_path / name))
+        columns = [targets.names.index(f"{command}.x") for command in ("closing", "opening")]
+        ahead[name] = ~np.isnan(targets.values[:, columns])
+    demonstration = [[1, 1], [1, 1], [0, 1], [0, 1], [0, 0], [0, 0]]
+    closing = [0, 0, *[1] * 6, *[0] * 4]
+    opening = [1] * 10 + [0] * 2
+    assert ahead["d"].astype(int).tolist() == [*demonstration, *map(list, zip(closing, opening, strict=True))]
+    assert ahead["silent"][6:, 0].astype(int).tolist() == [1, 1, *closing[2:]]

@@ -28,6 +28,17 @@ INTERVENTION = "intervention"
 STRETCH_COLUMNS = ("index", "episode_index", INTERVENTION)
 
 
+def expert_acts(episode: NDArray[Any], intervention: NDArray[Any]) -> NDArray[np.bool_]:
+    """(N,) whether the expert acts in a frame: everywhere in the episodes that it did not correct.
+
+    Args:
+        episode: (N,) number of each frame's episode.
+        intervention: N times whether it acts, having taken over from a policy.
+    """
+    acts = intervention.reshape(-1).astype(bool)
+    return np.asarray(acts | ~np.isin(episode, episode[acts]))
+
+
 class Stretches:
     """The stretches of frames in which the expert acts; an episode without corrections is one stretch.
 
@@ -43,18 +54,16 @@ class Stretches:
     """
 
     def __init__(self, *, index: NDArray[Any], episode_index: NDArray[Any], intervention: NDArray[Any]) -> None:
-        acts = intervention.reshape(-1).astype(bool)
-        episode = episode_index.reshape(-1)
-        index = index.reshape(-1)
-        is_expert = acts | ~np.isin(episode, episode[acts])
+        episode, index = episode_index.reshape(-1), index.reshape(-1)
+        is_expert = expert_acts(episode, intervention)
         expert, others = np.flatnonzero(is_expert), np.flatnonzero(~is_expert)
-        self.shown = np.arange(len(acts))
+        self.shown = np.arange(len(index))
         self.shown[others] = expert[np.arange(len(others)) * len(expert) // max(1, len(others))]
         begins = np.diff(episode, prepend=-1) != 0
         begins[1:] |= is_expert[1:] != is_expert[:-1]
         starts = np.flatnonzero(begins)
         number = np.cumsum(begins) - 1
-        ends = np.append(starts[1:], len(acts))
+        ends = np.append(starts[1:], len(index))
         self.first, self.end = index[starts][number], (index[ends - 1] + 1)[number]
 
 
