@@ -55,8 +55,11 @@ def dataset_language(dataset: Dataset) -> Measurement | None:
     fail=math.inf,
 )
 def dataset_instructions(dataset: Dataset) -> Measurement:
-    """Each task says in words what to do: catches names of files, placeholders, and one text under two numbers."""
-    wrong = [text for text in dataset.tasks if len(_WORD.findall(text)) < _FEWEST_WORDS]
+    """Each task says in words what to do: catches names of files, placeholders, and one text under two numbers.
+
+    Other scripts than Latin have no spaces between words, so of them only equal texts count.
+    """
+    wrong = [text for text in dataset.tasks if text.isascii() and len(_WORD.findall(text)) < _FEWEST_WORDS]
     wrong += [text for number, text in enumerate(dataset.tasks) if text in dataset.tasks[:number]]
     return Measurement(value=len(wrong), detail="; ".join(map(repr, wrong[:3])) or f"{len(dataset.tasks)} tasks")
 

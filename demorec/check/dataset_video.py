@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.datasets.lerobot.reader import EpisodePlace
+
+if TYPE_CHECKING:
+    import av
 
 _PARTS = 16
 """Parts along the shorter side, about, whose mean colours stand for an image."""
@@ -64,8 +67,8 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
         cells = np.stack([cell for cell, _ in images])
         mean = cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255
         moments = [moment for _, moment in images if moment is not None]
-        first, second = np.mean(moments, axis=0) if moments else np.full((2, 3), np.nan)
-        std = np.sqrt(np.maximum(second - first**2, 0.0))
+        colour, squared = np.mean(moments, axis=0) if moments else np.full((2, 3), np.nan)
+        std = np.sqrt(np.maximum(squared - colour**2, 0.0))
         found.append(EpisodeImages(count=len(cells), mean=mean, std=std, cells=cells))
     return found
 
@@ -93,13 +96,13 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
             for number, frame in enumerate(container.decode(video=0)):
                 small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
                 cells = cast("NDArray[np.uint8]", small.to_ndarray())
-                yield cells, None if number % _EVERY else _moments(frame.to_ndarray(format="rgb24"))
+                yield cells, None if number % _EVERY else _moments(frame)
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error
 
 
-def _moments(image: NDArray[np.uint8]) -> Array:
-    values = image.reshape(-1, 3) / np.float32(255)
+def _moments(frame: av.VideoFrame) -> Array:
+    values = frame.to_ndarray(format="rgb24").reshape(-1, 3) / np.float32(255)
     return np.stack([values.mean(axis=0), (values**2).mean(axis=0)]).astype(np.float64)
 
 

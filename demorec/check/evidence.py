@@ -20,7 +20,7 @@ from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
 from demorec.episode.episode import Columns
-from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
+from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.robots.urdf import Urdf
 
@@ -295,11 +295,12 @@ def _motion(
 
 
 def _sensors(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> dict[str, NDArray[Any]]:
-    """What is observed beside the state."""
+    """What is observed beside the state, and is no truth of the simulator's."""
+    others = (STATE, ENVIRONMENT_STATE)
     return {
         name: values
         for name, values in features.items()
-        if name.startswith("observation.") and name in names and name != STATE
+        if name.startswith("observation.") and name in names and name not in others
     }
 
 

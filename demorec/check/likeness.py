@@ -124,7 +124,8 @@ def motion_follows_action(dataset: Dataset) -> Found:
     """Increments, deltas of a pose and velocities make the state move in the same frame and soon after: catches those
     that were recorded late, early, or filtered. Targets are left to `state_follows_action`.
 
-    By the lag at which an action is best told as a linear function of the ways that the states go in one frame.
+    By the lag at which an action is best told as a linear function of the ways that the states go in one frame. One
+    that the states tell better is a target, whatever it is called.
     """
     arm = np.arange(len(dataset.motions.moving)) != (dataset.motions.all[0].gripper if dataset.motions.all else None)
     if dataset.motions.targets and dataset.motions.moving[arm].any():
@@ -152,11 +153,20 @@ def motion_follows_action(dataset: Dataset) -> Found:
         return NotMeasured(why="the episodes are too short to tell which of state and action is first")
     inverse = np.linalg.inv(square + _RIDGE * max(float(np.trace(square)) / len(square), 1e-9) * np.eye(len(square)))
     told = np.einsum("lnk,nm,lmk->lk", products, inverse, products) / np.maximum(all_of, 1e-9)
-    clear = np.flatnonzero(told.max(axis=0) > _CLEAR**2)
+    clear = np.flatnonzero((told.max(axis=0) > _CLEAR**2) & (told.max(axis=0) > _told_by_states(found, len(scale))))
     if not len(clear):
         return NotMeasured(why="the actions do not go with the states' motion")
     lag = float(np.median([finest_lag(lags, (-told[:, element]).tolist()) for element in clear]))
     return Measurement(value=max(-lag, lag - _LATEST_S * fps, 0.0), detail=f"the states follow by {lag:+.2f} frames")
+
+
+def _told_by_states(found: list[tuple[int, Array, Array]], size: int) -> Array:
+    """(K,) share of each action that is a linear function of the states in the same frame, of which there are D."""
+    actions = np.concatenate([a for _, a, _ in found])
+    states = np.concatenate([e[:, :size] for _, _, e in found])
+    square, product = states.T @ states + _RIDGE * len(states) * np.eye(size), states.T @ actions
+    told = (product * np.linalg.solve(square, product)).sum(axis=0)
+    return np.asarray(told / np.maximum((actions**2).sum(axis=0), 1e-9))
 
 
 @check(
@@ -183,7 +193,7 @@ def whole_episodes(dataset: Dataset) -> Found:
             told["with another opening"] = np.abs(opening - np.median(opening))
         for words, off in told.items():
             alike = np.quantile(off, _MOST, method="lower") < _ALIKE
-            strange = np.flatnonzero(off > _OTHER) if alike else []
+            strange = np.flatnonzero((off > _OTHER) & alike)
             if len(strange) <= max(1, _RARE * len(motions)):
                 wrong += [f"{motions[number].where} {word} {words}, unlike the others" for number in strange]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))

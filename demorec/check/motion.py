@@ -11,6 +11,7 @@ from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.base import (
     EFFORTS,
@@ -45,6 +46,8 @@ _VELOCITY_S = 0.3
 """Over which velocities are added up: filters of drivers are 20 to 100 ms late, which cancels over longer times."""
 _SLOW = 0.05
 """Root mean square speed, rad/s or m/s, above which a joint is judged even where others move ten times as far."""
+_LIVELY = 0.25
+"""Share of what all episodes move in a frame, squared, from which the velocities of one are judged by themselves."""
 _MIDWAY = 1e-6
 """Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
 MOVES = 1e-3
@@ -188,18 +191,17 @@ def velocity_matches_position(subject: Moving) -> Iterator[Found]:
     if not pairs:
         yield Lacking(need=VELOCITIES)
         return
-    sums, count = np.zeros((3, len(pairs[0].names))), 0
+    parts, counts = [], []
     for motion in pairs:
         assert motion.velocity is not None
         mean = (motion.velocity[1:] + motion.velocity[:-1]) / 2
         ways = np.vstack([np.zeros(mean.shape[1]), np.cumsum(mean * motion.steps_s[:, None], axis=0)])
         reach = min(max(1, round(_VELOCITY_S * motion.fps)), len(ways) - 1)
         integrated, moved = ways[reach:] - ways[:-reach], motion.state[reach:] - motion.state[:-reach]
-        count += len(moved)
-        own = np.array([(moved * integrated).sum(axis=0), (integrated**2).sum(axis=0), (moved**2).sum(axis=0)])
-        sums += own
-        if len(pairs) > 1 and len(moved) >= FEWEST:
-            yield _whole_ratio(motion, own)
+        parts.append([(moved * integrated).sum(axis=0), (integrated**2).sum(axis=0), (moved**2).sum(axis=0)])
+        counts.append(len(moved))
+    yield from _of_single_episodes(pairs, np.array(parts), np.array(counts))
+    sums, count = np.sum(parts, axis=0), sum(counts)
     known = np.flatnonzero(np.isfinite(sums[0]) & (sums[2] > 0))
     if not len(known):
         return
@@ -216,13 +218,17 @@ def velocity_matches_position(subject: Moving) -> Iterator[Found]:
     yield Measurement(value=float(off[worst]), detail=f"{names[worst]}: ratio {ratio[worst]:.3f}")
 
 
-def _whole_ratio(motion: Motion, sums: Array) -> Measurement | None:
-    """Of all joints of an episode that is one of many, by half: of what single episodes have, noise is a part."""
-    product, square, total = np.nansum(np.where(np.isfinite(sums[0]), sums, 0.0), axis=1)
-    if not total > 0:
-        return None
-    ratio = product / max(square, 1e-12)
-    return Measurement(value=abs(ratio - 1) * 0.5, detail=f"{motion.where}: ratio {ratio:.3f}")
+def _of_single_episodes(motions: Sequence[Motion], parts: Array, counts: NDArray[np.int64]) -> Iterator[Measurement]:
+    """Of all joints in each of several episodes, by half: one episode's ratio has more of the noise. Of one that moves
+    little, noise is the most.
+    """
+    if len(motions) < 2:
+        return
+    product, square, total = np.nansum(np.where(np.isfinite(parts[:, :1]), parts, 0.0), axis=2).T
+    moves = (total > _LIVELY * counts * total.sum() / counts.sum()) & (counts >= FEWEST)
+    for row in np.flatnonzero(moves):
+        ratio = product[row] / max(square[row], 1e-12)
+        yield Measurement(value=abs(ratio - 1) / 2, detail=f"{motions[row].where}: ratio {ratio:.3f}")
 
 
 @motion_check(

@@ -34,8 +34,8 @@ _ALIKE = 3.0
 """Times the movement of the state that an action of its unit may move: teleoperation is scaled to half or double."""
 _COPIED = 1e-6
 """Share of the state's range within which an action is a state."""
-_FAR = 0.2
-"""rad or m that no element goes by itself."""
+_FAR, _FAR_SHARE = 0.2, 0.2
+"""rad or m that no element goes by itself, and the share of what another one goes: some states are in degrees."""
 _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
@@ -156,7 +156,8 @@ def elements_alive(subject: Moving) -> Found:
     stands = np.all([np.ptp(state, axis=0) == 0 for state, _ in pairs], axis=0)
     sent = np.any([np.ptp(action, axis=0) > 50 * MOVES for _, action in pairs], axis=0)
     unsent = np.all([np.ptp(action, axis=0) == 0 for _, action in pairs], axis=0)
-    moves = np.any([np.ptp(state, axis=0) > _FAR for state, _ in pairs], axis=0)
+    ways = np.max([np.ptp(state, axis=0) for state, _ in pairs], axis=0)
+    moves = ways > max(_FAR, _FAR_SHARE * ways.max())
     is_dead = (stands & sent) | (unsent & moves)
     dead = [name for name, row in zip(subject.motions.all[0].names, is_dead, strict=True) if row]
     return Measurement(value=len(dead), detail=", ".join(dead))
