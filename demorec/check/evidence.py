@@ -36,6 +36,11 @@ Flags = NDArray[np.bool_]
 Named = tuple[str, Array]
 
 
+def is_gripper(name: str) -> bool:
+    """Whether an element is called after a gripper or its fingers."""
+    return any(word in name.lower() for word in _GRIPPER_WORDS)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """How a robot moves in one episode; elements are those of observation.state.
@@ -85,7 +90,7 @@ class Motion:
     @property
     def gripper(self) -> int | None:
         """The element that is the opening of a gripper, if one is."""
-        found = [i for i, name in enumerate(self.names) if any(word in name.lower() for word in _GRIPPER_WORDS)]
+        found = [i for i, name in enumerate(self.names) if is_gripper(name)]
         return found[0] if len(found) == 1 else None
 
     @property

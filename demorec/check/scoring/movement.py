@@ -12,11 +12,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.evidence import Flags, Motion
+from demorec.check.evidence import Flags, Motion, is_gripper
 from demorec.check.rows import finest_lag, longest_run
 from demorec.core.geometry import Array
 
-_GRIPPER_WORDS = ("gripper", "finger")
 _RISES, _FALLS = 0.65, 0.35
 """Share of its range above which a gripper's command counts as high, and below which as low again."""
 _STILL = 0.08
@@ -115,12 +114,12 @@ class Movement:
 
 def movement(motion: Motion, scale: Scale) -> Movement:
     """Measure an episode of three frames or more."""
-    is_gripper = np.array([any(word in name.lower() for word in _GRIPPER_WORDS) for name in motion.names])
-    arm = ~is_gripper if not is_gripper.all() else is_gripper
+    opens = np.array([is_gripper(name) for name in motion.names])
+    arm = ~opens if not opens.all() else opens
     state = motion.state[:, arm] / _width(scale.state, arm)
     steps = np.linalg.norm(np.diff(state, axis=0), axis=1)
     action = motion.action if motion.action is not None and np.isfinite(motion.action).all() else None
-    hands = [_hand(motion, scale, int(element)) for element in np.flatnonzero(is_gripper)]
+    hands = [_hand(motion, scale, int(element)) for element in np.flatnonzero(opens)]
     switches = sorted({frame for opening, command in hands for frame in _switches(command)})
     bounds = (0, *(frame for frame in switches if 0 < frame < len(state) - 1), len(state) - 1)
     readings = dict(_of_state(state, steps, motion.fps, hands))
