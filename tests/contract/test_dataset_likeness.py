@@ -42,7 +42,7 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
         numbers("action", np.zeros_like, only=(1,)), "actions_go_with_states", "fail"
     ),
     "actions of one episode backwards": (
-        numbers("action", lambda rows: rows[::-1], only=(1,)), "actions_go_with_states", "warn"
+        numbers("action", lambda rows: rows[::-1], only=(1,)), "actions_go_with_states", "fail"
     ),
     "actions eight frames late": (numbers("action", lambda rows: late(rows, 8)), "motion_follows_action", "fail"),
     "an episode that was cut off": (cut_off, "whole_episodes", "warn"),
