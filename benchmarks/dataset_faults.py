@@ -139,7 +139,7 @@ def main() -> None:
     parser.add_argument("--turn", type=int, default=0, help="begin with another of the three datasets")
     parser.add_argument("--cache", type=Path, help="a folder that keeps the good datasets")
     args = parser.parse_args()
-    dataset_files.lerobot_is_installed = lambda: False
+    vars(dataset_files)["lerobot_is_installed"] = lambda: False
     shares: Counter[tuple[str, bool, str]] = Counter()
     with tempfile.TemporaryDirectory() as temporary:
         bases = [make(args.cache or Path(temporary), action) for action in BASES]

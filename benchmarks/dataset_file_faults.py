@@ -169,7 +169,7 @@ META: tuple[tuple[str, Fault], ...] = (
     ("statistics of two episodes exchanged", cells(EPISODES, f"stats/{STATE}/mean", swap)),
     (
         "statistics of images of two episodes exchanged",
-        lambda d: [cells(EPISODES, f"stats/{WRIST}/{q}", swap)(d) for q in ("mean", "std")] and None,
+        cells(EPISODES, [f"stats/{WRIST}/{quantity}" for quantity in ("mean", "std")], swap),
     ),
     ("statistics of an episode missing", cells(EPISODES, f"stats/{ACTION}/mean", at(1, lambda v: None))),
     ("statistics of another number of columns", stats(lambda s: s[STATE]["max"].pop())),

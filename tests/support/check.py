@@ -221,7 +221,7 @@ def edit_column(dataset: Path, name: str, change: Callable[[np.ndarray[Any, Any]
     pq.write_table(table, path)
 
 
-def edit_json(path: Path, change: Callable[[Any], None]) -> None:
+def edit_json(path: Path, change: Callable[[Any], object]) -> None:
     """Change a JSON file in place."""
     data = json.loads(path.read_text())
     before = json.dumps(data)

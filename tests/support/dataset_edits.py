@@ -40,7 +40,12 @@ def numbers(name: str, change: Change, *, only: Sequence[int] | None = None, res
 
 def alike(change: Change, *names: str, only: Sequence[int] | None = None) -> Fault:
     """The same change of several features."""
-    return lambda dataset: [numbers(name, change, only=only)(dataset) for name in names] and None
+
+    def fault(dataset: Path) -> None:
+        for name in names:
+            numbers(name, change, only=only)(dataset)
+
+    return fault
 
 
 def reframed(pick: Callable[[list[Rows], int], list[Rows]]) -> Fault:
@@ -58,7 +63,9 @@ def one(change: Callable[[Rows, int], Rows]) -> Fault:
     return reframed(lambda parts, fps: [parts[0], change(parts[1], fps), *parts[2:]])
 
 
-def film(camera: str, change: Change, *, only: Sequence[int] | None = (1,), **coded: int) -> Fault:
+def film(
+    camera: str, change: Change, *, only: Sequence[int] | None = (1,), rate: int | None = None, crf: int = 18
+) -> Fault:
     """Other images in some episodes; None: in all."""
 
     def fault(dataset: Path) -> None:
@@ -66,7 +73,7 @@ def film(camera: str, change: Change, *, only: Sequence[int] | None = (1,), **co
         for number, part in enumerate(loose.parts_of(dataset)):
             if only is None or number in only:
                 images[part] = np.clip(change(images[part].copy()), 0, 255)
-        loose.put_images(dataset, camera, images, **coded)
+        loose.put_images(dataset, camera, images, rate=rate, crf=crf)
 
     return fault
 
@@ -83,9 +90,14 @@ def both(change: Callable[[Rows, Rows], tuple[Rows, Rows]]) -> Fault:
     return fault
 
 
-def cells(place: str, name: str, change: Callable[[list[Any]], list[Any]]) -> Fault:
-    """Other values of a table's column."""
-    return lambda dataset: loose.edit_cells(dataset, place, name, change)
+def cells(place: str, names: str | Sequence[str], change: Callable[[list[Any]], list[Any]]) -> Fault:
+    """Other values of a table's columns."""
+
+    def fault(dataset: Path) -> None:
+        for name in [names] if isinstance(names, str) else names:
+            loose.edit_cells(dataset, place, name, change)
+
+    return fault
 
 
 def table(place: str, change: loose.Table) -> Fault:
@@ -95,7 +107,7 @@ def table(place: str, change: loose.Table) -> Fault:
 
 def of_json(place: str, change: Callable[[Any], object]) -> Fault:
     """Another JSON file."""
-    return lambda dataset: edit_json(dataset / place, lambda data: change(data) and None)
+    return lambda dataset: edit_json(dataset / place, change)
 
 
 def info(change: Callable[[Any], object]) -> Fault:
@@ -235,7 +247,8 @@ def blurred(rows: Rows) -> Rows:
     """Means of 5 x 5 pixels."""
     out = np.pad(rows.astype(np.float32), ((0, 0), (2, 2), (2, 2), (0, 0)), mode="edge")
     h, w = rows.shape[1:3]
-    return np.mean([out[:, y : y + h, x : x + w] for y in range(5) for x in range(5)], axis=0).astype(np.uint8)
+    moved = [out[:, y : y + h, x : x + w] for y in range(5) for x in range(5)]
+    return np.asarray(np.mean(moved, axis=0), dtype=np.uint8)
 
 
 def noisy(scale: float) -> Change:

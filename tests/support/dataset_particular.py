@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,12 @@ def middle_all(rows: Rows, chosen: Any, factor: float) -> Rows:
 
 def turned(rows: Rows) -> Rows:
     """A turn more from the middle on."""
-    return rows + 2 * np.pi * (np.arange(len(rows)) >= len(rows) // 2)
+    return np.asarray(rows + 2 * np.pi * (np.arange(len(rows)) >= len(rows) // 2))
 
 
 def held(rows: Rows, times: int) -> Rows:
     """Each value so many times, at the same length."""
-    return rows[np.arange(len(rows)) // times * times]
+    return np.asarray(rows[np.arange(len(rows)) // times * times])
 
 
 def repeats(rows: Rows, every: int) -> Rows:
@@ -47,7 +48,7 @@ def repeats(rows: Rows, every: int) -> Rows:
 
 def normalised(rows: Rows) -> Rows:
     """Each column in -1 to 1."""
-    return 2 * (rows - rows.min(axis=0)) / np.maximum(np.ptp(rows, axis=0), 1e-9) - 1
+    return np.asarray(2 * (rows - rows.min(axis=0)) / np.maximum(np.ptp(rows, axis=0), 1e-9) - 1)
 
 
 def exchanged_features(a: str, b: str) -> Fault:
@@ -82,7 +83,7 @@ def film_ranges(dataset: Path, change: Callable[[list[float], list[float]], tupl
     found = loose.table_of(dataset, "meta/episodes")
     changed = change(*(found.column(name).to_pylist() for name in names))
     for name, values in zip(names, changed, strict=True):
-        loose.edit_cells(dataset, "meta/episodes", name, lambda _, values=values: values)
+        loose.edit_table(dataset, "meta/episodes", partial(loose.replaced, name=name, values=values))
 
 
 def exchanged_films(dataset: Path) -> None:

@@ -121,7 +121,8 @@ def images_of(dataset: Path, camera: str) -> Rows:
     import av
 
     with av.open(str(file_of(dataset, f"videos/{camera}"))) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+        frames = list(container.decode(video=0))
+    return np.stack([frame.to_ndarray(format="rgb24") for frame in frames])
 
 
 def put_images(
