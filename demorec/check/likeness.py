@@ -24,6 +24,8 @@ _AHEAD_S = (0.0, 0.1, 0.3)
 _RIDGE = 1e-3
 _CLEAR = 0.6
 """Correlation of an element of the action with what the states of other episodes make of it, from which it counts."""
+_LIVELY = 0.5
+"""Share of an action's usual deviation, as the states tell it, from which on an episode is judged."""
 _TARGET = 0.65
 """Share of an action's variance that the states of the same frame tell, in the median of its elements, above which it
 is a target: of targets 0.84 to 0.99, of increments 0.15 to 0.47."""
@@ -100,19 +102,22 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     grams = [(e.T @ e, e.T @ a, len(a)) for _, a, e in found]
     square, product, count = (sum(part) for part in zip(*grams, strict=True))
     size = found[0][2].shape[1]
-    common, sizes = np.zeros((2, len(found), len(is_arm)))
+    common, sizes, moves = np.zeros((3, len(found), len(is_arm)))
     for row, ((_, action, evidence), (its_square, its_product, frames)) in enumerate(zip(found, grams, strict=True)):
         ridge = _RIDGE * (count - frames) * np.eye(size)
         expected = evidence @ np.linalg.solve(square - its_square + ridge, product - its_product)
         a, b = action - action.mean(axis=0), expected - expected.mean(axis=0)
         common[row] = (a * b).sum(axis=0)
         sizes[row] = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+        moves[row] = (b**2).mean(axis=0)
     clear = is_arm & (np.median(common / np.maximum(sizes, 1e-9), axis=0) > _CLEAR)
     if not clear.any():
         yield NotMeasured(why="the actions do not go with the states")
         return
     own = common[:, clear].sum(axis=1) / np.maximum(sizes[:, clear].sum(axis=1), 1e-9)
-    for (number, _, _), below in zip(found, np.median(own) - own, strict=True):
+    lively = np.sqrt(moves[:, clear].sum(axis=1))
+    lively = lively > _LIVELY * np.median(lively)  # of an arm that waits noise decides
+    for (number, _, _), below in zip(found, (np.median(own) - own) * lively, strict=True):
         yield Measurement(value=max(float(below), 0.0), detail=f"episode {number}")
 
 
