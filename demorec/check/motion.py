@@ -48,8 +48,6 @@ _SLOW = 0.05
 """Root mean square speed, rad/s or m/s, above which a joint is judged even where others move ten times as far."""
 _LIVELY = 0.25
 """Share of what all episodes move in a frame, squared, from which the velocities of one are judged by themselves."""
-_MIDWAY = 1e-6
-"""Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
 MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
@@ -256,52 +254,6 @@ def stuck_sensors(subject: Moving) -> Iterator[Found]:
                 length, start = int(moves.sum()), 0
             label = f"{name}, {motion.where}" if motion.where else name
             yield Measurement(value=length, frame=start + 1 if length else None, detail=label)
-
-
-@motion_check(
-    measures="share of frames that repeat the one before, number by number, while the arm moves",
-    warn=0.02,
-    fail=math.inf,
-    simulated=(0.0, 0.0),
-    needs=STATE_ALONE,
-)
-def repeated_frames(subject: Moving) -> Iterator[Found]:
-    """Each frame is one of its own: catches gaps that were filled with what came before. Of simulated recordings, of
-    which all numbers are measured anew, in any frame."""
-    for motion in subject.motions.all:
-        tables = [motion.state, *motion.sensors.values(), *([] if motion.action is None else [motion.action])]
-        rows = np.column_stack([table.reshape(len(table), -1) for table in tables])
-        same = ((rows[1:] == rows[:-1]) | np.isnan(rows[1:])).all(axis=1)
-        moves = (motion.state[1:] != motion.state[:-1]).any(axis=1)
-        around = np.zeros_like(same)
-        around[1:-1] = moves[:-2] & moves[2:]
-        wrong = same if motion.contact is not None else same & around
-        frame = int(np.argmax(wrong)) + 1 if wrong.any() else None
-        yield Measurement(value=float(wrong.mean()) if len(wrong) else 0.0, frame=frame, detail=motion.where)
-
-
-@motion_check(
-    measures="share of moving frames in which every joint is exactly midway between its neighbours",
-    warn=0.02,
-    fail=0.2,
-    needs=STATE_ALONE,
-)
-def interpolated_frames(subject: Moving) -> Iterator[Found]:
-    """States were measured, not made by interpolation between others, which halves velocities where they turn.
-
-    A gripper may move at one speed while the arm stands still.
-    """
-    for motion in subject.motions.all:
-        state = motion.state[:, [i for i in range(len(motion.names)) if i != motion.gripper]]
-        if len(state) < FEWEST or not state.size:
-            continue
-        near, way = _MIDWAY * max(float(np.ptp(state, axis=0).max()), 1e-9), np.abs(state[2:] - state[:-2])
-        # Encoders of coarse steps may go as far twice; not several of them at once, over many steps.
-        least = np.where(state[1:] == state[:-1], np.inf, np.abs(np.diff(state, axis=0))).min(axis=0)
-        moves = (way > np.maximum(1e3 * near, 10 * least)).sum(axis=1) >= min(3, state.shape[1])
-        midway = np.abs(state[1:-1] - (state[2:] + state[:-2]) / 2).max(axis=1) < near
-        if moves.sum() >= FEWEST:
-            yield Measurement(value=float(midway[moves].mean()), detail=motion.where)
 
 
 @motion_check(

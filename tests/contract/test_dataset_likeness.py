@@ -14,7 +14,9 @@ from support.dataset_edits import late, numbers
 from support.export import export
 
 Fault = Callable[[Path], None]
-LAWS = ("actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position")
+LAWS = (
+    "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +39,11 @@ def at_half_the_rate(dataset: Path) -> None:
     loose.reframe(dataset, [parts[0], parts[1][::2], *parts[2:]])
 
 
+def without_a_second(dataset: Path) -> None:
+    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
+    loose.reframe(dataset, [parts[0], np.delete(parts[1], range(29, 39)), *parts[2:]])
+
+
 FAULTS: dict[str, tuple[Fault, str, str]] = {
     "zeros for the actions of one episode": (
         numbers("action", np.zeros_like, only=(1,)), "actions_go_with_states", "fail"
@@ -46,6 +53,7 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
     ),
     "actions eight frames late": (numbers("action", lambda rows: late(rows, 8)), "motion_follows_action", "fail"),
     "an episode that was cut off": (cut_off, "whole_episodes", "warn"),
+    "a second that is missing": (without_a_second, "missing_frames", "warn"),
     "an episode of half the rate": (at_half_the_rate, "velocity_matches_position", "fail"),
 }  # fmt: skip
 
