@@ -6,7 +6,8 @@ Whoever recorded them: nothing has to be known of the robot.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -56,28 +57,62 @@ def _evidence(states: Array, fps: float) -> Array:
     return np.concatenate([states, *steps], axis=1)
 
 
-def _usable(dataset: Dataset) -> list[tuple[int, Array, Array]] | Found:
-    """(episode, actions (T, K), evidence (T, N)), both less the dataset's means and in units of its deviations."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Scaled:
+    """Actions and evidence of the episodes that are long enough, made anew whenever they are asked for: all of them
+    together would need several times the room of the dataset.
+
+    Attributes:
+        numbers: The episodes.
+        means, deviations: Of actions and evidence, (K,) and (N,); those of what stays the same are inf.
+    """
+
+    dataset: Dataset
+    numbers: list[int]
+    means: list[Array]
+    deviations: list[Array]
+
+    @property
+    def num_states(self) -> int:
+        """D: the first elements of the evidence, and as many ways of one frame after them."""
+        return len(self.means[1]) // (1 + len(_AHEAD_S))
+
+    def __iter__(self) -> Iterator[tuple[Array, Array]]:
+        """(T, K) and (T, N) of each, less the dataset's means and in units of its deviations."""
+        for number in self.numbers:
+            action, evidence = _measured(self.dataset, number)
+            yield (action - self.means[0]) / self.deviations[0], (evidence - self.means[1]) / self.deviations[1]
+
+
+def _measured(dataset: Dataset, number: int) -> tuple[Array, Array]:
+    rows = dataset.rows[number]
+    action = rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64)
+    return action, _evidence(_states(rows), dataset.info.fps)
+
+
+def _scaled(dataset: Dataset) -> _Scaled | Found:
     features = dataset.info.features
     if not {STATE, ACTION} <= features.keys() or not all(features[n].is_numeric for n in (STATE, ACTION)):
         return Lacking(need="actions of three episodes")
-    long = [(number, rows) for number, rows in enumerate(dataset.rows) if len(rows[STATE]) >= _FEWEST_FRAMES]
+    long = [number for number, rows in enumerate(dataset.rows) if len(rows[STATE]) >= _FEWEST_FRAMES]
     if len(long) < _FEWEST_EPISODES:
         return NotMeasured(why=f"fewer than {_FEWEST_EPISODES} episodes have {_FEWEST_FRAMES} frames")
-    found = [
-        (
-            number,
-            rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64),
-            _evidence(_states(rows), dataset.info.fps),
-        )
-        for number, rows in long
-    ]
-    means, scales = [], []
-    for part in (1, 2):
-        together = np.concatenate([each[part] for each in found])
-        means.append(together.mean(axis=0))
-        scales.append(np.where(together.std(axis=0) > 1e-9, together.std(axis=0), np.inf))
-    return [(n, (a - means[0]) / scales[0], (e - means[1]) / scales[1]) for n, a, e in found]
+    means = _average(dataset, long, lambda _, table: table)
+    squares = _average(dataset, long, lambda part, table: (table - means[part]) ** 2)
+    deviations = [np.where(square > 1e-18, np.sqrt(square), np.inf) for square in squares]
+    return _Scaled(dataset=dataset, numbers=long, means=means, deviations=deviations)
+
+
+def _average(dataset: Dataset, numbers: list[int], of: Callable[[int, Array], Array]) -> list[Array]:
+    """Over all frames of actions and of evidence."""
+    sums, count = [np.zeros(()), np.zeros(())], 0
+    for number in numbers:
+        tables = _measured(dataset, number)
+        sums = [
+            total + of(part, table).sum(axis=0) for part, (total, table) in enumerate(zip(sums, tables, strict=True))
+        ]
+        count += len(tables[0])
+    return [total / count for total in sums]
 
 
 @likeness_check(
@@ -93,19 +128,22 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     The action as a linear function of states and the ways that they go next, by all other episodes. Of grippers, this
     depends on what is held.
     """
-    found = _usable(dataset)
-    if not isinstance(found, list):
+    found = _scaled(dataset)
+    if not isinstance(found, _Scaled):
         yield found
         return
-    names = dataset.info.features[ACTION].names or [""] * found[0][1].shape[1]
+    names = dataset.info.features[ACTION].names or [""] * len(found.means[0])
     is_arm = np.array([not is_gripper(name) for name in names])
-    grams = [(e.T @ e, e.T @ a, len(a)) for _, a, e in found]
-    square, product, count = (sum(part) for part in zip(*grams, strict=True))
-    size = found[0][2].shape[1]
-    common, sizes, moves = np.zeros((3, len(found), len(is_arm)))
-    for row, ((_, action, evidence), (its_square, its_product, frames)) in enumerate(zip(found, grams, strict=True)):
-        ridge = _RIDGE * (count - frames) * np.eye(size)
-        expected = evidence @ np.linalg.solve(square - its_square + ridge, product - its_product)
+    size = len(found.means[1])
+    square, product = np.zeros((size, size)), np.zeros((size, len(names)))
+    for action, evidence in found:
+        square += evidence.T @ evidence
+        product += evidence.T @ action
+    common, sizes, moves = np.zeros((3, len(found.numbers), len(names)))
+    for row, (action, evidence) in enumerate(found):
+        others = square - evidence.T @ evidence
+        ridge = _RIDGE * max(float(np.trace(others)) / size, 1e-9) * np.eye(size)
+        expected = evidence @ np.linalg.solve(others + ridge, product - evidence.T @ action)
         a, b = action - action.mean(axis=0), expected - expected.mean(axis=0)
         common[row] = (a * b).sum(axis=0)
         sizes[row] = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
@@ -117,7 +155,7 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     own = common[:, clear].sum(axis=1) / np.maximum(sizes[:, clear].sum(axis=1), 1e-9)
     lively = np.sqrt(moves[:, clear].sum(axis=1))
     lively = lively > _LIVELY * np.median(lively)  # of an arm that waits noise decides
-    for (number, _, _), below in zip(found, (np.median(own) - own) * lively, strict=True):
+    for number, below in zip(found.numbers, (np.median(own) - own) * lively, strict=True):
         yield Measurement(value=max(float(below), 0.0), detail=f"episode {number}")
 
 
@@ -133,26 +171,23 @@ def motion_follows_action(dataset: Dataset) -> Found:
 
     By the lag at which an action is best told as a linear function of the ways that the states go in one frame.
     """
-    found = _usable(dataset)
-    if not isinstance(found, list):
+    found = _scaled(dataset)
+    if not isinstance(found, _Scaled):
         return found
     if np.median(_told_by_states(found)) > _TARGET:
         return NotMeasured(why="the action is a target of the state")
     fps = dataset.info.fps
     reach = max(2, round(_REACH_S * fps))
     lags = range(-reach, reach + 1)
-    steps = [np.diff(_states(dataset.rows[number]), axis=0) for number, _, _ in found]
-    scale = np.concatenate(steps).std(axis=0)
-    width = found[0][1].shape[1]
-    square, all_of = np.zeros((len(scale), len(scale))), np.zeros(width)
-    products = np.zeros((len(lags), len(scale), width))
-    for (_, action, _), step in zip(found, steps, strict=True):
-        if len(step) <= 3 * reach:
+    size, width = found.num_states, len(found.means[0])
+    square, products, all_of = np.zeros((size, size)), np.zeros((len(lags), size, width)), np.zeros(width)
+    for action, evidence in found:
+        if len(action) <= 3 * reach + 1:
             continue
-        core = slice(reach, len(step) - reach)
-        way = step[core] / np.maximum(scale, 1e-9)
+        core = slice(reach, len(action) - 1 - reach)
+        way = evidence[:-1, size : 2 * size][core]
         square += way.T @ way
-        all_of += (action[core] ** 2).sum(axis=0)
+        all_of += (action[:-1][core] ** 2).sum(axis=0)
         products += [way.T @ np.roll(action[:-1], lag, axis=0)[core] for lag in lags]
     if not all_of.any():
         return NotMeasured(why="the episodes are too short to tell which of state and action is first")
@@ -165,13 +200,18 @@ def motion_follows_action(dataset: Dataset) -> Found:
     return Measurement(value=max(-lag, lag - _LATEST_S * fps, 0.0), detail=f"the states follow by {lag:+.2f} frames")
 
 
-def _told_by_states(found: list[tuple[int, Array, Array]]) -> Array:
+def _told_by_states(found: _Scaled) -> Array:
     """(K,) share of each action's variance that is a linear function of the states in the same frame."""
-    size = found[0][2].shape[1] // (1 + len(_AHEAD_S))
-    actions, states = np.concatenate([a for _, a, _ in found]), np.concatenate([e[:, :size] for _, _, e in found])
-    square, product = states.T @ states + _RIDGE * len(states) * np.eye(size), states.T @ actions
-    told = (product * np.linalg.solve(square, product)).sum(axis=0)
-    return np.asarray(told / np.maximum((actions**2).sum(axis=0), 1e-9))
+    size, width, count = found.num_states, len(found.means[0]), 0
+    square, product, total = np.zeros((size, size)), np.zeros((size, width)), np.zeros(width)
+    for action, evidence in found:
+        states = evidence[:, :size]
+        square += states.T @ states
+        product += states.T @ action
+        total += (action**2).sum(axis=0)
+        count += len(action)
+    told = (product * np.linalg.solve(square + _RIDGE * count * np.eye(size), product)).sum(axis=0)
+    return np.asarray(told / np.maximum(total, 1e-9))
 
 
 @check(
