@@ -87,7 +87,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             makes.
         seed: Root of all scenes, as of `generate-dataset`.
         variation: How much the scenes differ.
-        robot, fps, physics_hz, width, height, renderer: As of `generate-dataset`.
+        objects, object_split, robot, fps, physics_hz, width, height, renderer: As of `generate-dataset`.
         cameras: Names of `demorec list cameras`.
         privileged: Whether to give `environment_state`; None: only without cameras, and only for a task whose scenes
             all have as many numbers to tell, since a space has one length.
@@ -113,6 +113,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         split: Literal["all", "train", "eval"] = "eval",
         seed: int = 0,
         variation: Preset = "mild",
+        objects: Collection[str] = (),
+        object_split: Literal["all", "train", "eval"] = "all",
         robot: str = "panda",
         fps: int = 30,
         physics_hz: int = 240,
@@ -137,6 +139,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
                 split=split,
                 seed=seed,
                 variation=variation,
+                objects=tuple(objects),
+                object_split=object_split,
                 robot=robot,
                 fps=fps,
                 physics_hz=physics_hz,

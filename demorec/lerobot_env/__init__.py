@@ -26,7 +26,7 @@ __all__ = ["DemorecEnvConfig"]
 
 
 _AS_THEY_ARE = (
-    "robot", "split", "variation", "fps", "renderer", "privileged", "state", "action", "episode_length",
+    "robot", "split", "object_split", "variation", "fps", "renderer", "privileged", "state", "action", "episode_length",
     "render_mode", "render_camera", "render_width", "render_height",
 )  # fmt: skip
 """Flags that are arguments of the environment by the same name."""
@@ -42,6 +42,8 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
     split: str = "eval"
     scene_seed: int = 0
     variation: str = "mild"
+    objects: list[str] = field(default_factory=list)
+    object_split: str = "all"
     cameras: list[str] = field(default_factory=list)
     observation_width: int = 224
     observation_height: int = 224
@@ -82,6 +84,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
         return {name: getattr(self, name) for name in _AS_THEY_ARE} | {
             "seed": self.scene_seed,
             "cameras": tuple(self.cameras),
+            "objects": tuple(self.objects),
             "sensed": tuple(self.sensed),
             "width": self.observation_width,
             "height": self.observation_height,

@@ -47,6 +47,19 @@ def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
     return env
 
 
+def test_things_are_drawn_from_the_named_shelves_and_their_split() -> None:
+    """The same as `generate-dataset` draws for these flags; by the flags of LeRobot's plug-in, too."""
+    flags: dict[str, Any] = {"objects": ("blocks",), "object_split": "eval", "split": "all"}
+    env = make("pick_anything", **flags)
+    env.reset(seed=3)
+    assert env.episode.info.scene == episode(3, task="pick_anything", variation="mild", **flags).info.scene
+    assert env.episode.info.scene != episode(3, task="pick_anything", variation="mild", split="all").info.scene
+    env.close()
+    plugin = pytest.importorskip("demorec.lerobot_env")
+    kwargs = plugin.DemorecEnvConfig(task="pick_anything", objects=["blocks"], object_split="eval").gym_kwargs
+    assert (kwargs["objects"], kwargs["object_split"]) == (("blocks",), "eval")
+
+
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
 @pytest.mark.filterwarnings("ignore:.*(action space|observation space|Box).*:UserWarning")
 def test_gymnasium_accepts_the_environment(task: str) -> None:
