@@ -25,7 +25,7 @@ _AHEAD_S = (0.0, 0.1, 0.3)
 _RIDGE = 1e-3
 _CLEAR = 0.6
 """Correlation of an element of the action with what the states of other episodes make of it, from which it counts."""
-_LIVELY = 0.5
+_LIVELY = 0.25
 """Share of an action's usual deviation, as the states tell it, from which on an episode is judged."""
 _TARGET = 0.65
 """Share of an action's variance that the states of the same frame tell, in the median of its elements, above which it
