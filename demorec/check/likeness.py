@@ -223,11 +223,16 @@ def _told_by_states(found: _Scaled) -> Array:
     fail=math.inf,
 )
 def whole_episodes(dataset: Dataset) -> Found:
-    """An episode begins and ends as the others do, if these are alike: catches recordings that were cut off, halves
-    of episodes, and two in one."""
-    motions = [motion for motion in dataset.motions.all if len(motion.state) >= _FEWEST_FRAMES]
-    if len(motions) < _FEWEST_EPISODES:
+    """An episode begins and ends as the others do, if these are alike, and some of its own instruction among them:
+    catches recordings that were cut off, halves of episodes, and two in one."""
+    long = [
+        (motion, int(rows["task_index"].reshape(-1)[0]))
+        for motion, rows in zip(dataset.motions.all, dataset.rows, strict=False)
+        if len(motion.state) >= _FEWEST_FRAMES
+    ]
+    if len(long) < _FEWEST_EPISODES:
         return NotMeasured(why=f"fewer than {_FEWEST_EPISODES} episodes have {_FEWEST_FRAMES} frames")
+    motions, tasks = [motion for motion, _ in long], np.array([task for _, task in long])
     spread = np.concatenate([motion.state for motion in motions]).std(axis=0) + 1e-3
     gripper, wrong = motions[0].gripper, list[str]()
     for word, row in (("begins", 0), ("ends", -1)):
@@ -238,7 +243,7 @@ def whole_episodes(dataset: Dataset) -> Found:
             told["with another opening"] = np.abs(opening - np.median(opening))
         for words, off in told.items():
             alike = np.quantile(off, _MOST, method="lower") < _ALIKE
-            strange = np.flatnonzero((off > _OTHER) & alike)
+            strange = np.flatnonzero((off > _OTHER) & alike & np.isin(tasks, tasks[off <= _OTHER]))
             if len(strange) <= max(1, _RARE * len(motions)):
                 wrong += [f"{motions[number].where} {word} {words}, unlike the others" for number in strange]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
