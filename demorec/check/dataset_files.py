@@ -21,12 +21,9 @@ from demorec.core.errors import ExportError, MissingDependencyError, ResourceErr
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.layout import EPISODES_PATH, VIDEO_PATH, FilePosition
+from demorec.datasets.lerobot.layout import VIDEO_PATH
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
-
-_OWN_PLACE = ("meta/episodes/chunk_index", "meta/episodes/file_index")
-"""Columns that say in which file a row of the episodes' table is."""
 
 
 @dataset_check(
@@ -74,20 +71,13 @@ def dataset_counts(dataset: Dataset) -> Measurement:
 
 
 def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
-    """Where the episodes' table says that things are: its own file; rows of the dataset, and seconds of each video."""
+    """Where the episodes' table says that things are: rows of the dataset, and seconds of each video."""
     ends = [f"videos/{key}/to_timestamp" for key in dataset.info.video_keys]
     for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
         columns = open_table(path).schema_arrow.names
         names = [name for name in ("dataset_to_index", *ends) if name in columns]
         begins = [name.replace("to_", "from_") for name in names]
-        own = [name for name in _OWN_PLACE if set(_OWN_PLACE) <= set(columns)]
-        for row in read_table(path, ["episode_index", "length", *names, *begins, *own]).to_pylist():
-            if (
-                own
-                and FilePosition(chunk=row[own[0]], file=row[own[1]]).path(EPISODES_PATH)
-                != path.relative_to(dataset.path).as_posix()
-            ):
-                yield f"the file of the table's row of episode {row['episode_index']}"
+        for row in read_table(path, ["episode_index", "length", *names, *begins]).to_pylist():
             for begin, end in zip(begins, names, strict=True):
                 unit = 1 if end == "dataset_to_index" else dataset.info.fps
                 if not abs((row[end] - row[begin]) * unit - row["length"]) < 0.5:

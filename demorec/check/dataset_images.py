@@ -52,7 +52,8 @@ def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
     stated = numbers_of(said)
     if stated.shape != (3,) or not np.isfinite(stated).all():
         return Measurement(value=math.inf, detail=detail)
-    return Measurement(value=float(np.nan_to_num(np.abs(stated - true)).max()), detail=detail)  # NaN: no image was seen
+    off = np.nan_to_num(np.abs(stated - true))  # NaN: too few images were seen
+    return Measurement(value=float(off.max()), detail=detail)
 
 
 def _disordered(told: Mapping[str, Any], stats: Mapping[str, Any], key: str) -> Measurement | None:

@@ -34,7 +34,7 @@ class EpisodeImages:
     Attributes:
         count: How many there are.
         mean: (3,) mean red, green and blue, of 1.
-        std: (3,) their standard deviations over all pixels, of 1, by some of the images.
+        std: (3,) their standard deviations over all pixels, of 1, by some of the images; NaN where these are few.
         cells: (count, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
     """
 
@@ -67,15 +67,15 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
         cells = np.stack([cell for cell, _ in images])
         mean = cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255
         moments = [moment for _, moment in images if moment is not None]
-        colour, squared = np.mean(moments, axis=0) if moments else np.full((2, 3), np.nan)
+        colour, squared = np.mean(moments, axis=0) if len(moments) >= _FEWEST else np.full((2, 3), np.nan)
         std = np.sqrt(np.maximum(squared - colour**2, 0.0))
         found.append(EpisodeImages(count=len(cells), mean=mean, std=std, cells=cells))
     return found
 
 
 _Decoded = tuple[NDArray[np.uint8], Array | None]
-_EVERY = 8
-"""Of so many images one is looked at pixel by pixel."""
+_EVERY, _FEWEST = 8, 8
+"""Of so many images one is looked at pixel by pixel, and of how many at least an episode's deviation is told."""
 
 
 def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:

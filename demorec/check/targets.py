@@ -34,6 +34,8 @@ _ALIKE = 3.0
 """Times the movement of the state that an action of its unit may move: teleoperation is scaled to half or double."""
 _COPIED = 1e-6
 """Share of the state's range within which an action is a state."""
+_SEVERAL = 3
+"""Episodes that do not all go to one place."""
 _FAR, _FAR_SHARE = 0.2, 0.2
 """rad or m that no element goes by itself, and the share of what another one goes: some states are in degrees."""
 _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
@@ -145,7 +147,8 @@ def state_reaches_action(subject: Moving) -> Found:
     needs=ACTIONS,
 )
 def elements_alive(subject: Moving) -> Found:
-    """Encoders and commands are alive: of no element one stays at one value in all episodes while the other changes."""
+    """Encoders and commands are alive: of no element one stays at one value in all episodes while the other changes;
+    commands, in three episodes or more."""
     pairs = [
         (motion.state, motion.action)
         for motion in subject.motions.all
@@ -155,7 +158,8 @@ def elements_alive(subject: Moving) -> Found:
         return Lacking(need=ACTIONS)
     stands = np.all([np.ptp(state, axis=0) == 0 for state, _ in pairs], axis=0)
     sent = np.any([np.ptp(action, axis=0) > 50 * MOVES for _, action in pairs], axis=0)
-    unsent = np.all([np.ptp(action, axis=0) == 0 for _, action in pairs], axis=0)
+    sent_at_all = np.concatenate([action for _, action in pairs])
+    unsent = np.all(sent_at_all == sent_at_all[0], axis=0) & (len(pairs) >= _SEVERAL)  # one may have one goal
     ways = np.max([np.ptp(state, axis=0) for state, _ in pairs], axis=0)
     moves = ways > max(_FAR, _FAR_SHARE * ways.max())
     is_dead = (stands & sent) | (unsent & moves)

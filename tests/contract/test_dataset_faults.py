@@ -161,9 +161,6 @@ ALONE: dict[str, tuple[Fault, str]] = {
     ),
     "rows of no episode": (of_table("data", lambda t: pa.concat_tables([t, t.slice(0, 5)])), "dataset_counts"),
     "an episode that is done early": (value_of("next.done", 10, True), "dataset_counts"),
-    "a row of the episodes' table that is said to be in another file": (
-        value_of("meta/episodes/file_index", 1, 3, "meta/episodes"), "dataset_counts"
-    ),
     "a reward without a success": (value_of("next.reward", 10, 1.0), "dataset_counts"),
     "a depth map of three channels": (
         of_info(lambda d: d["features"][CAMERA]["info"].update(is_depth_map=True)), "dataset_schema"
