@@ -33,6 +33,8 @@ STALE_SHARE, STALE_EXCESS = 0.3, 2.5
 image by more than this, of 255: a predicted image may leave a small motion to the next keyframe."""
 _VARIES = 0.3
 """Share of the encoder's error by which that of a single image may be above the usual one."""
+_FEWEST_MEANS = 3
+"""Images whose mean colours tell: the encoder may darken one by 5 of 255."""
 _PREDICTED_WEIGHT = 0.25
 """Of the difference of a predicted image of AV1, which leaves whole motions to the next keyframe (15 levels seen)."""
 
@@ -223,7 +225,8 @@ def pixel_statistics(episode: CheckedEpisode) -> Iterator[Found]:
     """The histograms, counted before coding, are those of the images: catches swapped channels and other images."""
     for camera in episode.cameras:
         decoded = episode.images(camera).mean
-        if not len(decoded):
+        if len(decoded) < _FEWEST_MEANS:
+            yield NotMeasured(why=f"camera {camera.name} has {len(decoded)} images")
             continue
         counted = episode.recording.pixel_statistics(camera.name)
         if counted.num_images != (episode.num_frames + 1) // 2:  # every other image is counted

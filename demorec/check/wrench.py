@@ -39,6 +39,7 @@ _OFTEN, _OWN_INERTIA = 0.9, 0.15
 """Share of the frames by whose worst efforts are judged; of a motor's peak that its links' own inertia may make."""
 _AROUND = 6
 """Frames before and after a peak of the contact force in which it must be the only one."""
+_FEWEST_FRAMES = 3
 _LOST_SHARE = 0.5
 """Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
 _MOST_LAG, _CLEAR, _UNCLEAR = 3, 0.25, 0.5
@@ -232,6 +233,9 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     Wrench and efforts are those that the servo's motion needs, in each frame in which it alone moves the free hand; of
     the motors those count that bear weight. The force on what is carried is that of the gripper's motors in each frame.
     """
+    if episode.num_frames < _FEWEST_FRAMES:
+        yield NotMeasured(why="no frame has neighbours")
+        return
     yield _peak_of_grip(episode)
     for name, table in (("wrench", episode.columns.sensed.get("wrench")), ("efforts", episode.columns.joint_effort)):
         if table is not None and (lost := (table == 0).all(axis=1)).mean() < _LOST_SHARE:  # weight is always there

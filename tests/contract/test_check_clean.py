@@ -13,6 +13,7 @@ from support.tasks import QUICK_TASKS
 
 from demorec.core.config import VideoConfig
 from demorec.core.tables import ROBOTS, TASKS
+from demorec.mcap import Recording
 
 
 @pytest.mark.parametrize(
@@ -49,6 +50,21 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
 def test_an_arm_that_noise_shakes(config: dict[str, Any], tmp_path: Path) -> None:
     """Differences between frames say little about forces then, a hand that has turned presses askew, things slip."""
     path = simulate(tmp_path / "e.mcap", **config)
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+
+
+def test_an_attempt_that_ended_at_once(tmp_path: Path) -> None:
+    """What is out of reach ends it with its first frame, and one image may be 5 of 255 darker than what was drawn."""
+    config: dict[str, Any] = {
+        "task": "stack",
+        "fps": 10,
+        "seed": 93003,
+        "episode_index": 57,
+        "cameras": ("front", "wrist"),
+    }
+    path = simulate(tmp_path / "e.mcap", **config, width=96, height=96)
+    with Recording(path) as recording:
+        assert recording.num_frames == 1
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 
