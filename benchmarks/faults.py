@@ -576,7 +576,7 @@ def judge(subject: Any) -> dict[str, Result]:
     found = {}
     for name in CHECKS.names():
         check = CHECKS.load(name)
-        is_motion = check.measure.__module__.rpartition(".")[2] in ("motion", "targets", "mounts")
+        is_motion = check.measure.__module__.rpartition(".")[2] in ("motion", "frames", "targets", "mounts")
         if subject.form not in check.on or check.needs_images or check.group in ("file", "time"):
             continue
         if subject.form == "external" and not is_motion:
