@@ -105,6 +105,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  (each instance has its own)
+    _viewer: Painter | None = None
+    _session: Session | None = None
+    _situation: Situation | None = None
 
     def __init__(
         self,
@@ -153,9 +156,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)
         self._sensed = tuple(check_choice("sensed", name, tuple(SENSED)) for name in sensed)
-        if render_mode not in (None, "rgb_array"):
-            raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
-        self.config, self.render_mode = config, render_mode
+        self.config, self.render_mode = config, _checked(render_mode)
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
@@ -164,12 +165,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self.privileged = self._is_privileged() if privileged is None else privileged
         self._vector_lengths = self._lengths(info)
         self.observation_space = _observation_space(info, self._vector_lengths)
-        low, high = action_bounds(info.robot, action, fps=config.fps)
-        self.action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
+        low, high = (bound.astype(np.float32) for bound in action_bounds(info.robot, action, fps=config.fps))
+        self.action_space = spaces.Box(low, high)
         self._simulators, self._viewers = SimulatorCache(), WarmRenderer()
-        self._viewer: Painter | None = None
-        self._session: Session | None = None
-        self._situation: Situation | None = None
 
     # ------------------------------------------------------------------------------------------------ what it is at
 
@@ -351,6 +349,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 def _key(feature: str) -> str:
     """A dataset feature's key in the observation, as LeRobot's `preprocess_observation` maps it back."""
     return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
+
+
+def _checked(render_mode: str | None) -> str | None:
+    if render_mode not in (None, "rgb_array"):
+        raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
+    return render_mode
 
 
 def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
