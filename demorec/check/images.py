@@ -225,13 +225,15 @@ def pixel_statistics(episode: CheckedEpisode) -> Iterator[Found]:
     """The histograms, counted before coding, are those of the images: catches swapped channels and other images."""
     for camera in episode.cameras:
         decoded = episode.images(camera).mean
-        if len(decoded) < _FEWEST_MEANS:
-            yield NotMeasured(why=f"camera {camera.name} has {len(decoded)} images")
+        if not len(decoded):
             continue
         counted = episode.recording.pixel_statistics(camera.name)
         if counted.num_images != (episode.num_frames + 1) // 2:  # every other image is counted
             detail = f"camera {camera.name}: {counted.num_images} images are counted of {episode.num_frames}"
             yield Measurement(value=math.inf, detail=detail)
+            continue
+        if len(decoded) < _FEWEST_MEANS:
+            yield NotMeasured(why=f"camera {camera.name} has {len(decoded)} images")
             continue
         levels = np.arange(256)
         recorded = (counted.counts * levels).sum(axis=1) / np.maximum(counted.counts.sum(axis=1), 1)

@@ -132,14 +132,15 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     if not isinstance(found, _Scaled):
         yield found
         return
-    names = dataset.info.features[ACTION].names or [""] * len(found.means[0])
-    is_arm = np.array([not is_gripper(name) for name in names])
-    size = len(found.means[1])
-    square, product = np.zeros((size, size)), np.zeros((size, len(names)))
+    size, width, names = len(found.means[1]), len(found.means[0]), dataset.info.features[ACTION].names or ()
+    is_arm = (
+        np.array([not is_gripper(name) for name in names]) if len(names) == width else np.ones(width, dtype=np.bool_)
+    )
+    square, product = np.zeros((size, size)), np.zeros((size, width))
     for action, evidence in found:
         square += evidence.T @ evidence
         product += evidence.T @ action
-    common, sizes, moves = np.zeros((3, len(found.numbers), len(names)))
+    common, sizes, moves = np.zeros((3, len(found.numbers), width))
     for row, (action, evidence) in enumerate(found):
         others = square - evidence.T @ evidence
         ridge = _RIDGE * max(float(np.trace(others)) / size, 1e-9) * np.eye(size)
