@@ -29,10 +29,17 @@ _BACKWARDS = 0.5
 """The least correlation with the state's course from its end on that is none by chance."""
 _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
+_FEWEST_OF_SIDE = 10
+"""Changing images among every second one of an episode."""
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
 _STANDS = 0.02
 """Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
+_STALE, _CHANGES = 0.2, 1.5
+"""An image repeats the one before that changes by less than this share of what both of its neighbours change, where
+these change by so many levels of 255. A repeated image that is encoded again changes by 0.6."""
+_FEWEST_CHANGING = 50
+"""Images among changing ones, of all episodes together, from which on a share of them tells."""
 
 film_check = partial(image_check, on=("external", "dataset"), needs=IMAGES)
 
@@ -117,6 +124,63 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
             yield NotMeasured(why=f"{camera} hardly sees the robot move")
         else:
             yield from found
+
+
+@film_check(
+    measures="share of a camera's images that repeat the one before while those around them change",
+    warn=0.05,
+    fail=float("inf"),
+)
+def stale_images(subject: Filmed) -> Iterator[Found]:
+    """A camera gives a new image for each frame: catches one that is slower than the frames, and images that were lost
+    and replaced.
+
+    Of small, coarsely encoded images predicted ones may leave a motion to the next keyframe.
+    """
+    for camera, films in subject.films.items():
+        repeats, changing = 0, 0
+        for film in (film for film in films if len(film.cells) >= _FEWEST_IMAGES):
+            around = np.minimum(film.step[:-2], film.step[2:])
+            changes = (around > _CHANGES) & np.lib.stride_tricks.sliding_window_view(_moving(film), 3).all(axis=1)
+            repeats += int((film.step[1:-1][changes] < _STALE * around[changes]).sum())
+            changing += int(changes.sum())
+        if changing < _FEWEST_CHANGING:
+            yield NotMeasured(why=f"{camera} hardly changes")
+            continue
+        yield Measurement(value=repeats / changing, detail=f"{camera}, {repeats} of {changing} images")
+
+
+def _moving(film: Film) -> Flags:
+    """(N - 1,) from which image to the next the robot moves; all, where its state is not known."""
+    if film.state is None:
+        return np.ones(len(film.step), dtype=np.bool_)
+    return _moves(np.linalg.norm(np.diff(film.state / (film.state.std(axis=0) + 1e-3), axis=0), axis=1))
+
+
+@film_check(
+    measures="by what share every second image is nearer to the mean of its neighbours than the others are",
+    warn=0.4,
+    fail=float("inf"),
+)
+def interpolated_images(subject: Filmed) -> Iterator[Found]:
+    """No image is a mixture of the two around it: catches a video that was brought to twice its rate.
+
+    In the median of the episodes. Predicted images of a video whose every second one is a keyframe are nearer, too, by
+    a quarter.
+    """
+    for camera, films in subject.films.items():
+        nearer = []
+        for film in (film for film in films if len(film.cells) >= _FEWEST_IMAGES):
+            off = difference(film.cells[1:-1], (film.cells[2:].astype(np.float32) + film.cells[:-2]) / 2)
+            changes = (film.step[1:] > _CHANGES / 2) & _moving(film)[1:]
+            sides = [off[first::2][changes[first::2]] for first in (0, 1)]
+            if min(map(len, sides)) >= _FEWEST_OF_SIDE:
+                means = [float(side.mean()) for side in sides]
+                nearer.append(1.0 - min(means) / max(means))
+        if nearer:
+            yield Measurement(value=float(np.median(nearer)), detail=camera)
+        else:
+            yield NotMeasured(why=f"{camera} hardly changes")
 
 
 @film_check(

@@ -5,15 +5,19 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support import loose
 from support.check import level_of, simulate_run
-from support.dataset_edits import late, numbers
+from support.dataset_edits import FRONT, WRIST, blurred, film, halved, late, numbers, pixels
+from support.dataset_particular import repeats
 from support.export import export
 
 Fault = Callable[[Path], None]
+Images = NDArray[Any]
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
 )  # fmt: skip
@@ -68,6 +72,46 @@ def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Pa
     dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
     fault(dataset)
     assert level_of(dataset, law, "dataset") == level
+
+
+VIEWS = ("views_alike", "stale_images", "interpolated_images")
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five episodes with two cameras, nothing of demorec beside them."""
+    folder = tmp_path_factory.mktemp("filmed")
+    cameras = ("front", "wrist")
+    run = simulate_run(folder / "run", 5, robot="so101", variation="mild", seed=3601, fps=20, cameras=cameras)
+    export(run, folder / "dataset")
+    shutil.rmtree(folder / "dataset" / "demorec")
+    return folder / "dataset"
+
+
+IMAGE_FAULTS: dict[str, tuple[Fault, str]] = {
+    "a camera that hangs upside down in one episode": (film(WRIST, lambda r: r[:, ::-1, ::-1]), "views_alike"),
+    "a camera that is tilted in one episode": (film(FRONT, lambda r: np.roll(r, 16, axis=1)), "views_alike"),
+    "a gain in one episode": (film(FRONT, pixels(lambda r: 0.7 * r)), "views_alike"),
+    "a camera out of focus in one episode": (film(FRONT, blurred), "views_alike"),
+    "a tenth of the images repeats the one before": (
+        film(WRIST, lambda r: repeats(r, 10), only=None), "stale_images"
+    ),
+    "every second image is made of its neighbours": (
+        film(FRONT, lambda r: halved(r.astype(np.float32)), only=None), "interpolated_images"
+    ),
+}  # fmt: skip
+
+
+def test_good_images_pass(filmed: Path) -> None:
+    assert [level_of(filmed, law, "dataset") for law in VIEWS] == ["pass"] * len(VIEWS)
+
+
+@pytest.mark.parametrize("name", IMAGE_FAULTS)
+def test_images_unlike_the_others(name: str, filmed: Path, tmp_path: Path) -> None:
+    fault, law = IMAGE_FAULTS[name]
+    dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
+    fault(dataset)
+    assert level_of(dataset, law, "dataset") == "warn"
 
 
 def test_an_arm_that_begins_to_move_has_no_dead_band(tmp_path: Path) -> None:
