@@ -38,8 +38,8 @@ _STANDS = 0.02
 _STALE, _CHANGES = 0.2, 1.5
 """An image repeats the one before that changes by less than this share of what both of its neighbours change, where
 these change by so many levels of 255. A repeated image that is encoded again changes by 0.6."""
-_FEWEST_CHANGING = 50
-"""Images among changing ones, of all episodes together, from which on a share of them tells."""
+_FEWEST_CHANGING, _FEWEST_REPEATS = 25, 5
+"""Images among changing ones, of all episodes together, and repeats among them, from which on their share tells."""
 
 film_check = partial(image_check, on=("external", "dataset"), needs=IMAGES)
 
@@ -147,7 +147,8 @@ def stale_images(subject: Filmed) -> Iterator[Found]:
         if changing < _FEWEST_CHANGING:
             yield NotMeasured(why=f"{camera} hardly changes")
             continue
-        yield Measurement(value=repeats / changing, detail=f"{camera}, {repeats} of {changing} images")
+        share = repeats / changing if repeats >= _FEWEST_REPEATS else 0.0
+        yield Measurement(value=share, detail=f"{camera}, {repeats} of {changing} images")
 
 
 def _moving(film: Film) -> Flags:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -24,6 +24,7 @@ _STAMP_FIRST = {
 }
 """Types whose first field is a time stamp, alone or in a header."""
 _STAMP = np.dtype([("seconds", "<i4"), ("nanoseconds", "<u4")])
+_NONE = np.zeros(0, dtype=np.int64)
 _STAMP_BYTES = 4 + _STAMP.itemsize
 """A stamp with the four bytes of CDR's head before it."""
 
@@ -46,30 +47,31 @@ class TopicScan:
 
 
 def scan_topics(container: Container, blocks: Mapping[str, Block]) -> dict[str, TopicScan]:
-    """Topic -> what was found on it; `blocks` has all topics but those of images, which are read one by one.
+    """Topic -> what was found on it; `blocks` has all topics but those of images, which are read chunk by chunk.
 
     Every chunk's checksum is verified on the way, and that of every attachment.
     """
     schemas = {name: container.schemas[c.schema_id].name for name, c in container.channels.items()}
     found = {topic: _scan(schemas[topic], block) for topic, block in blocks.items()}
     images = [topic for topic in schemas if topic not in found]
-    times: dict[str, list[int]] = {topic: [] for topic in images}
-    stamps: dict[str, list[int]] = {topic: [] for topic in images}
-    first: dict[str, bytes] = {}
-    for topic, time_ns, data in container.messages(images):
-        times[topic].append(time_ns)
-        stamps[topic].append(_stamp(data))
-        first.setdefault(topic, data)
+    parts: dict[str, list[TopicScan]] = {topic: [] for topic in images}
+    for chunk in container.blocks_by_chunk(images):
+        for topic, block in chunk.items():
+            parts[topic].append(_scan(schemas[topic], block))
     for name in container.attachment_names:
         container.attachment(name)
-    for topic in images:
-        found[topic] = TopicScan(
-            schema=schemas[topic],
-            time_ns=np.array(times[topic], dtype=np.int64),
-            stamp_ns=np.array(stamps[topic], dtype=np.int64) if schemas[topic] in _STAMP_FIRST else None,
-            first=first.get(topic, b""),
-        )
+    found |= {topic: _joined(schemas[topic], scans) for topic, scans in parts.items()}
     return {topic: found[topic] for topic in schemas}
+
+
+def _joined(schema: str, scans: Sequence[TopicScan]) -> TopicScan:
+    stamps = [scan.stamp_ns for scan in scans if scan.stamp_ns is not None]
+    return TopicScan(
+        schema=schema,
+        time_ns=np.concatenate([_NONE, *(scan.time_ns for scan in scans)]),
+        stamp_ns=np.concatenate([_NONE, *stamps]) if schema in _STAMP_FIRST else None,
+        first=next((scan.first for scan in scans if len(scan.time_ns)), b""),
+    )
 
 
 def _scan(schema: str, block: Block) -> TopicScan:

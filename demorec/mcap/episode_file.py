@@ -176,10 +176,9 @@ class EpisodeFile(Closing):
 
     def _read[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
         """(time_ns, what was read) of the messages of a topic, in order."""
-        for message in self._container.messages((topic,)):
-            with damage_as_recording_error(self.path):
-                found = read(message.data)
-            yield message.time_ns, found
+        with damage_as_recording_error(self.path):
+            for message in self._container.messages((topic,)):
+                yield message.time_ns, read(message.data)
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera, in order; `frame_index` is their number, by which frames hold them."""
