@@ -19,7 +19,7 @@ from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE
 
-_FEWEST_EPISODES, _FEWEST_FRAMES, _FEWEST_VIEWS = 3, 30, 4
+_FEWEST_EPISODES, _FEWEST_FRAMES, _FEWEST_TO_COMPARE = 3, 30, 4
 _AHEAD_S = (0.0, 0.1, 0.3)
 """How far ahead the states are looked at that an action leads to, seconds; the first is one frame."""
 _RIDGE = 1e-3
@@ -45,8 +45,8 @@ _START, _ALIKE_PARTS = 0.2, 0.95
 show an object that lies elsewhere."""
 _USUAL, _FAR = 0.9, 2.5
 """How many of the episodes are usual, and how many times farther than those a view is off that is odd."""
-_LEVELS, _FINENESS = 1.5, 0.25
-"""What is usual at least: levels of 255, and the logarithm of how fine an image is."""
+_LEVELS, _FINENESS, _OFFSET = 1.5, 0.25, 0.1
+"""What is usual at least: levels of 255, the logarithm of how fine an image is, deviations of a joint."""
 
 likeness_check = partial(check, on=("dataset",), needs="actions of three episodes")
 
@@ -209,6 +209,31 @@ def motion_follows_action(dataset: Dataset) -> Found:
     return Measurement(value=max(-lag, lag - _LATEST_S * fps, 0.0), detail=f"the states follow by {lag:+.2f} frames")
 
 
+@likeness_check(
+    group="alignment",
+    measures="episodes in which a joint is farther from its targets than in the others",
+    warn=0,
+    fail=math.inf,
+)
+def offsets_alike(dataset: Dataset) -> Found:
+    """A joint is as far from its targets as it always is, in the mean of an episode: catches an arm or a leader that
+    slips, or was calibrated anew."""
+    if not dataset.motions.targets:
+        return NotMeasured(why="the action is no target of the state")
+    motions = [m for m in dataset.motions.all if m.action is not None and len(m.state) >= _FEWEST_FRAMES]
+    if len(motions) < _FEWEST_TO_COMPARE:
+        return NotMeasured(why=f"fewer than {_FEWEST_TO_COMPARE} episodes have {_FEWEST_FRAMES} frames")
+    spread = np.concatenate([motion.state for motion in motions]).std(axis=0)
+    means = np.array([np.mean(m.action - m.state, axis=0) for m in motions if m.action is not None])
+    wrong = []
+    for element in np.flatnonzero(dataset.motions.moving & np.isfinite(means).all(axis=0)).tolist():
+        if element != motions[0].gripper:  # what it holds decides
+            off = np.abs(means[:, element] - np.median(means[:, element])) / spread[element]
+            name = motions[0].names[element]
+            wrong += [f"{name}, {motions[row].where}" for row in np.flatnonzero(_far(off, _OFFSET))]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+
+
 def _told_by_states(found: _Scaled) -> Array:
     """(K,) share of each action's variance that is a linear function of the states in the same frame."""
     size, width, count = found.num_states, len(found.means[0]), 0
@@ -277,8 +302,8 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
     moved, turned, zoomed or blurred, or whose colours were changed. Where scenes vary much, only much is seen."""
     tasks = np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
     for camera, films in dataset.films.items():
-        if len(films) < _FEWEST_VIEWS:
-            yield NotMeasured(why=f"fewer than {_FEWEST_VIEWS} episodes")
+        if len(films) < _FEWEST_TO_COMPARE:
+            yield NotMeasured(why=f"fewer than {_FEWEST_TO_COMPARE} episodes")
             continue
         views = np.stack([np.median(film.cells[: max(round(_START * len(film.cells)), 1)], axis=0) for film in films])
         parts = np.sort(np.abs(views - np.median(views, axis=0)).mean(axis=3).reshape(len(views), -1), axis=1)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 
 from demorec.check.base import EE_POSES, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.evidence import Motion
 from demorec.check.motion import FEWEST, Moving
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.core.geometry import Array
@@ -16,6 +18,8 @@ _LARGEST = 2.0
 """How many times as large as its model a robot may be built, or as small."""
 _FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1
 """By which fixed mounts are found, and metres at which a turn counts beside a distance."""
+_FEWEST_EPISODES, _OFF = 3, 0.01
+"""Of which it is told whether their mounts are one, and metres from which on a frame counts less for the common one."""
 
 
 @check(
@@ -44,42 +48,88 @@ def pose_follows_joints(subject: Moving) -> Iterator[Found]:
         if len(motion.state) < FEWEST:
             yield NotMeasured(why=f"an episode has fewer than {FEWEST} frames")
             continue
-        links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
-        last = [joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]
-        off = _mounted(links[last], matrices(motion.ee_pose))
+        links, poses = _links(motion), _poses(motion)
+        rows = np.unique(np.linspace(0, len(links) - 1, _FITTED_FRAMES).astype(int))
+        off = displacement(_placed(_fitted(links[rows], poses[rows]), links), poses)
         frame = int(np.argmax(off))
         yield Measurement(value=float(np.quantile(off, 0.9)), frame=frame, detail=motion.where)
 
 
-def _mounted(links: Array, poses: Array) -> Array:
-    """(T,) metres by which poses (T, 4, 4) are off X @ links @ Y, for the fixed X and Y and the size that fit best."""
+@check(
+    group="physics",
+    on=("external", "dataset"),
+    measures="how much farther than usual an episode's EE poses are from the joints', by the mounts of all episodes",
+    unit="m",
+    warn=0.01,
+    fail=math.inf,
+    needs=EE_POSES,
+)
+def mounts_alike(subject: Moving) -> Found:
+    """The arm stands where it stood and has the tool that it had, and its joints have their zeros, in all episodes:
+    catches an arm that was homed anew, another tool, a base that was moved."""
+    motions = [m for m in subject.motions.all if m.ee_pose is not None and m.urdf is not None]
+    if not motions:
+        return Lacking(need=EE_POSES)
+    motions = [motion for motion in motions if not motion.tcp_link and len(motion.state) >= FEWEST]
+    if len(motions) < _FEWEST_EPISODES:
+        return NotMeasured(why=f"of fewer than {_FEWEST_EPISODES} episodes the mounts are unknown")
+    chosen = motions[:: max(1, len(motions) // _FITTED_EPISODES)]
+    few = max(_FITTED_FRAMES // len(chosen), 5)
+    parts = []
+    for motion in chosen:
+        rows = np.unique(np.linspace(0, len(motion.state) - 1, few).astype(int))
+        parts.append((_links(motion)[rows], _poses(motion)[rows]))
+    fit = _fitted(*(np.concatenate(side) for side in zip(*parts, strict=True)), loss="soft_l1")
+    off = [float(np.quantile(displacement(_placed(fit, _links(motion)), _poses(motion)), 0.9)) for motion in motions]
+    worst = int(np.argmax(off))
+    return Measurement(value=off[worst] - float(np.median(off)), detail=motions[worst].where)
+
+
+def _links(motion: Motion) -> Array:
+    """(T, 4, 4) of the last link that moves."""
+    assert motion.urdf is not None
+    links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
+    return links[[joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]]
+
+
+def _poses(motion: Motion) -> Array:
+    """(T, 4, 4) of the hand."""
+    assert motion.ee_pose is not None
+    return matrices(motion.ee_pose)
+
+
+def _fixed(numbers: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:]
+    return out
+
+
+def _placed(numbers: Array, links: Array) -> Array:
+    """(N, 4, 4) hands at links (N, 4, 4), by a fit."""
+    sized = links.copy()
+    sized[:, :3, 3] *= _LARGEST ** math.tanh(numbers[12])
+    return np.asarray(_fixed(numbers[:6]) @ sized @ _fixed(numbers[6:12]))
+
+
+def _fitted(links: Array, poses: Array, loss: Literal["linear", "soft_l1"] = "linear") -> Array:
+    """(13,) the fixed X and Y and the size by which X @ links @ Y are nearest to poses, all (N, 4, 4)."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    def fixed(numbers: Array) -> Array:
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:]
-        return out
-
-    def placed(numbers: Array, links: Array) -> Array:
-        sized = links.copy()
-        sized[:, :3, 3] *= _LARGEST ** math.tanh(numbers[12])
-        return np.asarray(fixed(numbers[:6]) @ sized @ fixed(numbers[6:12]))
-
-    rows = np.unique(np.linspace(0, len(links) - 1, _FITTED_FRAMES).astype(int))
-
     def residual(numbers: Array) -> Array:
-        off = placed(numbers, links[rows]) - poses[rows]
+        off = _placed(numbers, links) - poses
         return np.asarray((off[:, :3] * [_LEVER, _LEVER, _LEVER, 1.0]).reshape(-1))
 
     best = None
     for yaw in np.arange(4) * (math.pi / 2):  # bases that are turned may be far from each other's fit
         start = np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0])
-        mount = np.linalg.inv(fixed(start) @ links[0]) @ poses[0]
+        mount = np.linalg.inv(_fixed(start) @ links[0]) @ poses[0]
         guess = np.concatenate([start, Rotation.from_matrix(mount[:3, :3]).as_rotvec(), mount[:3, 3], [0.0]])
-        found = least_squares(residual, guess)
+        found = least_squares(residual, guess, loss=loss, f_scale=_OFF)
         best = found if best is None or found.cost < best.cost else best
-        if best.cost < 1e-3 * _LEVER * len(rows):
+        if best.cost < 1e-3 * _LEVER * len(links):
             break
     assert best is not None
-    return displacement(placed(best.x, links), poses)
+    return np.asarray(best.x)

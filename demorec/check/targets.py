@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import partial
 
@@ -42,6 +43,8 @@ _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
 """rad, m: by how much a state that stays changes at most, and an action that goes on at least; how often."""
+_FEWEST_STEPS = 12
+"""Steps between a joint's values from which on the least of them tells how fine they are."""
 _RESOLVED_FPS = 20
 """Frames a second from which on a joint's steps follow from its velocities: noise on commands starts and stops an arm
 within longer ones."""
@@ -256,6 +259,33 @@ def dead_band(subject: Moving) -> Found:
     of_joint = {name: float(np.median(way)) for name, way in ways.items() if len(way) >= _FEWEST_TIMES}
     name = max(of_joint, key=lambda key: of_joint[key], default="")
     return Measurement(value=of_joint.get(name, 0.0), detail=f"{name}, {len(ways[name])} times" if name else "")
+
+
+@motion_check(
+    measures="step in which the readings of a joint come",
+    unit="rad, m",
+    warn=0.01,
+    fail=math.inf,
+    on=("external", "dataset"),
+    needs=URDF,
+)
+def encoder_steps(subject: Moving) -> Iterator[Found]:
+    """A joint's readings are as fine as its encoder, a thousandth of a turn: catches angles in whole degrees or a byte.
+
+    The step is the least distance of two of its values in all episodes.
+    """
+    columns: dict[str, list[Array]] = {}
+    for motion in subject.motions.all:
+        for element in np.flatnonzero(np.isfinite(motion.lower)).tolist():
+            if element != motion.gripper:
+                columns.setdefault(motion.names[element], []).append(motion.state[:, element])
+    if not columns:
+        yield Lacking(need=URDF)
+    for name, parts in columns.items():
+        steps = np.diff(np.unique(np.concatenate(parts)))
+        steps = steps[steps > _STAYS]
+        if len(steps) >= _FEWEST_STEPS:
+            yield Measurement(value=float(steps.min()), detail=name)
 
 
 @check(

@@ -20,6 +20,7 @@ Fault = Callable[[Path], None]
 Images = NDArray[Any]
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
+    "mounts_alike", "encoder_steps",
 )  # fmt: skip
 
 
@@ -56,6 +57,12 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
         numbers("action", lambda rows: rows[::-1], only=(1,)), "actions_go_with_states", "fail"
     ),
     "actions eight frames late": (numbers("action", lambda rows: late(rows, 8)), "motion_follows_action", "fail"),
+    "a zero that is moved in one episode": (
+        numbers("observation.state", lambda rows: rows + 0.1 * (np.arange(8) == 1), only=(2,)), "mounts_alike", "warn"
+    ),
+    "an encoder of eight bits": (
+        numbers("observation.state", lambda rows: np.round(rows * 40) / 40), "encoder_steps", "warn"
+    ),
     "an episode that was cut off": (cut_off, "whole_episodes", "warn"),
     "a second that is missing": (without_a_second, "missing_frames", "warn"),
     "an episode of half the rate": (at_half_the_rate, "velocity_matches_position", "fail"),
@@ -74,7 +81,7 @@ def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Pa
     assert level_of(dataset, law, "dataset") == level
 
 
-VIEWS = ("views_alike", "stale_images", "interpolated_images")
+VIEWS = ("views_alike", "stale_images", "interpolated_images", "offsets_alike")
 
 
 @pytest.fixture(scope="module")
@@ -88,11 +95,15 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "dataset"
 
 
-IMAGE_FAULTS: dict[str, tuple[Fault, str]] = {
+FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a camera that hangs upside down in one episode": (film(WRIST, lambda r: r[:, ::-1, ::-1]), "views_alike"),
     "a camera that is tilted in one episode": (film(FRONT, lambda r: np.roll(r, 16, axis=1)), "views_alike"),
     "a gain in one episode": (film(FRONT, pixels(lambda r: 0.7 * r)), "views_alike"),
     "a camera out of focus in one episode": (film(FRONT, blurred), "views_alike"),
+    "a leader that drifts in one episode": (
+        numbers("action", lambda r: r + np.linspace(0, 0.3, len(r))[:, None] * (np.arange(6) == 1), only=(1,)),
+        "offsets_alike",
+    ),
     "a tenth of the images repeats the one before": (
         film(WRIST, lambda r: repeats(r, 10), only=None), "stale_images"
     ),
@@ -102,13 +113,13 @@ IMAGE_FAULTS: dict[str, tuple[Fault, str]] = {
 }  # fmt: skip
 
 
-def test_good_images_pass(filmed: Path) -> None:
+def test_good_targets_and_images_pass(filmed: Path) -> None:
     assert [level_of(filmed, law, "dataset") for law in VIEWS] == ["pass"] * len(VIEWS)
 
 
-@pytest.mark.parametrize("name", IMAGE_FAULTS)
-def test_images_unlike_the_others(name: str, filmed: Path, tmp_path: Path) -> None:
-    fault, law = IMAGE_FAULTS[name]
+@pytest.mark.parametrize("name", FILMED_FAULTS)
+def test_targets_and_images_unlike_the_others(name: str, filmed: Path, tmp_path: Path) -> None:
+    fault, law = FILMED_FAULTS[name]
     dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
     fault(dataset)
     assert level_of(dataset, law, "dataset") == "warn"
