@@ -43,8 +43,8 @@ _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
 """rad, m: by how much a state that stays changes at most, and an action that goes on at least; how often."""
-_FEWEST_STEPS = 12
-"""Steps between a joint's values from which on the least of them tells how fine they are."""
+_FEWEST_STEPS, _COMES_BACK = 12, 2
+"""Steps between a joint's values from which on the least of them tells how fine they are, and how often each is gone."""
 _RESOLVED_FPS = 20
 """Frames a second from which on a joint's steps follow from its velocities: noise on commands starts and stops an arm
 within longer ones."""
@@ -272,7 +272,8 @@ def dead_band(subject: Moving) -> Found:
 def encoder_steps(subject: Moving) -> Iterator[Found]:
     """A joint's readings are as fine as its encoder, a thousandth of a turn: catches angles in whole degrees or a byte.
 
-    The step is the least distance of two of its values in all episodes.
+    The step is the least distance of two of its values in all episodes, to which it comes back often: of a continuous
+    reading no value comes twice.
     """
     columns: dict[str, list[Array]] = {}
     for motion in subject.motions.all:
@@ -284,8 +285,9 @@ def encoder_steps(subject: Moving) -> Iterator[Found]:
     for name, parts in columns.items():
         steps = np.diff(np.unique(np.concatenate(parts)))
         steps = steps[steps > _STAYS]
-        if len(steps) >= _FEWEST_STEPS:
-            yield Measurement(value=float(steps.min()), detail=name)
+        changes = sum(int((np.abs(np.diff(part)) > _STAYS).sum()) for part in parts)
+        is_coarse = _FEWEST_STEPS <= len(steps) <= changes / _COMES_BACK
+        yield Measurement(value=float(steps.min()) if is_coarse else 0.0, detail=name)
 
 
 @check(
