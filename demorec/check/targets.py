@@ -44,7 +44,7 @@ _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
 """rad, m: by how much a state that stays changes at most, and an action that goes on at least; how often."""
 _FEWEST_STEPS, _COMES_BACK = 12, 2
-"""Steps between a joint's values from which on the least of them tells how fine they are, and how often each is gone."""
+"""Steps between a joint's values from which on the least of them tells how fine they are; how often each is gone."""
 _RESOLVED_FPS = 20
 """Frames a second from which on a joint's steps follow from its velocities: noise on commands starts and stops an arm
 within longer ones."""
