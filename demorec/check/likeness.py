@@ -299,8 +299,12 @@ def _speed_at(motion: Motion, row: int, spread: Array) -> float:
 )
 def views_alike(dataset: Dataset) -> Iterator[Found]:
     """A camera begins each episode with about the same view, if nearly all do, and is as sharp: catches one that was
-    moved, turned, zoomed or blurred, or whose colours were changed. Where scenes vary much, only much is seen."""
+    moved, turned, zoomed or blurred, or whose colours were changed. Where scenes vary much, only much is seen.
+
+    An episode that alone has its instruction may show something else, where most share theirs.
+    """
     tasks = np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
+    of_own = np.unique(tasks, return_counts=True)[1].tolist().count(1) > len(tasks) / 2
     for camera, films in dataset.films.items():
         if len(films) < _FEWEST_TO_COMPARE:
             yield NotMeasured(why=f"fewer than {_FEWEST_TO_COMPARE} episodes")
@@ -312,7 +316,7 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
         if np.isfinite(fineness).all():
             fineness = np.log(np.maximum(fineness, 1e-6))
             odd |= _far(np.abs(fineness - np.median(fineness)), _FINENESS)
-        strange = np.flatnonzero(odd & np.isin(tasks, tasks[~odd])).tolist()
+        strange = np.flatnonzero(odd & (of_own | np.isin(tasks, tasks[~odd]))).tolist()
         named = ", ".join(map(str, strange[:5]))
         yield Measurement(value=len(strange), detail=f"{camera}, episode {named}" if strange else camera)
 

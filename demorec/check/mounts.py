@@ -75,11 +75,10 @@ def mounts_alike(subject: Moving) -> Found:
         return NotMeasured(why=f"of fewer than {_FEWEST_EPISODES} episodes the mounts are unknown")
     chosen = motions[:: max(1, len(motions) // _FITTED_EPISODES)]
     few = max(_FITTED_FRAMES // len(chosen), 5)
-    parts = []
-    for motion in chosen:
-        rows = np.unique(np.linspace(0, len(motion.state) - 1, few).astype(int))
-        parts.append((_links(motion)[rows], _poses(motion)[rows]))
-    fit = _fitted(*(np.concatenate(side) for side in zip(*parts, strict=True)), loss="soft_l1")
+    rows = [np.unique(np.linspace(0, len(motion.state) - 1, few).astype(int)) for motion in chosen]
+    links = np.concatenate([_links(motion)[some] for motion, some in zip(chosen, rows, strict=True)])
+    poses = np.concatenate([_poses(motion)[some] for motion, some in zip(chosen, rows, strict=True)])
+    fit = _fitted(links, poses, loss="soft_l1")
     off = [float(np.quantile(displacement(_placed(fit, _links(motion)), _poses(motion)), 0.9)) for motion in motions]
     worst = int(np.argmax(off))
     return Measurement(value=off[worst] - float(np.median(off)), detail=motions[worst].where)
