@@ -12,14 +12,16 @@ from functools import partial
 
 import numpy as np
 
-from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check, image_check
+from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.evidence import Flags, Motion, is_gripper
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE
 
-_FEWEST_EPISODES, _FEWEST_FRAMES, _FEWEST_TO_COMPARE = 3, 30, 4
+_FEWEST_EPISODES, _FEWEST_FRAMES = 3, 30
+FEWEST_TO_COMPARE = 4
+"""Episodes from which on one is told to be unlike the others."""
 _AHEAD_S = (0.0, 0.1, 0.3)
 """How far ahead the states are looked at that an action leads to, seconds; the first is one frame."""
 _RIDGE = 1e-3
@@ -40,13 +42,10 @@ _MOST, _ALIKE, _OTHER, _RARE = 0.7, 0.1, 0.5, 0.05
 """Share of the episodes that are alike, how alike (in deviations of the opening, and shares of the mean speed), how far
 one is off that is not, and the share of those that are not from which on it is another way to do it."""
 
-_START, _ALIKE_PARTS = 0.2, 0.95
-"""Share of an episode's images that are its start, and share of an image's parts that are compared: the others may
-show an object that lies elsewhere."""
 _USUAL, _FAR = 0.9, 2.5
 """How many of the episodes are usual, and how many times farther than those a view is off that is odd."""
-_LEVELS, _FINENESS, _OFFSET = 1.5, 0.25, 0.1
-"""What is usual at least: levels of 255, the logarithm of how fine an image is, deviations of a joint."""
+_OFFSET = 0.1
+"""Distance of a joint from its targets that is usual at least, in its deviations."""
 
 likeness_check = partial(check, on=("dataset",), needs="actions of three episodes")
 
@@ -221,8 +220,8 @@ def offsets_alike(dataset: Dataset) -> Found:
     if not dataset.motions.targets:
         return NotMeasured(why="the action is no target of the state")
     motions = [m for m in dataset.motions.all if m.action is not None and len(m.state) >= _FEWEST_FRAMES]
-    if len(motions) < _FEWEST_TO_COMPARE:
-        return NotMeasured(why=f"fewer than {_FEWEST_TO_COMPARE} episodes have {_FEWEST_FRAMES} frames")
+    if len(motions) < FEWEST_TO_COMPARE:
+        return NotMeasured(why=f"fewer than {FEWEST_TO_COMPARE} episodes have {_FEWEST_FRAMES} frames")
     spread = np.concatenate([motion.state for motion in motions]).std(axis=0)
     means = np.array([np.mean(m.action - m.state, axis=0) for m in motions if m.action is not None])
     wrong = []
@@ -230,7 +229,7 @@ def offsets_alike(dataset: Dataset) -> Found:
         if element != motions[0].gripper:  # what it holds decides
             off = np.abs(means[:, element] - np.median(means[:, element])) / spread[element]
             name = motions[0].names[element]
-            wrong += [f"{name}, {motions[row].where}" for row in np.flatnonzero(_far(off, _OFFSET))]
+            wrong += [f"{name}, {motions[row].where}" for row in np.flatnonzero(far_off(off, _OFFSET))]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
 
 
@@ -290,37 +289,6 @@ def _speed_at(motion: Motion, row: int, spread: Array) -> float:
     return float(speed[row * few :][:few].mean() / max(float(np.sqrt((speed**2).mean())), 1e-9))
 
 
-@image_check(
-    on=("dataset",),
-    needs="images of four episodes",
-    measures="episodes in which a camera begins with another view than in the others",
-    warn=0,
-    fail=math.inf,
-)
-def views_alike(dataset: Dataset) -> Iterator[Found]:
-    """A camera begins each episode with about the same view, if nearly all do, and is as sharp: catches one that was
-    moved, turned, zoomed or blurred, or whose colours were changed. Where scenes vary much, only much is seen.
-
-    An episode that alone has its instruction may show something else, where most share theirs.
-    """
-    tasks = np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
-    of_own = np.unique(tasks, return_counts=True)[1].tolist().count(1) > len(tasks) / 2
-    for camera, films in dataset.films.items():
-        if len(films) < _FEWEST_TO_COMPARE:
-            yield NotMeasured(why=f"fewer than {_FEWEST_TO_COMPARE} episodes")
-            continue
-        views = np.stack([np.median(film.cells[: max(round(_START * len(film.cells)), 1)], axis=0) for film in films])
-        parts = np.sort(np.abs(views - np.median(views, axis=0)).mean(axis=3).reshape(len(views), -1), axis=1)
-        odd = _far(parts[:, : max(round(_ALIKE_PARTS * parts.shape[1]), 1)].mean(axis=1), _LEVELS)
-        fineness = np.array([images.fineness for images in dataset.images(camera)])
-        if np.isfinite(fineness).all():
-            fineness = np.log(np.maximum(fineness, 1e-6))
-            odd |= _far(np.abs(fineness - np.median(fineness)), _FINENESS)
-        strange = np.flatnonzero(odd & (of_own | np.isin(tasks, tasks[~odd]))).tolist()
-        named = ", ".join(map(str, strange[:5]))
-        yield Measurement(value=len(strange), detail=f"{camera}, episode {named}" if strange else camera)
-
-
-def _far(off: Array, least: float) -> Flags:
-    """Which are much farther off than most."""
+def far_off(off: Array, least: float) -> Flags:
+    """Which of N are much farther off than most, when `least` is usual at least."""
     return np.asarray(off > _FAR * max(float(np.quantile(off, _USUAL, method="lower")), least))

@@ -81,15 +81,15 @@ def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Pa
     assert level_of(dataset, law, "dataset") == level
 
 
-VIEWS = ("views_alike", "stale_images", "interpolated_images", "offsets_alike")
+VIEWS = ("views_alike", "views_stay", "stale_images", "interpolated_images", "offsets_alike")
 
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five episodes with two cameras, nothing of demorec beside them."""
+    """Six episodes with two cameras, nothing of demorec beside them."""
     folder = tmp_path_factory.mktemp("filmed")
     cameras = ("front", "wrist")
-    run = simulate_run(folder / "run", 5, robot="so101", variation="mild", seed=3601, fps=20, cameras=cameras)
+    run = simulate_run(folder / "run", 6, robot="so101", variation="mild", seed=3601, fps=20, cameras=cameras)
     export(run, folder / "dataset")
     shutil.rmtree(folder / "dataset" / "demorec")
     return folder / "dataset"
@@ -98,6 +98,9 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a camera that hangs upside down in one episode": (film(WRIST, lambda r: r[:, ::-1, ::-1]), "views_alike"),
     "a camera that is tilted in one episode": (film(FRONT, lambda r: np.roll(r, 16, axis=1)), "views_alike"),
+    "a camera that is tilted from the fourth episode on": (
+        film(FRONT, lambda r: np.roll(r, 10, axis=1), only=(3, 4, 5)), "views_stay"
+    ),
     "a gain in one episode": (film(FRONT, pixels(lambda r: 0.7 * r)), "views_alike"),
     "a camera out of focus in one episode": (film(FRONT, blurred), "views_alike"),
     "a leader that drifts in one episode": (

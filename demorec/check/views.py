@@ -1,0 +1,97 @@
+"""Does a camera show the same place in all episodes of a dataset: whoever recorded them, nothing has to be known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from demorec.check.base import Found, Measurement, NotMeasured, image_check
+from demorec.check.dataset import Dataset
+from demorec.check.films import Film
+from demorec.check.likeness import FEWEST_TO_COMPARE, far_off
+from demorec.core.geometry import Array
+
+_START, _ALIKE_PARTS = 0.2, 0.95
+"""Share of an episode's images that are its start, and share of an image's parts that are compared: the others may
+show an object that lies elsewhere."""
+_LEVELS, _FINENESS = 1.5, 0.12
+"""What is usual at least: levels of 255, and the logarithm of how fine an image is."""
+_FLAT = 1e-6
+"""How fine an image is at least that is no single colour."""
+_FEWEST_OF_SESSION, _SESSION = 3, 0.05
+"""Episodes of a session at least, and share of all."""
+
+views_check = partial(image_check, on=("dataset",), needs="images of four episodes", fail=math.inf)
+
+
+def _views(films: list[Film]) -> Array:
+    """(N, rows, columns, 3) what each film shows at its start, 0 to 255."""
+    starts = [film.cells[: max(round(_START * len(film.cells)), 1)] for film in films]
+    return np.stack([np.median(start, axis=0) for start in starts])
+
+
+def _difference(one: Array, other: Array) -> Array:
+    """(...,) levels by which most parts of views (..., rows, columns, 3) differ."""
+    parts = np.abs(one - other).mean(axis=-1)
+    parts = np.sort(parts.reshape(*parts.shape[:-2], -1), axis=-1)
+    return np.asarray(parts[..., : max(round(_ALIKE_PARTS * parts.shape[-1]), 1)].mean(axis=-1))
+
+
+def _instructions(dataset: Dataset) -> tuple[Array, bool]:
+    """(N,) number of the first one of each episode, and whether most episodes have one that no other has."""
+    tasks = np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
+    return tasks, int((np.unique(tasks, return_counts=True)[1] == 1).sum()) > len(tasks) / 2
+
+
+@views_check(measures="episodes in which a camera begins with another view than in the others", warn=0)
+def views_alike(dataset: Dataset) -> Iterator[Found]:
+    """A camera begins each episode with about the same view, if nearly all do, and is as sharp: catches one that was
+    moved, turned, zoomed or blurred, or whose colours were changed. Where scenes vary much, only much is seen.
+
+    An episode that alone has its instruction may show something else, where most share theirs.
+    """
+    tasks, of_own = _instructions(dataset)
+    for camera, films in dataset.films.items():
+        if len(films) < FEWEST_TO_COMPARE:
+            yield NotMeasured(why=f"fewer than {FEWEST_TO_COMPARE} episodes")
+            continue
+        views = _views(list(films))
+        odd = far_off(_difference(views, np.median(views, axis=0)), _LEVELS)
+        fineness = np.array([images.fineness for images in dataset.images(camera)])
+        if (known := np.isfinite(fineness)).any():
+            fineness = np.log(np.maximum(fineness[known], _FLAT))
+            odd[known] |= far_off(np.abs(fineness - np.median(fineness)), _FINENESS)
+        strange = np.flatnonzero(odd & (of_own | np.isin(tasks, tasks[~odd]))).tolist()
+        named = ", ".join(map(str, strange[:5]))
+        yield Measurement(value=len(strange), detail=f"{camera}, episode {named}" if strange else camera)
+
+
+@views_check(
+    measures="by how many times what is usual among episodes a camera's view changes from one of them on",
+    warn=2.0,
+)
+def views_stay(dataset: Dataset) -> Iterator[Found]:
+    """A camera shows the same place before and after each episode: catches one that was moved between two sessions.
+
+    Of what the episodes before and after show in the mean; where both have an instruction in common, or most have one
+    of their own.
+    """
+    tasks, of_own = _instructions(dataset)
+    for camera, films in dataset.films.items():
+        least = max(_FEWEST_OF_SESSION, math.ceil(_SESSION * len(films)))
+        if len(films) < 2 * least:
+            yield NotMeasured(why=f"fewer than {2 * least} episodes")
+            continue
+        views = _views(list(films))
+        sums, found = np.cumsum(views, axis=0), [(0.0, 0)]
+        for first in range(least, len(films) - least + 1):
+            if of_own or np.isin(tasks[:first], tasks[first:]).any():
+                before, after = sums[first - 1] / first, (sums[-1] - sums[first - 1]) / (len(films) - first)
+                found.append((float(_difference(before, after)), first))
+        change, first = max(found)
+        sides = [side for side in (views[:first], views[first:]) if len(side)]
+        usual = np.median(np.concatenate([_difference(side, side.mean(axis=0)) for side in sides]))
+        yield Measurement(value=change / max(float(usual), _LEVELS), detail=f"{camera}, from episode {first} on")
