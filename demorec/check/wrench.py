@@ -247,9 +247,9 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     free = dynamics.is_judged.copy()
     free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
     of_wrench, (of_motors, of_all) = _peaks_of_wrench(episode, hand, dynamics), _peaks_of_motors(episode, dynamics)
-    # What accelerates the arm otherwise than the servo, as an impact does, shows in both: in the wrench less, if the
-    # links are accelerated more than the hand, and in motors that bear no weight, if it goes sideways.
-    yield worst_frame(np.where(free, np.maximum(of_wrench - of_all, 0.0), 0.0), "wrench")
+    # What accelerates the arm otherwise than the servo, as an impact does, shows in both: in one of them less, as links
+    # or hand are accelerated more, and in motors that bear no weight, if it goes sideways.
+    yield worst_frame(np.where(free, np.maximum(of_wrench - 2 * of_all, 0.0), 0.0), "wrench")
     yield worst_frame(np.where(free, np.maximum(of_motors - 2 * of_wrench, 0.0), 0.0), "efforts")
 
 
