@@ -35,15 +35,12 @@ class EpisodeImages:
         count: How many there are.
         mean: (3,) mean red, green and blue, of 1.
         std: (3,) their standard deviations over all pixels, of 1, by some of the images; NaN where these are few.
-        fineness: Variance of the pixels within the parts, of 1, mean over the colours, by some of the images, NaN
-            without any: what blur takes and noise adds.
         cells: (count, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
     """
 
     count: int
     mean: Array
     std: Array
-    fineness: float
     cells: NDArray[np.uint8]
 
 
@@ -69,15 +66,10 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
             )
         cells = np.stack([cell for cell, _ in images])
         mean = cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255
-        some = [(cell, moment) for cell, moment in images if moment is not None]
-        std, fineness = np.full(3, np.nan), math.nan
-        if some:
-            colour, squared = np.mean([moment for _, moment in some], axis=0)
-            std = np.sqrt(np.maximum(squared - colour**2, 0.0)) if len(some) >= _FEWEST else std
-            fineness = float(
-                np.mean(squared - np.square(np.array([cell for cell, _ in some]) / 255).mean(axis=(0, 1, 2)))
-            )
-        found.append(EpisodeImages(count=len(cells), mean=mean, std=std, fineness=fineness, cells=cells))
+        moments = [moment for _, moment in images if moment is not None]
+        colour, squared = np.mean(moments, axis=0) if len(moments) >= _FEWEST else np.full((2, 3), np.nan)
+        std = np.sqrt(np.maximum(squared - colour**2, 0.0))
+        found.append(EpisodeImages(count=len(cells), mean=mean, std=std, cells=cells))
     return found
 
 

@@ -17,10 +17,8 @@ from demorec.core.geometry import Array
 _START, _ALIKE_PARTS = 0.2, 0.95
 """Share of an episode's images that are its start, and share of an image's parts that are compared: the others may
 show an object that lies elsewhere."""
-_LEVELS, _FINENESS = 1.5, 0.12
-"""What is usual at least: levels of 255, and the logarithm of how fine an image is."""
-_FLAT = 1e-6
-"""How fine an image is at least that is no single colour."""
+_LEVELS = 1.5
+"""By how much a view is off at least that is usual, of 255."""
 _FEWEST_OF_SESSION, _SESSION = 5, 0.05
 """Episodes of a session at least, and share of all."""
 
@@ -48,8 +46,8 @@ def _instructions(dataset: Dataset) -> tuple[Array, bool]:
 
 @views_check(measures="episodes in which a camera begins with another view than in the others", warn=0)
 def views_alike(dataset: Dataset) -> Iterator[Found]:
-    """A camera begins each episode with about the same view, if nearly all do, and is as sharp: catches one that was
-    moved, turned, zoomed, blurred or noisy, or whose colours were changed. Where scenes vary much, only much is seen.
+    """A camera begins each episode with about the same view, if nearly all do: catches one that was moved, turned or
+    zoomed, or whose colours were changed. Where scenes vary much, or episodes are few, only much is seen.
 
     An episode that alone has its instruction may show something else, where most share theirs.
     """
@@ -60,10 +58,6 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
             continue
         views = _views(list(films))
         odd = far_off(_difference(views, np.median(views, axis=0)), _LEVELS)
-        fineness = np.array([images.fineness for images in dataset.images(camera)])
-        if (known := np.isfinite(fineness)).any():
-            fineness = np.log(np.maximum(fineness[known], _FLAT))
-            odd[known] |= far_off(np.abs(fineness - np.median(fineness)), _FINENESS)
         strange = np.flatnonzero(odd & (of_own | np.isin(tasks, tasks[~odd]))).tolist()
         named = ", ".join(map(str, strange[:5]))
         yield Measurement(value=len(strange), detail=f"{camera}, episode {named}" if strange else camera)

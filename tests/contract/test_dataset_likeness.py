@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from support import loose
 from support.check import level_of, simulate_run
-from support.dataset_edits import FRONT, WRIST, film, halved, late, noisy, numbers, pixels
+from support.dataset_edits import FRONT, WRIST, film, halved, late, numbers, pixels
 from support.dataset_particular import repeats
 from support.export import export
 
@@ -101,7 +101,6 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
         film(FRONT, lambda r: np.roll(r, 24, axis=1), only=range(5, 10)), "views_stay"
     ),
     "a gain in one episode": (film(FRONT, pixels(lambda r: 0.7 * r)), "views_alike"),
-    "a noisy sensor in one episode": (film(FRONT, pixels(noisy(40.0))), "views_alike"),
     "a leader that drifts in one episode": (
         numbers("action", lambda r: r + np.linspace(0, 0.6, len(r))[:, None] * (np.arange(6) == 1), only=(1,)),
         "offsets_alike",
