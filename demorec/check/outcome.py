@@ -20,6 +20,8 @@ from demorec.episode.scene import Body, Scene
 
 _PLACES = ("target", "mark", "marks", "tray")
 """What the tasks call bodies of the role "target"."""
+_LEVER = 0.1
+"""Metres at which a tilt counts beside a distance."""
 _LAST = 11
 """Frames at the end that show how far what settles moves in one step, by the second largest: a tower of three rocks by
 0.001 rad. A single large step is a seam between two recordings."""
@@ -127,12 +129,12 @@ def _expected(scene: Scene, names: Sequence[str]) -> Iterator[str]:
 
 @outcome_check(
     measures="what the last frame shows of a condition, against the outcome's value",
-    unit="m, rad",
+    unit="m",
 )
 def final_state(episode: CheckedEpisode) -> Iterator[Found]:
     """After a success objects and fingers are in the last recorded frame where the outcome says: distances to goals,
-    heights, tilts, what was not to be moved, the opening. The outcome is a step later: what moved in the last frames
-    may move by as much once more."""
+    heights, tilts (0.1 m for each rad), what was not to be moved, the opening. The outcome is a step later: what moved
+    in the last frames may move by as much once more."""
     outcome, c = episode.outcome, episode.columns
     if outcome is None or not outcome.success or not c.num_frames:
         return
@@ -142,8 +144,9 @@ def final_state(episode: CheckedEpisode) -> Iterator[Found]:
             values = [shown[condition.name] for shown in last]
             steps = sorted(abs(b - a) for a, b in pairwise(values))
             value, step = values[-1], steps[-2] if len(steps) > 1 else 0.0
+            metres = _LEVER if condition.name.partition(":")[0] == "tilt" else 1.0
             yield Measurement(
-                value=max(abs(value - condition.value) - step, 0.0),
+                value=metres * max(abs(value - condition.value) - step, 0.0),
                 frame=c.num_frames - 1,
                 detail=f"{condition.name}: {value:.4f}, outcome says {condition.value:.4f}",
             )

@@ -38,10 +38,9 @@ def _difference(one: Array, other: Array) -> Array:
     return np.asarray(parts[..., : max(round(_ALIKE_PARTS * parts.shape[-1]), 1)].mean(axis=-1))
 
 
-def _instructions(dataset: Dataset) -> tuple[Array, bool]:
-    """(N,) number of the first one of each episode, and whether most episodes have one that no other has."""
-    tasks = np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
-    return tasks, int((np.unique(tasks, return_counts=True)[1] == 1).sum()) > len(tasks) / 2
+def _instructions(dataset: Dataset) -> Array:
+    """(N,) number of the first one of each episode."""
+    return np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
 
 
 @views_check(measures="episodes in which a camera begins with another view than in the others", warn=0)
@@ -49,16 +48,16 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
     """A camera begins each episode with about the same view, if nearly all do: catches one that was moved, turned or
     zoomed, or whose colours were changed. Where scenes vary much, or episodes are few, only much is seen.
 
-    An episode that alone has its instruction may show something else, where most share theirs.
+    An episode that alone has its instruction may show something else.
     """
-    tasks, of_own = _instructions(dataset)
+    tasks = _instructions(dataset)
     for camera, films in dataset.films.items():
         if len(films) < FEWEST_TO_COMPARE:
             yield NotMeasured(why=f"fewer than {FEWEST_TO_COMPARE} episodes")
             continue
         views = _views(list(films))
         odd = far_off(_difference(views, np.median(views, axis=0)), _LEVELS)
-        strange = np.flatnonzero(odd & (of_own | np.isin(tasks, tasks[~odd]))).tolist()
+        strange = np.flatnonzero(odd & np.isin(tasks, tasks[~odd])).tolist()
         named = ", ".join(map(str, strange[:5]))
         yield Measurement(value=len(strange), detail=f"{camera}, episode {named}" if strange else camera)
 
@@ -70,10 +69,9 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
 def views_stay(dataset: Dataset) -> Iterator[Found]:
     """A camera shows the same place before and after each episode: catches one that was moved between two sessions.
 
-    Of what the episodes before and after show in the mean; where both have an instruction in common, or most have one
-    of their own.
+    Of what the episodes before and after show in the mean, where both have an instruction in common.
     """
-    tasks, of_own = _instructions(dataset)
+    tasks = _instructions(dataset)
     for camera, films in dataset.films.items():
         least = max(_FEWEST_OF_SESSION, math.ceil(_SESSION * len(films)))
         if len(films) < 2 * least:
@@ -82,7 +80,7 @@ def views_stay(dataset: Dataset) -> Iterator[Found]:
         views = _views(list(films))
         sums, found = np.cumsum(views, axis=0), [(0.0, 0)]
         for first in range(least, len(films) - least + 1):
-            if of_own or np.isin(tasks[:first], tasks[first:]).any():
+            if np.isin(tasks[:first], tasks[first:]).any():
                 before, after = sums[first - 1] / first, (sums[-1] - sums[first - 1]) / (len(films) - first)
                 found.append((float(_difference(before, after)), first))
         change, first = max(found)

@@ -39,6 +39,8 @@ _OFTEN, _OWN_INERTIA = 0.9, 0.15
 """Share of the frames by whose worst efforts are judged; of a motor's peak that its links' own inertia may make."""
 _AROUND = 6
 """Frames before and after a peak of the contact force in which it must be the only one."""
+_MOVES = 0.3
+"""Of the hand's opening, a second, from which on its fingers move."""
 _FEWEST_FRAMES = 3
 _LOST_SHARE = 0.5
 """Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
@@ -230,8 +232,9 @@ def _is_loaded(torque: Array, dynamics: Dynamics) -> bool:
 def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     """No single frame is far from both of its neighbours, or empty: catches lost values and glitches of an amplifier.
 
-    Wrench and efforts are those that the servo's motion needs, in each frame in which it alone moves the free hand; of
-    the motors those count that bear weight. The force on what is carried is that of the gripper's motors in each frame.
+    Wrench and efforts are those that the servo's motion needs, in each frame in which it alone moves the free hand and
+    its fingers stay; of the motors those count that bear weight. The force on what is carried is that of the gripper's
+    motors in each frame.
     """
     if episode.num_frames < _FEWEST_FRAMES:
         yield NotMeasured(why="no frame has neighbours")
@@ -244,7 +247,9 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     if not isinstance(hand, _Hand) or isinstance(dynamics, NotMeasured):
         yield None if isinstance(hand, _Hand) else hand
         return
-    free = dynamics.is_judged.copy()
+    robot, width = episode.info.robot, episode.columns.gripper_width
+    moving = np.abs(np.gradient(width)) * episode.info.fps > _MOVES * robot.gripper.open_width  # fingers weigh, too
+    free = dynamics.is_judged & ~moving
     free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
     of_wrench, (of_motors, of_all) = _peaks_of_wrench(episode, hand, dynamics), _peaks_of_motors(episode, dynamics)
     # What accelerates the arm otherwise than the servo, as an impact does, shows in both: in one of them less, as links
