@@ -14,7 +14,7 @@ import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check
 from demorec.check.dataset import Dataset, Rows
-from demorec.check.evidence import Flags, Motion, is_gripper
+from demorec.check.evidence import Flags, Motion, is_gripper, quaternion_places
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE
@@ -135,16 +135,16 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     backwards, whatever kind of action it is.
 
     The action as a linear function of states and the ways that they go next, by all other episodes. Of grippers, this
-    depends on what is held.
+    depends on what is held, and of quaternions on their sign.
     """
     found = _scaled(dataset)
     if not isinstance(found, _Scaled):
         yield found
         return
     size, width, names = len(found.means[1]), len(found.means[0]), dataset.info.features[ACTION].names or ()
-    is_arm = (
-        np.array([not is_gripper(name) for name in names]) if len(names) == width else np.ones(width, dtype=np.bool_)
-    )
+    turns = {place + part for place in quaternion_places(names) for part in range(4)}
+    is_linear = np.array([not is_gripper(name) and i not in turns for i, name in enumerate(names)], dtype=np.bool_)
+    is_linear = is_linear if len(names) == width else np.ones(width, dtype=np.bool_)
     square, product = np.zeros((size, size)), np.zeros((size, width))
     for action, evidence in found:
         square += evidence.T @ evidence
@@ -158,7 +158,7 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
         common[row] = (a * b).sum(axis=0)
         sizes[row] = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
         moves[row] = (b**2).mean(axis=0)
-    clear = is_arm & (np.median(common / np.maximum(sizes, 1e-9), axis=0) > _CLEAR)
+    clear = is_linear & (np.median(common / np.maximum(sizes, 1e-9), axis=0) > _CLEAR)
     if not clear.any():
         yield NotMeasured(why="the actions do not go with the states")
         return
