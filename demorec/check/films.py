@@ -47,6 +47,11 @@ class Film:
         """(N - 1,) mean difference of each image from the one before, of 255."""
         return difference(self.cells[1:], self.cells[:-1])
 
+    @cached_property
+    def first_view(self) -> Array:
+        """(rows, columns, 3) median of the first fifth of the images, 0 to 255."""
+        return np.asarray(np.median(self.cells[: max(len(self.cells) // 5, 1)], axis=0))
+
 
 _BLANK_LEVELS = 1.0
 """Of 255, standard deviation over an image's parts below which it is of one colour: black, green or otherwise empty."""

@@ -177,7 +177,7 @@ def interpolated_images(subject: Filmed) -> Iterator[Found]:
             sides = [off[first::2][changes[first::2]] for first in (0, 1)]
             if min(map(len, sides)) >= _FEWEST_OF_SIDE:
                 means = [float(side.mean()) for side in sides]
-                nearer.append(1.0 - min(means) / max(means))
+                nearer.append(1.0 - min(means) / max(*means, 1e-9))
         if nearer:
             yield Measurement(value=float(np.median(nearer)), detail=camera)
         else:
@@ -287,10 +287,7 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
         films = [(a, b) for a, b in films if len(a.cells) >= _FEWEST_IMAGES <= len(b.cells)]
         if not films or films[0][0].cells.shape[1:] != films[0][1].cells.shape[1:]:
             continue
-        views = [
-            np.median([np.median(film.cells[: max(len(film.cells) // 5, 1)], axis=0) for film in side], axis=0)
-            for side in zip(*films, strict=True)
-        ]
+        views = [np.median([film.first_view for film in side], axis=0) for side in zip(*films, strict=True)]
         for a, b in films:
             count = min(len(a.cells), len(b.cells))
             one_cells, other_cells = a.cells[:count], b.cells[:count]

@@ -10,25 +10,17 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, image_check
 from demorec.check.dataset import Dataset
-from demorec.check.films import Film
 from demorec.check.likeness import FEWEST_TO_COMPARE, far_off
 from demorec.core.geometry import Array
 
-_START, _ALIKE_PARTS = 0.2, 0.95
-"""Share of an episode's images that are its start, and share of an image's parts that are compared: the others may
-show an object that lies elsewhere."""
+_ALIKE_PARTS = 0.95
+"""Share of an image's parts that are compared: the others may show an object that lies elsewhere."""
 _LEVELS = 1.5
 """By how much a view is off at least that is usual, of 255."""
 _FEWEST_OF_SESSION, _SESSION = 5, 0.05
 """Episodes of a session at least, and share of all."""
 
-views_check = partial(image_check, on=("dataset",), needs="images of four episodes", fail=math.inf)
-
-
-def _views(films: list[Film]) -> Array:
-    """(N, rows, columns, 3) what each film shows at its start, 0 to 255."""
-    starts = [film.cells[: max(round(_START * len(film.cells)), 1)] for film in films]
-    return np.stack([np.median(start, axis=0) for start in starts])
+views_check = partial(image_check, on=("dataset",), fail=math.inf)
 
 
 def _difference(one: Array, other: Array) -> Array:
@@ -43,7 +35,11 @@ def _instructions(dataset: Dataset) -> Array:
     return np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
 
 
-@views_check(measures="episodes in which a camera begins with another view than in the others", warn=0)
+@views_check(
+    measures="episodes in which a camera begins with another view than in the others",
+    warn=0,
+    needs="images of four episodes",
+)
 def views_alike(dataset: Dataset) -> Iterator[Found]:
     """A camera begins each episode with about the same view, if nearly all do: catches one that was moved, turned or
     zoomed, or whose colours were changed. Where scenes vary much, or episodes are few, only much is seen.
@@ -55,7 +51,10 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
         if len(films) < FEWEST_TO_COMPARE:
             yield NotMeasured(why=f"fewer than {FEWEST_TO_COMPARE} episodes")
             continue
-        views = _views(list(films))
+        if len(np.unique(tasks)) == len(tasks):
+            yield NotMeasured(why="each episode has an instruction of its own")
+            continue
+        views = np.stack([film.first_view for film in films])
         odd = far_off(_difference(views, np.median(views, axis=0)), _LEVELS)
         strange = np.flatnonzero(odd & np.isin(tasks, tasks[~odd])).tolist()
         named = ", ".join(map(str, strange[:5]))
@@ -65,6 +64,7 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
 @views_check(
     measures="by how many times what is usual among episodes a camera's view changes from one of them on",
     warn=3.5,
+    needs="images of ten episodes",
 )
 def views_stay(dataset: Dataset) -> Iterator[Found]:
     """A camera shows the same place before and after each episode: catches one that was moved between two sessions.
@@ -72,18 +72,25 @@ def views_stay(dataset: Dataset) -> Iterator[Found]:
     Of what the episodes before and after show in the mean, where both have an instruction in common.
     """
     tasks = _instructions(dataset)
+    last = {task: number for number, task in enumerate(tasks.tolist())}
     for camera, films in dataset.films.items():
         least = max(_FEWEST_OF_SESSION, math.ceil(_SESSION * len(films)))
         if len(films) < 2 * least:
             yield NotMeasured(why=f"fewer than {2 * least} episodes")
             continue
-        views = _views(list(films))
-        sums, found = np.cumsum(views, axis=0), [(0.0, 0)]
-        for first in range(least, len(films) - least + 1):
-            if np.isin(tasks[:first], tasks[first:]).any():
-                before, after = sums[first - 1] / first, (sums[-1] - sums[first - 1]) / (len(films) - first)
-                found.append((float(_difference(before, after)), first))
-        change, first = max(found)
-        sides = [side for side in (views[:first], views[first:]) if len(side)]
+        # Until where an instruction is heard that was heard before: beyond it nothing is in common.
+        heard = np.maximum.accumulate([last[task] for task in tasks.tolist()])
+        splits = [first for first in range(least, len(films) - least + 1) if heard[first - 1] >= first]
+        if not splits:
+            yield NotMeasured(why="no instruction is given before and after")
+            continue
+        views = np.stack([film.first_view for film in films])
+        sums = np.cumsum(views, axis=0)
+        changes = [
+            float(_difference(sums[first - 1] / first, (sums[-1] - sums[first - 1]) / (len(films) - first)))
+            for first in splits
+        ]
+        change, first = max(zip(changes, splits, strict=True))
+        sides = (views[:first], views[first:])
         usual = np.median(np.concatenate([_difference(side, side.mean(axis=0)) for side in sides]))
         yield Measurement(value=change / max(float(usual), _LEVELS), detail=f"{camera}, from episode {first} on")

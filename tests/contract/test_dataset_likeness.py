@@ -126,6 +126,12 @@ def test_targets_and_images_unlike_the_others(name: str, filmed: Path, tmp_path:
     assert level_of(dataset, law, "dataset") == "warn"
 
 
+def test_views_of_different_instructions_are_not_compared(filmed: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
+    loose.put_rows(dataset, "task_index", loose.rows_of(dataset, "episode_index"))
+    assert [level_of(dataset, law, "dataset") for law in ("views_alike", "views_stay")] == ["skip", "skip"]
+
+
 def test_an_arm_that_begins_to_move_has_no_dead_band(tmp_path: Path) -> None:
     """What is sent to an arm at rest is 0.02 rad away within one frame of ten a second."""
     run = simulate_run(tmp_path / "run", 3, robot="so101", variation="mild", seed=3604, fps=10)
