@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Protocol
 
@@ -141,6 +142,20 @@ def unit_quaternions(subject: Turning) -> Iterator[Found]:
     """Every rotation is one."""
     for name, table in subject.quaternions():
         yield worst_frame(np.abs(np.linalg.norm(table, axis=1) - 1.0), name)
+
+
+@physics_check(
+    on=("external", "dataset"),
+    needs="quaternions, by the names of elements",
+    measures="frames in which a quaternion jumps to its own negative",
+    warn=0,
+    fail=math.inf,
+)
+def quaternions_keep_sign(subject: Turning) -> Iterator[Found]:
+    """No quaternion changes its sign from one frame to the next: the rotation is the same, but a policy sees a jump."""
+    for name, table in subject.quaternions():
+        jumps = 1 + np.flatnonzero((table[1:] * table[:-1]).sum(axis=1) < 0)
+        yield Measurement(value=len(jumps), frame=int(jumps[0]) if len(jumps) else None, detail=name)
 
 
 @physics_check(

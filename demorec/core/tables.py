@@ -101,7 +101,7 @@ CHECKS: Registry[Check] = Registry(
         ("outcome", "at_rest_in_the_end"),
         ("physics", "finite_numbers", "action_acceleration", "joint_acceleration"),
         ("motion", "joint_limits", "joint_speed", "velocity_matches_position"),
-        ("physics", "forward_kinematics", "unit_quaternions", "gripper_width"),
+        ("physics", "forward_kinematics", "unit_quaternions", "quaternions_keep_sign", "gripper_width"),
         ("physics", "command_tracking", "action_matches_command"),
         ("wrench", "wrench_bears_the_hand", "wrench_turns_the_wrist", "wrench_lag", "force_spikes"),
         ("wrench", "effort_in_each_frame"),

@@ -20,7 +20,7 @@ Fault = Callable[[Path], None]
 Images = NDArray[Any]
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
-    "mounts_alike", "encoder_steps",
+    "mounts_alike", "encoder_steps", "quaternions_keep_sign",
 )  # fmt: skip
 
 
@@ -49,6 +49,11 @@ def without_a_second(dataset: Path) -> None:
     loose.reframe(dataset, [parts[0], np.delete(parts[1], range(29, 39)), *parts[2:]])
 
 
+def other_sign(poses: Images) -> Images:
+    """The same poses, with the quaternions from the 20th on negated."""
+    return np.concatenate([poses[:20], poses[20:] * [1, 1, 1, -1, -1, -1, -1]])
+
+
 FAULTS: dict[str, tuple[Fault, str, str]] = {
     "zeros for the actions of one episode": (
         numbers("action", np.zeros_like, only=(1,)), "actions_go_with_states", "fail"
@@ -62,6 +67,11 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
     ),
     "an encoder of eight bits": (
         numbers("observation.state", lambda rows: np.round(rows * 40) / 40), "encoder_steps", "warn"
+    ),
+    "a quaternion that becomes its own negative": (
+        numbers("observation.ee_pose", other_sign),
+        "quaternions_keep_sign",
+        "warn",
     ),
     "an episode that was cut off": (cut_off, "whole_episodes", "warn"),
     "a second that is missing": (without_a_second, "missing_frames", "warn"),
