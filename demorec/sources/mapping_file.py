@@ -39,15 +39,12 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"The mapping is no valid TOML ({describe_error(error)}): {path}") from error
-    problems = (
-        [problem]
-        if (problem := _excess(data))
-        else list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_LISTED))
-    )
-    if problems:
-        other: SourceKind = "hdf5" if kind == "bag" else "bag"
-        if not _excess(data) and not any(_unknown_keys(data, SourceMapping, "", other)):
-            raise ConfigError(f"This is a mapping of {_KINDS[other]}, not of {_KINDS[kind]}: {path}")
+    if excess := _excess(data):
+        raise ConfigError(f"The mapping cannot be used: {excess}: {path}")
+    if problems := list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_LISTED)):
+        for other in _KINDS:
+            if not any(_unknown_keys(data, SourceMapping, "", other)):
+                raise ConfigError(f"This is a mapping of {_KINDS[other]}, not of {_KINDS[kind]}: {path}")
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     try:
         if kind == "hdf5" and isinstance(data.get("episodes", {}), dict):

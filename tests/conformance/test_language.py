@@ -1,4 +1,4 @@
-"""LeRobot's language columns of all ten tasks, judged by LeRobot, by the recordings' phases and by brute force."""
+"""LeRobot's language columns of all tasks, judged by LeRobot, by the recordings' phases and by brute force."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def test_a_sensed_value_that_was_changed_is_found(recorded: Path, tmp_path: Path
     table = spoilt.columns.sensed["wrench"] if name == "sensed" else getattr(spoilt.columns, name)
     changed = table.copy()
     changed[40:50] += 1e-6
-    spoilt.set(**{name: {"wrench": changed} if name == "sensed" else changed})
+    spoilt.set(**{name: {**spoilt.columns.sensed, "wrench": changed} if name == "sensed" else changed})
     path = spoilt.write(tmp_path / "s.mcap")
     report = _replay(path)
     assert report.first_difference is not None

@@ -20,6 +20,7 @@ from support.recording import write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
+from demorec.episode.info import FORMAT_VERSION
 from demorec.mcap import Recording, recover
 
 Damage = Callable[[bytes, random.Random], bytes]
@@ -289,5 +290,5 @@ def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
         for frame in frames:
             writer.write(frame)
         writer.finish(outcome)
-    with pytest.raises(RecordingError, match=r"format version 99, this demorec reads 1 to 2"):
+    with pytest.raises(RecordingError, match=f"format version 99, this demorec reads 1 to {FORMAT_VERSION}"):
         Recording(tmp_path / "a.mcap")

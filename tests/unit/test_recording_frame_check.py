@@ -73,7 +73,7 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         r"a wrench of shape \(3,\)",
     ),
     "a NaN in the wrench": (
-        lambda f: observed(f, sensed={"wrench": with_nan(f.observation.sensed["wrench"])}),
+        lambda f: observed(f, sensed={**f.observation.sensed, "wrench": with_nan(f.observation.sensed["wrench"])}),
         "wrench in its observation that is not finite",
     ),
     "a NaN in a joint": (

@@ -53,6 +53,7 @@ def test_a_description_of_another_version_than_its_record_is_refused(tmp_path: P
 
     path = rewrite_messages(tmp_path / "a.mcap", tmp_path / "b.mcap", lambda m: [m], metadata=relabelled)
     with pytest.raises(
-        RecordingError, match=r"not that of format version 1 \(its description is of format version 2\)"
+        RecordingError,
+        match=rf"not that of format version 1 \(its description is of format version {FORMAT_VERSION}\)",
     ):
         Recording(path)
