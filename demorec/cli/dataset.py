@@ -40,7 +40,7 @@ _FLAGS = {
     "workers": ("score",),
     "scores": ("select", "drop", "set-task", "split", "reorder"),
     **dict.fromkeys(("out", "overwrite"), tuple(name for name in _COMMANDS if name != "diff")),
-    **dict.fromkeys(("decode", "dry_run"), _COMMANDS[:-2]),
+    **dict.fromkeys(("decode", "dry_run"), tuple(name for name in _COMMANDS if name not in ("diff", "score"))),
 }
 """The commands that each flag is for."""
 _SHOWN = 20

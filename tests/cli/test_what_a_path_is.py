@@ -12,6 +12,7 @@ import pytest
 from support.commands import exit_code
 from support.recording import write_episode
 
+from demorec.cli import COMMANDS as ALL_COMMANDS
 from demorec.cli import main
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -82,8 +83,14 @@ COMMANDS = {
 }
 
 
+OTHERWISE = {"generate", "import", "dataset", "pretrain", "train", "evaluate", "correct", "improve", "list"}
+"""Those that take other things than recordings, runs and folders of them."""
 READ_HDF5 = {"info", "check", "report", "view", "export"}
 """These read it: tests/contract/test_everything_readable.py."""
+
+
+def test_every_command_is_tried() -> None:
+    assert COMMANDS.keys() | OTHERWISE == set(ALL_COMMANDS.names())
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array, Pose
 from demorec.core.plain import to_plain
+from demorec.core.tables import EXPORTERS
 from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation
 from demorec.episode.features import ActionKind
 from demorec.generate.options import RunOptions
@@ -126,7 +127,7 @@ def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Pa
     assert data_table(tmp_path / "slow").column("intervention").to_pylist() == acted[::2]
 
 
-@pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
+@pytest.mark.parametrize("exporter", EXPORTERS.names())
 def test_what_a_policy_did_alone_can_be_left_out(
     rollout: tuple[Attempt, Path], expert_poses: Array, tmp_path: Path, exporter: str
 ) -> None:

@@ -18,6 +18,7 @@ from support.external import FORCE, STATE, TOP, Episode, make_external, write_ex
 from support.recording import write_episode
 
 from demorec.core.errors import ConfigError, ExportError
+from demorec.core.tables import EXPORTERS
 
 
 def run_of(folder: Path, *episodes: Episode) -> Path:
@@ -101,7 +102,7 @@ def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:
     assert "Of 1 episodes nobody said" in card
 
 
-@pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
+@pytest.mark.parametrize("exporter", EXPORTERS.names())
 def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) -> None:
     """Failed episodes without an image, of other cameras and features, and of another rate."""
     failed: dict[str, Any] = {"episode_index": 1, "num_frames": 5, "success": False}

@@ -89,7 +89,8 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
         assert row["command_joint_target.panda_joint7"] == command.joint_target[6]
         assert row["action_gripper"] == frame.action.gripper_target
         assert row["world_from_camera.wrist.x"] == frame.images["wrist"].world_from_camera.position[0]
-    numbers = 2 + 3 * 9 + 2 + 6 + 7 + 2 * (7 + 1 + 7) + 7 + 2 * 7 + 1
+    numbers = 2 + 3 * 9 + 2 + 7 + 2 * (7 + 1 + 7) + 7 + 2 * 7 + 1
+    numbers += sum(values.size for values in truth[0].observation.sensed.values())
     assert table.shape == (NUM_FRAMES, numbers)
 
 
