@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -17,8 +17,27 @@ _ALIKE_PARTS = 0.95
 """Share of an image's parts that are compared: the others may show an object that lies elsewhere."""
 _LEVELS = 1.5
 """By how much a view is off at least that is usual, of 255."""
+_FEWEST_TO_TURN = 3
 _FEWEST_OF_SESSION, _SESSION = 5, 0.05
 """Episodes of a session at least, and share of all."""
+
+_NEIGHBOURS = 9
+"""Episodes after one whose median its view is compared with."""
+_TURNS: tuple[Callable[[Array], Array], ...] = (
+    lambda view: view[:, ::-1],
+    lambda view: view[::-1],
+    lambda view: view[::-1, ::-1],
+    lambda view: view[..., ::-1],  # red for blue
+    lambda view: np.repeat(view.mean(axis=-1, keepdims=True), 3, axis=-1),  # gray
+)
+"""Views that an image becomes by one wrong line of a converter or by a camera on its head."""
+_QUARTER_TURNS: tuple[Callable[[Array], Array], ...] = (
+    np.rot90,
+    lambda view: np.rot90(view, 3),
+    lambda view: np.swapaxes(view, 0, 1),
+    lambda view: np.rot90(np.swapaxes(view, 0, 1), 2),
+)
+"""The same of square images."""
 
 views_check = partial(image_check, on=("dataset",), fail=math.inf)
 
@@ -59,6 +78,30 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
         strange = np.flatnonzero(odd & np.isin(tasks, tasks[~odd])).tolist()
         named = ", ".join(map(str, strange[:5]))
         yield Measurement(value=len(strange), detail=f"{camera}, episode {named}" if strange else camera)
+
+
+@views_check(
+    measures="how many times nearer an episode's view is to the others' mirrored, turned, gray or BGR than as they are",
+    warn=3.0,
+    needs="images of three episodes",
+)
+def views_upright(dataset: Dataset) -> Iterator[Found]:
+    """No episode has images that are mirrored, turned, gray or in another order of colours, where others are not.
+
+    What looks alike both ways is not found: most scenes seen from the front, mirrored.
+    """
+    for films in dataset.films.values():
+        count = len(films)
+        if count < _FEWEST_TO_TURN:
+            yield NotMeasured(why=f"fewer than {_FEWEST_TO_TURN} episodes")
+            continue
+        views = np.stack([film.first_view for film in films])
+        turns = (*_TURNS, *(_QUARTER_TURNS if views.shape[1] == views.shape[2] else ()))
+        for number, (film, view) in enumerate(zip(films, views, strict=True)):
+            others = (number + 1 + np.arange(min(count - 1, _NEIGHBOURS))) % count
+            usual = np.median(views[others], axis=0)
+            turned = min(float(_difference(view, turn(usual))) for turn in turns)
+            yield Measurement(value=float(_difference(view, usual)) / max(turned, _LEVELS), detail=film.where)
 
 
 @views_check(

@@ -135,7 +135,7 @@ CHECKS: Registry[Check] = Registry(
         ("targets", "state_follows_action", "actions_in_order", "state_reaches_action"),
         ("targets", "action_is_no_observation", "gripper_waits_for_action", "dead_band", "encoder_steps"),
         ("likeness", "actions_go_with_states", "motion_follows_action", "whole_episodes", "offsets_alike"),
-        ("views", "views_alike", "views_stay"),
+        ("views", "views_upright", "views_alike", "views_stay"),
         ("run", "duplicates", "coverage"),
         ("alignment", "dataset_action_lag"),
         ("dataset_files", "dataset_sidecar"),

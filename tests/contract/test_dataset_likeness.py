@@ -91,7 +91,7 @@ def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Pa
     assert level_of(dataset, law, "dataset") == level
 
 
-VIEWS = ("views_alike", "views_stay", "stale_images", "interpolated_images", "offsets_alike")
+VIEWS = ("views_upright", "views_alike", "views_stay", "stale_images", "interpolated_images", "offsets_alike")
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +107,8 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a camera that hangs upside down in one episode": (film(FRONT, lambda r: r[:, ::-1, ::-1]), "views_alike"),
+    "red for blue in one episode": (film(WRIST, lambda r: r[..., ::-1]), "views_upright"),
+    "a wrist camera that hangs upside down in one episode": (film(WRIST, lambda r: r[:, ::-1, ::-1]), "views_upright"),
     "a camera that is tilted from the sixth episode on": (
         film(FRONT, lambda r: np.roll(r, 24, axis=1), only=range(5, 10)), "views_stay"
     ),
