@@ -89,6 +89,16 @@ def difference(one: NDArray[Any], other: NDArray[Any]) -> Array:
     return np.asarray(np.abs(one.astype(np.float32) - other).mean(axis=(1, 2, 3), dtype=np.float64))
 
 
+def turned(view: Array) -> Iterator[Array]:
+    """What a wrong line of a converter, or a camera on its head, makes of a view (rows, columns, 3)."""
+    yield from (view[:, ::-1], view[::-1], view[::-1, ::-1])
+    yield view[..., ::-1]  # red for blue
+    yield np.repeat(view.mean(axis=-1, keepdims=True), 3, axis=-1)  # gray
+    if len(view) == len(view[0]):
+        across = np.swapaxes(view, 0, 1)
+        yield from (across, across[::-1], across[:, ::-1], across[::-1, ::-1])
+
+
 def films_of_recording(recording: Recording, columns: Columns) -> Films:
     """Of a recording that demorec did not simulate: each image once, beside the first frame that holds it."""
     state = columns.features[STATE].astype(np.float64) if STATE in columns.features else None

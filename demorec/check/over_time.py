@@ -10,12 +10,14 @@ import numpy as np
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
 from demorec.check.evidence import Flags
-from demorec.check.films import Film, Filmed, difference, flat_images, is_blank
+from demorec.check.films import Film, Filmed, difference, flat_images, is_blank, turned
 from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
 
 _ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
 """An image from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
+_BESIDE = 4
+"""Images before and after a jump whose medians are compared."""
 _EXPLAINED = 2.0
 """Times what the camera shows of such a motion at most (in nine of ten moving frames) that no motion explains. Wrist
 cameras that exploration noise shakes at 10 and 15 frames a second show 1.1, images of another moment 2 and more."""
@@ -89,6 +91,23 @@ def _alien(film: Film) -> Flags:
 
 def _moves(speed: Array) -> Flags:
     return np.asarray(speed > _MOVING * float(np.sqrt((speed**2).sum() / max(len(speed), 1))))
+
+
+@film_check(
+    measures="how many times nearer images after a jump are to those before turned, mirrored, gray or BGR than as is",
+    warn=3.0,
+    fail=5.0,
+)
+def images_stay_upright(subject: Filmed) -> Iterator[Found]:
+    """A camera's images do not turn round or change the order of their colours in the midst of an episode."""
+    for film in _all(subject):
+        if len(film.cells) < 2 * _BESIDE:
+            continue
+        row = int(np.argmax(film.step[_BESIDE - 1 : -_BESIDE + 1])) + _BESIDE
+        before, after = (np.median(film.cells[a:b], axis=0) for a, b in ((row - _BESIDE, row), (row, row + _BESIDE)))
+        as_is, *otherwise = (float(np.abs(after - view).mean()) for view in (before, *turned(before)))
+        times = as_is / max(min(otherwise), 1.0) if as_is > _ALIEN_LEVELS else 1.0
+        yield Measurement(value=times, frame=int(film.frames[row]), detail=film.where)
 
 
 @film_check(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, image_check
 from demorec.check.dataset import Dataset
+from demorec.check.films import turned
 from demorec.check.likeness import FEWEST_TO_COMPARE, far_off
 from demorec.core.geometry import Array
 
@@ -23,21 +24,6 @@ _FEWEST_OF_SESSION, _SESSION = 5, 0.05
 
 _NEIGHBOURS = 9
 """Episodes after one whose median its view is compared with."""
-_TURNS: tuple[Callable[[Array], Array], ...] = (
-    lambda view: view[:, ::-1],
-    lambda view: view[::-1],
-    lambda view: view[::-1, ::-1],
-    lambda view: view[..., ::-1],  # red for blue
-    lambda view: np.repeat(view.mean(axis=-1, keepdims=True), 3, axis=-1),  # gray
-)
-"""Views that an image becomes by one wrong line of a converter or by a camera on its head."""
-_QUARTER_TURNS: tuple[Callable[[Array], Array], ...] = (
-    np.rot90,
-    lambda view: np.rot90(view, 3),
-    lambda view: np.swapaxes(view, 0, 1),
-    lambda view: np.rot90(np.swapaxes(view, 0, 1), 2),
-)
-"""The same of square images."""
 
 views_check = partial(image_check, on=("dataset",), fail=math.inf)
 
@@ -96,12 +82,11 @@ def views_upright(dataset: Dataset) -> Iterator[Found]:
             yield NotMeasured(why=f"fewer than {_FEWEST_TO_TURN} episodes")
             continue
         views = np.stack([film.first_view for film in films])
-        turns = (*_TURNS, *(_QUARTER_TURNS if views.shape[1] == views.shape[2] else ()))
         for number, (film, view) in enumerate(zip(films, views, strict=True)):
             others = (number + 1 + np.arange(min(count - 1, _NEIGHBOURS))) % count
             usual = np.median(views[others], axis=0)
-            turned = min(float(_difference(view, turn(usual))) for turn in turns)
-            yield Measurement(value=float(_difference(view, usual)) / max(turned, _LEVELS), detail=film.where)
+            otherwise = min(float(_difference(view, other)) for other in turned(usual))
+            yield Measurement(value=float(_difference(view, usual)) / max(otherwise, _LEVELS), detail=film.where)
 
 
 @views_check(
