@@ -26,7 +26,7 @@ from scipy import ndimage
 from demorec.check.base import Form, Result
 from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import drawable_scene
-from demorec.check.films import Film, cells_of, likeness_of_films
+from demorec.check.films import Film, likeness_of_films, parts_of
 from demorec.check.report import CheckOptions
 from demorec.core.config import GenerateConfig, VideoConfig
 from demorec.core.tables import CHECKS
@@ -536,8 +536,8 @@ class Stranger:
     def __init__(self, reel: Reel, state: Rows, fps: int) -> None:
         frames = np.arange(len(state))
         self.films = {
-            name: [Film(where=name, fps=fps, cells=cells_of(rows), frames=frames, state=state)]
-            for name, rows in reel.items()
+            name: [Film(where=name, fps=fps, cells=cells, detail=detail, frames=frames, state=state)]
+            for name, (cells, detail) in ((name, parts_of(rows)) for name, rows in reel.items())
         }
 
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:

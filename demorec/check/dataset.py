@@ -186,6 +186,7 @@ class Dataset:
                     where=f"{key}, episode {number}",
                     fps=self.info.fps,
                     cells=images.cells,
+                    detail=images.detail,
                     frames=np.arange(images.count),
                     state=self.rows[number][STATE].astype(np.float64) if known else None,
                 )

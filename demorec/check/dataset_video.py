@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +36,14 @@ class EpisodeImages:
         mean: (3,) mean red, green and blue, of 1.
         std: (3,) their standard deviations over all pixels, of 1, by some of the images; NaN where these are few.
         cells: (count, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
+        detail: (count,) `detail_of` each image.
     """
 
     count: int
     mean: Array
     std: Array
     cells: NDArray[np.uint8]
+    detail: Array
 
 
 def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace], key: str) -> list[EpisodeImages]:
@@ -64,23 +66,24 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
             raise ExportError(
                 f"Episode {place.episode_index} has {place.length} frames, {len(images)} images decode: {path}"
             )
-        cells = np.stack([cell for cell, _ in images])
+        cells = np.stack([cell for cell, _, _ in images])
         mean = cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255
-        moments = [moment for _, moment in images if moment is not None]
+        moments = [moment for _, _, moment in images if moment is not None]
         colour, squared = np.mean(moments, axis=0) if len(moments) >= _FEWEST else np.full((2, 3), np.nan)
         std = np.sqrt(np.maximum(squared - colour**2, 0.0))
-        found.append(EpisodeImages(count=len(cells), mean=mean, std=std, cells=cells))
+        detail = np.array([one for _, one, _ in images])
+        found.append(EpisodeImages(count=len(cells), mean=mean, std=std, cells=cells, detail=detail))
     return found
 
 
-_Decoded = tuple[NDArray[np.uint8], Array | None]
+_Decoded = tuple[NDArray[np.uint8], float, Array | None]
 _EVERY, _FEWEST = 8, 8
 """Of so many images one is looked at pixel by pixel, and of how many at least an episode's deviation is told."""
 
 
 def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
-    """(rows, columns, 3) mean colours of the parts of every image, 0 to 255; of some (2, 3) means of colours of 1, and
-    of their squares, over all pixels.
+    """(rows, columns, 3) mean colours of the parts of every image, 0 to 255, and `detail_of` it; of some (2, 3) means
+    of colours of 1, and of their squares, over all pixels.
     """
     import av
     from av.video.reformatter import VideoReformatter
@@ -96,7 +99,8 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
             for number, frame in enumerate(container.decode(video=0)):
                 small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
                 cells = cast("NDArray[np.uint8]", small.to_ndarray())
-                yield cells, None if number % _EVERY else _moments(frame)
+                detail = detail_of(frame.to_ndarray(format="gray"))
+                yield cells, detail, None if number % _EVERY else _moments(frame)
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error
 
@@ -104,6 +108,12 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
 def _moments(frame: av.VideoFrame) -> Array:
     values = frame.to_ndarray(format="rgb24").reshape(-1, 3) / np.float32(255)
     return np.stack([values.mean(axis=0), (values**2).mean(axis=0)]).astype(np.float64)
+
+
+def detail_of(gray: NDArray[Any]) -> float:
+    """Mean square of the differences of neighbouring pixels (H, W), of 255: falls with blur and rises with noise."""
+    values = gray.astype(np.float32)
+    return sum(float((np.diff(values, axis=axis) ** 2).mean()) for axis in (0, 1) if values.shape[axis] > 1)
 
 
 def part_counts(width: int, height: int) -> tuple[int, int]:

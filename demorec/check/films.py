@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from demorec.check.base import NotMeasured
 from demorec.check.cells import correlation
-from demorec.check.dataset_video import part_counts
+from demorec.check.dataset_video import detail_of, part_counts
 from demorec.core.geometry import Array
 from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.features import STATE
@@ -32,6 +33,7 @@ class Film:
         where: Camera and episode, for people.
         fps: Frames per second.
         cells: (N, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
+        detail: (N,) `detail_of` each image.
         frames: (N,) frame that each image belongs to.
         state: (N, D) observation.state in these frames, None where there is none.
     """
@@ -39,6 +41,7 @@ class Film:
     where: str
     fps: float
     cells: NDArray[np.uint8]
+    detail: Array
     frames: NDArray[np.intp]
     state: Array | None
 
@@ -52,7 +55,30 @@ class Film:
         """(rows, columns, 3) median of the first fifth of the images, 0 to 255."""
         return np.asarray(np.median(self.cells[: max(len(self.cells) // 5, 1)], axis=0))
 
+    @cached_property
+    def gains(self) -> Array | NotMeasured:
+        """(3, N) of each image, against the median one of a camera that stands still, by colour.
 
+        The gain of an image is the median over its parts; where half of them do not stay what they are but for that
+        gain, the camera moves.
+        """
+        usual = np.median(self.cells, axis=0)
+        lit = (usual > 20) & (usual < 235)  # (rows, columns, 3)
+        if (lit.mean(axis=(0, 1)) < 0.3).any():
+            return NotMeasured(why=f"most of what {self.where} shows is black or white")
+        gains, stays = [], []
+        for channel in range(3):
+            ratio = self.cells[..., channel][:, lit[..., channel]] / usual[..., channel][lit[..., channel]]
+            gain = np.median(ratio, axis=1)
+            gains.append(gain)
+            stays.append(np.median(np.abs(ratio / np.maximum(gain, 1e-3)[:, None] - 1), axis=1))
+        if np.quantile(np.max(stays, axis=0), 0.9) > _STANDS:
+            return NotMeasured(why=f"{self.where} moves")
+        return np.array(gains)
+
+
+_STANDS = 0.02
+"""Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
 _BLANK_LEVELS = 1.0
 """Of 255, standard deviation over an image's parts below which it is of one colour: black, green or otherwise empty."""
 
@@ -104,7 +130,7 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
     state = columns.features[STATE].astype(np.float64) if STATE in columns.features else None
     found = {}
     for camera in recording.cameras:
-        cells = cells_of(decode(recording.video_settings(camera), recording.packets(camera)))
+        cells, detail = parts_of(decode(recording.video_settings(camera), recording.packets(camera)))
         held, frames = np.unique(columns.images[camera], return_index=True)
         shown = (held != NO_IMAGE) & (held < len(cells))
         rows = frames[shown]
@@ -112,6 +138,7 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
             where=f"camera {camera}",
             fps=recording.info.fps,
             cells=cells[held[shown]],
+            detail=detail[held[shown]],
             frames=rows,
             state=None if state is None else state[rows],
         )
@@ -119,13 +146,14 @@ def films_of_recording(recording: Recording, columns: Columns) -> Films:
     return found
 
 
-def cells_of(images: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Images (H, W, 3) of one size in parts, as `Film.cells` has them."""
-    found = []
+def parts_of(images: Iterable[NDArray[np.uint8]]) -> tuple[NDArray[np.uint8], Array]:
+    """Images (H, W, 3) of one size in parts, and their detail, as `Film.cells` and `Film.detail`."""
+    cells, detail = [], []
     for image in images:
         counts = part_counts(image.shape[1], image.shape[0])
-        found.append(np.asarray(Image.fromarray(image).resize(counts, Image.Resampling.BOX)))
-    return np.stack(found) if found else np.zeros((0, 1, 1, 3), dtype=np.uint8)
+        cells.append(np.asarray(Image.fromarray(image).resize(counts, Image.Resampling.BOX)))
+        detail.append(detail_of(image[..., 1]))
+    return np.stack(cells) if cells else np.zeros((0, 1, 1, 3), dtype=np.uint8), np.array(detail)
 
 
 def likeness_of_films(films: Films) -> Iterator[tuple[str, float]]:

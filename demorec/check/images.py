@@ -181,9 +181,15 @@ def frozen(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparis
 )
 @of_each_camera
 def repeated_images(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
-    """No image was dropped and the one before shown in its place."""
+    """No image was dropped and the one before shown in its place.
+
+    A motion that changes cells by less than their encoder does may be left to the next image.
+    """
     stale = _stale(compared)
     stale &= _is_exact(episode, camera)[: len(stale)]
+    full = episode.full_size(camera)
+    if isinstance(full, FullSize):
+        stale &= compared.motion > full.encoded
     return _stale_frames(camera, compared, int(stale.sum()), int(np.argmax(stale)))
 
 

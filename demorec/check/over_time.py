@@ -7,6 +7,7 @@ from functools import partial
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
 from demorec.check.evidence import Flags
@@ -18,6 +19,9 @@ _ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
 """An image from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
 _BESIDE = 4
 """Images before and after a jump whose medians are compared."""
+_SAME_LEVELS, _LEAST_DETAIL = 0.7, 10.0
+"""Views whose coarse parts differ by less in the mean, of 255, show the same, however sharp; detail of images that
+hardly have any."""
 _EXPLAINED = 2.0
 """Times what the camera shows of such a motion at most (in nine of ten moving frames) that no motion explains. Wrist
 cameras that exploration noise shakes at 10 and 15 frames a second show 1.1, images of another moment 2 and more."""
@@ -35,8 +39,6 @@ _FEWEST_OF_SIDE = 10
 """Changing images among every second one of an episode."""
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
-_STANDS = 0.02
-"""Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
 _STALE, _CHANGES = 0.2, 1.5
 """An image repeats the one before that changes by less than this share of what both of its neighbours change, where
 these change by so many levels of 255. A repeated image that is encoded again changes by 0.6."""
@@ -261,31 +263,42 @@ def _near(table: Array) -> float:
     fail=float("inf"),
 )
 def steady_exposure(subject: Filmed) -> Iterator[Found]:
-    """What stands still before a fixed camera keeps its colours: catches exposure and white balance that drift or hunt.
+    """What stands still before a fixed camera keeps its colours: catches drifting exposure, white balance."""
+    for film in (film for film in _all(subject) if len(film.cells) >= _FEWEST_IMAGES):
+        gains = film.gains
+        if isinstance(gains, NotMeasured):
+            yield gains
+        else:
+            yield Measurement(value=float(np.ptp(gains, axis=1).max()), detail=film.where)
 
-    The gain of an image is the median over its parts; where half of them do not stay what they are but for that gain,
-    the camera moves, and nothing is concluded.
-    """
-    for camera, films in subject.films.items():
-        for film in films:
-            if len(film.cells) < _FEWEST_IMAGES:
-                continue
-            usual = np.median(film.cells, axis=0)
-            lit = (usual > 20) & (usual < 235)  # (rows, columns, 3)
-            if (lit.mean(axis=(0, 1)) < 0.3).any():
-                yield NotMeasured(why=f"most of what {camera} shows is black or white")
-                continue
-            gains, stays = [], []
-            for channel in range(3):
-                ratio = film.cells[..., channel][:, lit[..., channel]] / usual[..., channel][lit[..., channel]]
-                gain = np.median(ratio, axis=1)
-                gains.append(gain)
-                stays.append(np.median(np.abs(ratio / np.maximum(gain, 1e-3)[:, None] - 1), axis=1))
-            if np.quantile(np.max(stays, axis=0), 0.9) > _STANDS:
-                yield NotMeasured(why=f"{camera} moves")
-                continue
-            drift = np.ptp(gains, axis=1)
-            yield Measurement(value=float(drift.max()), detail=film.where)
+
+def _coarse(cells: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(N, h, w, 3) means of 4 x 4 parts, which blur leaves as they are."""
+    count, rows, columns = len(cells), cells.shape[1] // 4, cells.shape[2] // 4
+    whole = cells[:, : 4 * rows, : 4 * columns].reshape(count, rows, 4, columns, 4, 3)
+    return np.asarray(whole.mean(axis=(2, 4)), dtype=np.float32)
+
+
+@film_check(
+    measures="times as much detail that a fixed camera's images have before or after they become blurred or noisy",
+    warn=2.0,
+    fail=float("inf"),
+)
+def steady_sharpness(subject: Filmed) -> Iterator[Found]:
+    """What stands still before a fixed camera stays as sharp: catches lost focus, drops on the lens, noise."""
+    for film in (film for film in _all(subject) if len(film.cells) >= _FEWEST_IMAGES):
+        if isinstance(film.gains, NotMeasured):
+            yield film.gains
+            continue
+        starts = len(film.cells) - _BESIDE + 1
+        parts = _coarse(film.cells)
+        views = np.stack([parts[n : n + starts] for n in range(_BESIDE)]).mean(axis=0)
+        detail = np.median(np.lib.stride_tricks.sliding_window_view(film.detail, _BESIDE), axis=1)
+        before, after = detail[:-_BESIDE], detail[_BESIDE:]
+        times = np.maximum(before, after) / np.maximum(np.minimum(before, after), _LEAST_DETAIL)
+        times[difference(views[_BESIDE:], views[:-_BESIDE]) > _SAME_LEVELS] = 1.0
+        row = int(np.argmax(times))
+        yield Measurement(value=float(times[row]), frame=int(film.frames[row + _BESIDE]), detail=film.where)
 
 
 @film_check(

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from support import loose
 from support.check import level_of, simulate_run
-from support.dataset_edits import FRONT, WRIST, film, halved, late, numbers, pixels
+from support.dataset_edits import FRONT, WRIST, blurred, film, halved, late, numbers, pixels
 from support.dataset_particular import repeats
 from support.export import export
 
@@ -121,6 +121,9 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a camera that hangs upside down in one episode": (film(FRONT, lambda r: r[:, ::-1, ::-1]), "views_alike"),
     "red for blue in one episode": (film(WRIST, lambda r: r[..., ::-1]), "views_upright"),
     "a wrist camera that hangs upside down in one episode": (film(WRIST, lambda r: r[:, ::-1, ::-1]), "views_upright"),
+    "a focus that is lost for a second": (
+        film(FRONT, lambda r: np.concatenate([r[:20], blurred(r[20:40]), r[40:]])), "steady_sharpness"
+    ),
     "gray images from the middle of an episode on": (
         film(FRONT, pixels(lambda r: np.concatenate([r[: len(r) // 2], gray(r[len(r) // 2 :])]))), "images_stay_upright"
     ),
