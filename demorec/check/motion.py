@@ -155,7 +155,7 @@ def joint_limits(subject: Moving) -> Iterator[Found]:
     measures="largest speed of a joint in units of its limit",
     warn=1.2,
     fail=2.5,
-    simulated=(1.1, 1.5),
+    simulated=(1.15, 1.5),
     needs=URDF,
 )
 def joint_speed(subject: Moving) -> Iterator[Found]:

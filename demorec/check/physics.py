@@ -63,12 +63,15 @@ _STANDS = 1e-6
 def action_acceleration(episode: CheckedEpisode) -> Measurement | None:
     """The expert's joint targets (the labels) ask for no more than the motors give: it plans for 0.8 of their limits.
 
-    A target that is the observed position stops the arm where it is, and asks for nothing.
+    A target that is the observed position stops the arm where it is, and asks for nothing; nor does the last one of a
+    failure, which stays what it was.
     """
     c, fps, robot = episode.columns, episode.info.fps, episode.info.robot
     targets = c.action_joint_target
     stops = np.abs(targets - c.joint_position[:, : episode.num_arm]).max(axis=1) < _STANDS
     asked = ~(stops[2:] | stops[1:-1])
+    if episode.outcome is not None and not episode.outcome.success and (targets[-1:] == targets[-2:-1]).all():
+        asked[-1:] = False
     acceleration = np.abs(np.diff(targets, 2, axis=0)) * fps**2 * asked[:, None]
     return worst_entry(acceleration / np.array(robot.acceleration_limit), robot.arm_joints, first=1)
 

@@ -161,8 +161,8 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     """Wrench and efforts are of one instant: of all shifts against each other none fits the last motors best. Where no
     shift fits clearly, one of the two was filtered, or they do not belong together.
 
-    Of the last two motors those count that tell the shift clearly: at few frames a second noise moves what is between
-    them and the hand in a way that frames do not show.
+    Of the last two motors the one counts that tells the shift more clearly: at few frames a second noise moves what is
+    between the other and the hand in a way that frames do not show.
     """
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
@@ -173,17 +173,19 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
         return NotMeasured(why="there are too few joints or frames")
     lags, core = range(-_MOST_LAG, _MOST_LAG + 1), slice(_MOST_LAG, -_MOST_LAG)
     share = size = 0.0
-    found = []
+    found = list[tuple[float, Measurement]]()
     for name in _motors(episode)[-2:]:
         needed, effort = _of_joint(episode, hand, name)
         off = np.array([float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags])
         size, usual = float(np.sqrt((effort**2).mean())), float(np.median(off))
         share, lag = float(off.min()) / max(usual, 1e-12), lags[int(np.argmin(off))]
         if share < _CLEAR:
-            found.append(Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}"))
+            found.append((share, Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}")))
     if not found and share > _UNCLEAR and size > _LEAST_TORQUE / 2:  # nothing but the hand is beyond the last motor
         return Measurement(value=_MOST_LAG + 1, detail=f"no shift fits {name}")
-    return worst(*found) or NotMeasured(why="the wrist's motors do not tell one shift from another")
+    if not found:
+        return NotMeasured(why="the wrist's motors do not tell one shift from another")
+    return min(found, key=lambda each: each[0])[1]
 
 
 @physics_check(
