@@ -67,8 +67,7 @@ class LinkMatrices:
 
 
 def joint_matrices(joint: UrdfJoint, position: Array) -> Array:
-    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m): along its axis, or by Rodrigues' formula
-    about it."""
+    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m); turns are by Rodrigues' formula."""
     at_zero, along = joint.parent_from_joint.matrix(), position[:, None, None]
     x, y, z = joint.axis
     if joint.kind == "prismatic":

@@ -49,7 +49,7 @@ class TopicScan:
 
 
 def scan_topics(container: Container, blocks: Mapping[str, Block]) -> dict[str, TopicScan]:
-    """Topic -> what was found on it; `blocks` has all topics but those of images, which are read a few chunks at a time.
+    """Topic -> what was found on it; `blocks` has all topics but those of images, which are read chunk by chunk.
 
     Every chunk's checksum is verified on the way, and that of every attachment.
     """
