@@ -105,7 +105,7 @@ def _moments(frame: av.VideoFrame) -> Array:
     lines = frame.to_ndarray(format="rgb24").reshape(frame.height, -1)
     # Down first and then across: so NumPy adds many bytes at once.
     sums = [part.sum(axis=0, dtype=np.uint32) for part in (lines, np.square(lines, dtype=np.uint16))]
-    return np.stack(sums).reshape(2, -1, 3).mean(axis=1) / frame.height / [[255], [255**2]]
+    return np.asarray(np.stack(sums).reshape(2, -1, 3).mean(axis=1) / frame.height / [[255], [255**2]])
 
 
 def part_counts(width: int, height: int) -> tuple[int, int]:
