@@ -89,7 +89,7 @@ class CellGrid:
             kernels.sum_labels(np.ascontiguousarray(image, dtype=np.int32), *grid, sums)
         return ImageCells(
             cells=(sums[1:-1, 1:-1] / self._area).astype(np.float32),
-            mean=sums.sum(axis=(0, 1)) / self._num_pixels,
+            mean=sums.reshape(-1, CHANNELS[kind]).sum(axis=0) / self._num_pixels,
             dark=dark / self._num_pixels,
             bright=bright / self._num_pixels,
         )

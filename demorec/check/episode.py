@@ -35,6 +35,7 @@ from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
+from demorec.mcap.video import is_keyframe
 from demorec.render.recorded import RecordedWorld
 from demorec.robots.urdf import Urdf
 
@@ -55,6 +56,7 @@ class CheckedEpisode(ExitStack):
         self._comparisons: dict[tuple[str, ImageKind], ImageComparison] = {}
         self._full_sizes: dict[str, FullSize] = {}
         self._bodies: dict[str, Array] = {}
+        self._links: dict[tuple[LinkMatrices, str], Array] = {}
         self._shared: dict[Callable[[CheckedEpisode], object], object] = {}
 
     def __exit__(self, *error: Any) -> bool | None:
@@ -227,7 +229,10 @@ class CheckedEpisode(ExitStack):
 
     def world_from_link(self, link: str, kinematics: LinkMatrices | None = None) -> Array:
         """(T, 4, 4), by default of the recorded joints; RecordingError: unknown link."""
-        return np.asarray(self.world_from_base @ self.base_from_link(link, kinematics))
+        of_robot = kinematics or self.recorded_kinematics
+        if (of_robot, link) not in self._links:
+            self._links[of_robot, link] = np.asarray(self.world_from_base @ self.base_from_link(link, of_robot))
+        return self._links[of_robot, link]
 
     @cached_property
     def world_from_tcp(self) -> Array:
@@ -263,8 +268,12 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def keyframes(self) -> Mapping[str, NDArray[np.int64]]:
         """Camera -> frames whose colour images are decoded without others."""
-        names = [camera.name for camera in self.cameras]
-        return {name: np.flatnonzero([packet.is_keyframe for packet in self.recording.packets(name)]) for name in names}
+        found = {}
+        for camera in self.cameras:  # one after the other, so that the images of all are not in memory together
+            codec = self.recording.video_settings(camera.name).codec
+            images = self.recording.coded_images([camera.name])[camera.name].messages()
+            found[camera.name] = np.flatnonzero([is_keyframe(codec, image) for image in images])
+        return found
 
     def images(self, camera: SceneCamera, kind: ImageKind = "color") -> ImageSummary:
         """What the checks need of a camera's decoded images; decoded once."""

@@ -111,7 +111,7 @@ def draw_full_size(
     painter.setup(world)
     for world.frame in sorted({int(frame) for of_camera in frames.values() for frame in of_camera}):
         for name, image in painter.images().items():
-            for kind in kinds[name]:
+            for kind in kinds[name] if world.frame in frames[name] else ():
                 drawn = {"color": image.color, "depth": image.depth, "labels": image.segmentation}[kind]
                 assert drawn is not None
                 found[name, kind][world.frame] = drawn.copy()

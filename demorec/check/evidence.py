@@ -187,11 +187,12 @@ def motions_of_dataset(
         for name, feature in features.items()
         if feature.is_numeric and len(feature.shape) == 1
     }
-    stranger = _arm(described[STATE].names, urdf)
+    stranger: _Arm | None = None  # what its robot is takes time to find out
     for number, rows in enumerate(rows_of):
         robot = robots.get(number)
         where = f"episode {number}"
         if robot is None:
+            stranger = stranger or _arm(described[STATE].names, urdf)
             yield _motion(where, info.fps, rows, described, arm=stranger)
             continue
         spec, arm = robot.record.spec, _Arm.of(robot)

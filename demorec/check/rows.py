@@ -67,22 +67,16 @@ class LinkMatrices:
 
 
 def joint_matrices(joint: UrdfJoint, position: Array) -> Array:
-    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m)."""
-    motion = np.broadcast_to(np.eye(4), (len(position), 4, 4)).copy()
-    axis = np.array(joint.axis)
+    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m); turns are by Rodrigues' formula."""
+    at_zero, along = joint.parent_from_joint.matrix(), position[:, None, None]
+    x, y, z = joint.axis
     if joint.kind == "prismatic":
-        motion[:, :3, 3] = position[:, None] * axis
-    else:
-        motion[:, :3, :3] = _axis_rotations(axis, position)
-    return np.asarray(joint.parent_from_joint.matrix() @ motion)
-
-
-def _axis_rotations(axis: Array, angle: Array) -> Array:
-    """(T, 3, 3) by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross))
+        way = np.zeros((4, 4))
+        way[:3, 3] = joint.axis
+        return np.asarray(at_zero + along * (at_zero @ way))
+    cross = np.array([[0, -z, y, 0], [z, 0, -x, 0], [-y, x, 0, 0], [0, 0, 0, 0]])
+    turned = at_zero @ cross
+    return np.asarray(at_zero + np.sin(along) * turned + (1 - np.cos(along)) * (turned @ cross))
 
 
 def displacement(a: Array, b: Array, *, lever: float = 0.1) -> Array:

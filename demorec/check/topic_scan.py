@@ -27,6 +27,8 @@ _STAMP = np.dtype([("seconds", "<i4"), ("nanoseconds", "<u4")])
 _NONE = np.zeros(0, dtype=np.int64)
 _STAMP_BYTES = 4 + _STAMP.itemsize
 """A stamp with the four bytes of CDR's head before it."""
+_IMAGE_BYTES = 1 << 22
+"""Of chunks with images that are read together."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,8 +57,8 @@ def scan_topics(container: Container, blocks: Mapping[str, Block]) -> dict[str, 
     found = {topic: _scan(schemas[topic], block) for topic, block in blocks.items()}
     images = [topic for topic in schemas if topic not in found]
     parts: dict[str, list[TopicScan]] = {topic: [] for topic in images}
-    for chunk in container.blocks_by_chunk(images):
-        for topic, block in chunk.items():
+    for chunks in container.blocks_by_chunk(images, num_bytes=_IMAGE_BYTES):
+        for topic, block in chunks.items():
             parts[topic].append(_scan(schemas[topic], block))
     for name in container.attachment_names:
         container.attachment(name)

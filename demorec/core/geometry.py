@@ -161,6 +161,12 @@ def rotate(quat_xyzw: ArrayLike, vector: ArrayLike) -> Array:
     return np.asarray(r[:, 0] * x + r[:, 1] * y + r[:, 2] * z, dtype=np.float64)
 
 
+def angle_between(a: Pose, b: Pose) -> float:
+    """Angle of the rotation from a to b, rad, 0..pi."""
+    dot = abs(sum(float(x) * float(y) for x, y in zip(a.quat_xyzw, b.quat_xyzw, strict=True)))
+    return 2.0 * math.acos(min(1.0, dot))
+
+
 def wrap_angle(angle: float) -> float:
     """The same angle in [-pi, pi)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi

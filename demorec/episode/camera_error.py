@@ -8,9 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.core.geometry import Pose
+from demorec.core.geometry import Pose, angle_between
 from demorec.episode.scene import SceneCamera
-from demorec.robots.motion import angle_between
 
 ANGLE_MARGIN = 1e-6
 """Radians by which quaternion and angle may disagree."""

@@ -98,7 +98,7 @@ def read_columns(
         columns["images"] = dict.fromkeys(image_topics, np.arange(num_frames, dtype=np.int64))
         columns["image_stamps"] = dict.fromkeys(image_topics, time_ns)
     else:
-        columns["image_stamps"] = {name: _stamps(container, topic) for name, topic in image_topics.items()}
+        columns["image_stamps"] = _stamps(container, image_topics)
         _check_images(columns["images"], columns["image_stamps"], container)
     return Columns(time_ns=time_ns, **columns), said.get(channels.EVENTS, [])
 
@@ -123,6 +123,10 @@ def _check_images(
             )
 
 
-def _stamps(container: Container, topic: str) -> NDArray[np.int64]:
-    """(N,) of the messages of a topic, one chunk of them in memory at a time: images may take gigabytes."""
-    return np.fromiter((message.time_ns for message in container.messages((topic,))), dtype=np.int64)
+def _stamps(container: Container, topics: Mapping[str, str]) -> dict[str, NDArray[np.int64]]:
+    """Name -> (N,) of the messages of its topic, one chunk of them in memory at a time: images may take gigabytes."""
+    found: dict[str, list[NDArray[np.int64]]] = {name: [np.empty(0, np.int64)] for name in topics}
+    for blocks in container.blocks_by_chunk(set(topics.values())):
+        for name, topic in topics.items():
+            found[name].append(blocks[topic].time_ns)
+    return {name: np.concatenate(times) for name, times in found.items()}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose
+from demorec.core.geometry import Array, Pose, angle_between
 from demorec.robots.kinematics import WHOLE_POSE, ArmKinematics
 
 # Peaks of the quintic time law u^3 (10 - 15 u + 6 u^2) over unit time and distance.
@@ -45,12 +45,6 @@ class MotionLimits:
 def quintic(u: Array) -> Array:
     """Fraction of the way at fraction `u` of the time, both 0..1."""
     return np.asarray(u * u * u * (10.0 + u * (6.0 * u - 15.0)), dtype=np.float64)
-
-
-def angle_between(a: Pose, b: Pose) -> float:
-    """Angle of the rotation from a to b, rad, 0..pi."""
-    dot = abs(sum(float(x) * float(y) for x, y in zip(a.quat_xyzw, b.quat_xyzw, strict=True)))
-    return 2.0 * math.acos(min(1.0, dot))
 
 
 def plan_straight(

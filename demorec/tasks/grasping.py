@@ -7,10 +7,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose, wrap_angle
+from demorec.core.geometry import Array, Pose, angle_between, wrap_angle
 from demorec.episode.scene import Body, Shape, yaw_of
 from demorec.objects.antipodal import Grasp, Hand, antipodal_grasps, standing_rotation
-from demorec.robots.motion import angle_between
 from demorec.robots.robot import RobotSpec
 from demorec.tasks.script import Behaviour
 from demorec.tasks.success import resting_half_height

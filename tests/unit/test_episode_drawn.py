@@ -7,8 +7,8 @@ import pytest
 
 from demorec.check.episode_drawn import drawable_scene
 from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.geometry import angle_between
 from demorec.loop import prepare
-from demorec.robots.motion import angle_between
 
 
 @pytest.mark.parametrize("index", range(3))

@@ -12,12 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.core.geometry import Array
+from demorec.core.geometry import Array, angle_between
 from demorec.episode.episode import Action, Observation
 from demorec.gym_env import Situation
 from demorec.learn.evaluate import TakeOver
 from demorec.loop import Episode, Session
-from demorec.robots.motion import angle_between
 from demorec.sim.world import World
 from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert, GaveUp
