@@ -32,6 +32,8 @@ from demorec.tasks.script import Behaviour
 from demorec.tasks.vary import calibration_errors, draw_behaviour, vary_cameras, vary_looks, vary_physics
 
 EVAL_SEED_OFFSET = 2**63
+MAX_LAYOUTS = 10
+"""How many layouts are drawn at most until the arm reaches all that is asked of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,20 +107,9 @@ def prepare(plan: EpisodePlan) -> Episode:
     robot = load_robot(config.robot, config.modules)
     task = load_task(config)()
     ranges = resolve(config.variation, config.ranges)
-    scene = task.sample_scene(robot, _sampler(plan, ranges, task))
-    for module in modules_of([config.task]):
-        scene = _with_model_names(scene, module)
-    robot = robot.scaled(scene.robot.scale)
-    physics = replace(
-        scene.physics,
-        hz=config.physics_hz,
-        contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD,
-        finger_stiffness=FINGER_STIFFNESS,
-    )
-    scene = replace(scene, physics=physics)
-    scene = vary_physics(scene, ranges, _rng(plan, "physics"), distractors=not task.draws_distractors)
-    scene = vary_looks(scene, ranges, _rng(plan, "looks"))
     behaviour = draw_behaviour(ranges, _rng(plan, "behaviour"))
+    scene = vary_looks(_layout(plan, robot, ranges, task, behaviour), ranges, _rng(plan, "looks"))
+    robot = robot.scaled(scene.robot.scale)
     camera_rng = _rng(plan, "cameras")
     cameras = vary_cameras(tuple(_cameras(task, robot, config)), ranges, camera_rng)
     errors = calibration_errors(cameras, ranges, camera_rng)
@@ -149,6 +140,27 @@ def prepare(plan: EpisodePlan) -> Episode:
         true_from_recorded={name: error for name, error in errors.items() if error != Pose()},
         interjection=draw_interjection(scene, _rng(plan, "interjection")) if config.interject else None,
     )
+
+
+def _layout(plan: EpisodePlan, robot: RobotSpec, ranges: Ranges, task: Task, behaviour: Behaviour) -> Scene:
+    """The first layout that the arm can serve, with its physics, or the last one: there the expert says why not."""
+    config, sampler = plan.config, _sampler(plan, ranges, task)
+    for _ in range(MAX_LAYOUTS):
+        scene = task.sample_scene(robot, sampler)
+        for module in modules_of([config.task]):
+            scene = _with_model_names(scene, module)
+        physics = replace(
+            scene.physics,
+            hz=config.physics_hz,
+            contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD,
+            finger_stiffness=FINGER_STIFFNESS,
+        )
+        scene = replace(scene, physics=physics)
+        scene = vary_physics(scene, ranges, _rng(plan, "physics"), distractors=not task.draws_distractors)
+        if task.is_in_reach(scene, robot.scaled(scene.robot.scale), behaviour):
+            break
+        sampler = replace(sampler, unit_point=())
+    return scene
 
 
 def _cameras(task: Task, robot: RobotSpec, config: GenerateConfig) -> Iterator[SceneCamera]:

@@ -145,6 +145,26 @@ class ArmKinematics:
         q, reached = self._seek(base_from_tcp, start, rest, null_gain, freedom or self.freedom)
         return q if reached else None
 
+    def find(self, base_from_tcp: Pose, *, start: Array, rest: Array) -> Array | None:
+        """As `inverse`, and where it ends at a joint limit though the pose is within reach, from other starts.
+
+        These are the rest configuration, with and without the pull to it, and with its last joint, about which a hand
+        that points down turns, a quarter turn to either side.
+
+        Args:
+            base_from_tcp: Wanted pose.
+            start: (n,) where the first try starts, rad.
+            rest: (n,) configuration towards which the null space is pulled.
+        """
+        q = self.inverse(base_from_tcp, start=start, rest=rest)
+        if q is None:
+            q = self.inverse(base_from_tcp, start=rest, rest=rest)
+        for turn in (0.0, math.pi / 2, -math.pi / 2):
+            if q is None:
+                turned = np.array([*rest[:-1], rest[-1] + turn])
+                q = self.inverse(base_from_tcp, start=np.clip(turned, self.lower, self.upper))
+        return q
+
     def why_unreachable(
         self, base_from_tcp: Pose, *, start: Array, rest: Array | None = None, freedom: Freedom | None = None
     ) -> str:

@@ -1,7 +1,7 @@
-"""Timed straight-line motions of the tool centre point within the joint limits.
+"""Timed motions within the joint limits: straight lines of the tool centre point, or of all joints at once.
 
-A quintic time law (zero velocity and acceleration at both ends) along a straight line with slerp, slowed down until
-every joint keeps to its velocity and acceleration limits.
+A quintic time law (zero velocity and acceleration at both ends) along a straight line with slerp, or from one
+configuration to the other, slowed down until every joint keeps to its velocity and acceleration limits.
 """
 
 from __future__ import annotations
@@ -71,9 +71,7 @@ def plan_straight(
         limits: Joint and TCP limits.
         dt: Control step, s.
     """
-    goal_q = arm.inverse(goal, start=start, rest=rest)
-    if goal_q is None and arm.freedom != WHOLE_POSE:
-        goal_q = arm.inverse(goal, start=rest, rest=rest)  # from where a joint is at its limit it may find nothing
+    goal_q = arm.find(goal, start=start, rest=rest)
     if goal_q is None:
         return None
     base_from_start = arm.forward(start)
@@ -103,6 +101,27 @@ def plan_straight(
             return path
         seconds *= 1.02 * factor
     return None
+
+
+def plan_joints(*, start: Array, goal: Array, speed: float, limits: MotionLimits, dt: float) -> Array:
+    """Joint targets (T, n) of a motion of all joints at once, one per control step, the start left out.
+
+    Args:
+        start, goal: (n,) configurations, rad.
+        speed: Peak speed of the joint that turns farthest, rad/s.
+        limits: Joint limits.
+        dt: Control step, s.
+    """
+    seconds = PEAK_VELOCITY * max(float(np.abs(goal - start).max()) / speed, limits.min_seconds)
+    path = start
+    for _ in range(_ROUNDS):
+        steps = max(1, math.ceil(seconds / dt))
+        path = start + quintic(np.arange(1, steps + 1) / steps)[:, np.newaxis] * (goal - start)
+        factor = slowdown(path, start=start, limits=limits, dt=dt)
+        if factor <= 1.0:
+            break
+        seconds *= 1.02 * factor
+    return path
 
 
 def slowdown(path: Array, *, start: Array, limits: MotionLimits, dt: float) -> float:

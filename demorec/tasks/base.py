@@ -15,7 +15,7 @@ from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
 from demorec.tasks.recovery import begin_again, is_served
 from demorec.tasks.sampling import Sampler
-from demorec.tasks.script import Step
+from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert
 
 
@@ -46,6 +46,17 @@ class Task(ABC):
     @abstractmethod
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         """Draw a layout; no cameras. SceneError when none is found."""
+
+    def is_in_reach(self, scene: Scene, robot: RobotSpec, behaviour: Behaviour) -> bool:
+        """Whether the arm can do it in this layout; another one is drawn where it cannot.
+
+        Args:
+            scene: As it is at the start.
+            robot: At the scene's scale.
+            behaviour: How the expert does it.
+        """
+        del scene, robot, behaviour
+        return True
 
     @abstractmethod
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:

@@ -41,6 +41,11 @@ def hand_yaw(world_from_tcp: Pose) -> float:
     return math.atan2(rotation[1, 0], rotation[0, 0])
 
 
+def _across(yaw: float) -> Array:
+    """The direction (3,) in which the fingers of a hand move that points down at a yaw, rad."""
+    return hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
+
+
 def raised(pose: Pose, height: float) -> Pose:
     """The same pose `height` metres higher."""
     return Pose(position=pose.position + np.array([0.0, 0.0, height]), quat_xyzw=pose.quat_xyzw)
@@ -98,6 +103,8 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
         now: Present hand yaw, rad.
         robot: Whose hand it is.
         behaviour: How it is done.
+
+    Of a mesh from a file those across its narrower side come before the others.
     """
     if body.shape.mesh:
         return [_perturbed(grasp, behaviour) for grasp in _grasps_of_mesh(body, pose, now=now, robot=robot)]
@@ -107,8 +114,12 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
     above_support = gripper.finger_depth + 0.005 * robot.task_scale
     z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + above_support)
     found = []
-    for yaw in nearest_first(grasp_yaws(body, pose, now, gripper.open_width), now):
-        across = hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
+    yaws = nearest_first(grasp_yaws(body, pose, now, gripper.open_width), now)
+    if body.shape.kind == "mesh":
+        # Its faces are not known. Over the ends of a long thing fingers meet points, at which it turns and comes loose.
+        yaws.sort(key=lambda yaw: round(half_extent(body, pose, _across(yaw)), 4))
+    for yaw in yaws:
+        across = _across(yaw)
         x, y = pose.position[:2] - gripper.object_offset(2 * half_extent(body, pose, across)) * across[:2]
         found.append(_perturbed(hand_down((x, y, z), yaw), behaviour))
     return found
@@ -140,7 +151,7 @@ def _grasps_of_mesh(body: Body, pose: Pose, *, now: float, robot: RobotSpec) -> 
     grasps: list[tuple[float, Pose]] = []
     for grasp in found:
         for yaw in symmetric_yaws(heading + grasp.yaw, 2):
-            across = hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
+            across = _across(yaw)
             offset = np.array([cos * grasp.x - sin * grasp.y, sin * grasp.x + cos * grasp.y, grasp.z])
             place = pose.position + offset - robot.gripper.object_offset(grasp.width) * across
             grasps.append((grasp.cost + _COST_OF_TURNING * abs(wrap_angle(yaw - now)), hand_down(place, yaw)))

@@ -19,9 +19,10 @@ from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.furniture import cube, robot_at_origin, table_and_floor, words_for
+from demorec.tasks.reach import serves
 from demorec.tasks.recovery import finish, put_back
 from demorec.tasks.sampling import Sampler, wording
-from demorec.tasks.script import Step
+from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import at_most, gripper_open_check, placement_checks
 
@@ -40,6 +41,10 @@ class PlacingTask(Task):
     Success: every goal's object lies at its goal (`placement_checks`), whatever was not to be moved is where it
     was (2 cm), and the gripper is open.
     """
+
+    def is_in_reach(self, scene: Scene, robot: RobotSpec, behaviour: Behaviour) -> bool:
+        """All that the goals ask of it, one after the other."""
+        return serves(scene, scene.goals, robot, behaviour)
 
     def script(self, expert: Expert) -> Iterator[Step]:
         """One pick-and-place per goal."""

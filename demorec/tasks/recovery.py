@@ -7,16 +7,16 @@ wrong place. So the arm is stopped and brought to where a script can begin, and 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from demorec.episode.episode import HALT_PHASE
 from demorec.episode.scene import Goal
-from demorec.robots.motion import PEAK_VELOCITY, quintic, slowdown
+from demorec.robots.motion import plan_joints
 from demorec.sim.world import World
 from demorec.tasks.grasping import hand_down, hand_yaw, is_above, nearest_first, symmetric_yaws
+from demorec.tasks.reach import JOINT_SPEED
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
 from demorec.tasks.success import placement_checks, resting_half_height
@@ -29,8 +29,6 @@ _CLEARANCE = 0.03
 """Metres of air between the finger tips and everything that lies about, above which the hand moves where it wants."""
 _HEIGHTS = (0.16, 0.12, 0.08, _CLEARANCE)
 """Metres above everything to which the hand rises; the first that it reaches."""
-_HOME_SPEED = 0.8
-"""Peak speed, rad/s, of the joints on their way home."""
 _ROUNDS = 2
 """How often all goals are gone through: serving one may spoil another."""
 
@@ -185,17 +183,10 @@ def _rise(expert: Expert) -> Iterator[Step]:
 
 def _go_home(expert: Expert) -> Iterator[Step]:
     """Joint by joint to the home configuration."""
-    start, home = expert.joint_target, np.array(expert.world.robot.home_q)
+    home = np.array(expert.world.robot.home_q)
     dt = 1.0 / expert.world.fps
-    seconds = PEAK_VELOCITY * max(float(np.abs(home - start).max()) / _HOME_SPEED, 0.2)
-    path = start
-    for _ in range(5):
-        steps = max(1, math.ceil(seconds / dt))
-        path = start + quintic(np.arange(1, steps + 1) / steps)[:, np.newaxis] * (home - start)
-        factor = slowdown(path, start=start, limits=expert.limits, dt=dt)
-        if factor <= 1.0:
-            break
-        seconds *= 1.02 * factor
-    for joint_target in path:
+    for joint_target in plan_joints(
+        start=expert.joint_target, goal=home, speed=JOINT_SPEED, limits=expert.limits, dt=dt
+    ):
         expert.joint_target = joint_target
         yield expert.step()

@@ -8,16 +8,17 @@ No step is wasted waiting: a policy that learns from idle frames learns to stand
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose
+from demorec.core.geometry import Pose
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, Goal
 from demorec.robots.kinematics import WHOLE_POSE
-from demorec.robots.motion import MotionLimits, plan_straight
+from demorec.robots.motion import MotionLimits
 from demorec.sim.world import World
 from demorec.tasks.grasping import (
     clear_first,
@@ -31,12 +32,15 @@ from demorec.tasks.grasping import (
     raised,
     symmetric_yaws,
 )
+from demorec.tasks.reach import ANY_YAW, LEAST_ABOVE_GOAL, Reach, within
 from demorec.tasks.script import Behaviour, Step, steady_width
 from demorec.tasks.success import goal_pose, is_at_rest, on_support, placement_checks
 
 MAX_TRIES = 3
 FREE_SPEED, DESCEND_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.25, 0.3, 0.08
 """Peak speeds of the TCP, m/s."""
+MOST_BELOW_LINE = 0.02
+"""Metres (of an arm of task_scale 1) that the TCP may then come below the lower end of the line."""
 SETTLE_TOLERANCE, SETTLE_SECONDS = 0.03, 0.1
 """Joint error, rad, at which a motion counts as finished; waited for at most so long."""
 ARRIVAL_TOLERANCE, ARRIVAL_SECONDS = 0.006, 0.34
@@ -44,12 +48,8 @@ ARRIVAL_TOLERANCE, ARRIVAL_SECONDS = 0.006, 0.34
 still held the arm a centimetre off, a policy would learn that a centimetre off is good enough."""
 LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
-LEAST_ABOVE_GOAL = 0.10
-"""Metres of the TCP above the goal on its way there; it stays at `lift_height` where that is higher."""
 ROCKING_SECONDS = 0.5
 """How long what a small arm, which is soon away, has let go of may rock."""
-ANY_YAW = 24
-"""Yaws that are tried where any will do."""
 CARRIED_ABOVE_M = 0.04
 """As `ABOVE_M` for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
 
@@ -100,6 +100,8 @@ class Expert:
         # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
         self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
         self._base_from_world = self.world.arm.world_from_base.inverse()
+        home = np.array(robot.home_q)
+        self.reach = Reach(arm=self.arm, world_from_base=self.world.arm.world_from_base, home=home)
 
     @property
     def open_width(self) -> float:
@@ -113,8 +115,7 @@ class Expert:
         """
         why = ""
         for pose in poses[:1] if not self._keeps_bytes else ():
-            goal = self._base_from_world @ pose
-            why = self.arm.why_unreachable(goal, start=self.joint_target, rest=self.rest_for(pose))
+            why = self.reach.why_not(pose, self.joint_target)
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
         return GaveUp(self.phase, "unreachable")
 
@@ -143,19 +144,17 @@ class Expert:
         """`world_from_tcp` as commanded."""
         return self.world.arm.world_from_base @ self.arm.forward(self.joint_target)
 
-    def rest_for(self, world_from_tcp: Pose) -> Array:
-        """The home configuration turned towards a pose: what the goal configuration is pulled to."""
-        position = (self._base_from_world @ world_from_tcp).position
-        return self.arm.turned_towards(np.array(self.world.robot.home_q), position)
-
     def reaches(self, world_from_tcp: Pose) -> bool:
-        """Whether the arm can get there."""
-        goal = self._base_from_world @ world_from_tcp
-        return self.arm.inverse(goal, start=self.joint_target, rest=self.rest_for(world_from_tcp)) is not None
+        """Whether the arm can get there from where it is."""
+        return self.reach.at_once(world_from_tcp, self.joint_target)
 
-    def first_reachable(self, grasps: Iterable[Pose], above_by: float) -> Pose | None:
-        """The first grasp that the arm reaches, there and `above_by` metres higher."""
-        return next((g for g in grasps if self.reaches(g) and self.reaches(raised(g, above_by))), None)
+    def first_reachable(self, grasps: Sequence[Pose], above_by: float, *, lift_by: float = 0.0) -> Pose | None:
+        """The first grasp that the arm reaches, there and `above_by` and `lift_by` metres higher.
+
+        From where it is, or failing that at all.
+        """
+        found = chain(within(self.reaches, grasps, up_to=above_by), within(self.reach.at_all, grasps, up_to=above_by))
+        return next((grasp for grasp in found if self.reach.at_all(raised(grasp, lift_by))), None)
 
     def move(
         self,
@@ -167,29 +166,28 @@ class Expert:
         settle: bool = True,
         until: Callable[[], bool] | None = None,
     ) -> Iterator[Step]:
-        """Move in a straight line.
+        """Move in a straight line; where the arm cannot follow it and the hand is above everything, joint by joint.
 
         Args:
             world_from_tcp: Where to.
             speed: Peak speed, m/s; multiplied by the behaviour's speed.
             free: Whether exploration noise is allowed.
-            clear_height: Height of the TCP, metres, above which it is.
+            clear_height: Height of the TCP, metres, above which it is; without one the hand is above everything.
             settle: Whether to wait, for a fraction of a second, until the joints have caught up.
             until: Stop as soon as this holds.
 
         Raises:
-            GaveUp: The arm cannot follow this line.
+            GaveUp: The arm cannot get there so.
         """
         self._free, self._clear_height = free, clear_height
-        path = plan_straight(
-            self.arm,
+        path = self.reach.path(
+            world_from_tcp,
             start=self.joint_target,
-            goal=self._base_from_world @ world_from_tcp,
-            rest=self.rest_for(world_from_tcp),
-            speed=speed * self.behaviour.speed,
-            turn_speed=self.behaviour.speed,
+            speed=speed,
+            pace=self.behaviour.speed,
             limits=self.limits,
             dt=1.0 / self.world.fps,
+            may_sink=MOST_BELOW_LINE * self._scale if free and clear_height == -math.inf else None,
         )
         if path is None:
             raise GaveUp(self.phase, "unreachable")
@@ -246,8 +244,8 @@ class Expert:
                 return
         raise GaveUp(*self.trouble)
 
-    def reachable_grasp(self, name: str, *, above_by: float) -> Pose:
-        """`world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and `above_by` metres higher.
+    def reachable_grasp(self, name: str, *, above_by: float, lift_by: float = 0.0) -> Pose:
+        """`world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and so many metres higher.
 
         Raises:
             GaveUp: Out of reach at every yaw.
@@ -261,9 +259,9 @@ class Expert:
                 for grasp in self.grasps(name)
                 for missed in grasps_beside(grasp, body, pose, x=x, y=y, others=self._others(name), robot=world.robot)
             )
-            found = self.first_reachable(beside, above_by)
+            found = next(within(self.reaches, beside, up_to=above_by), None)
             self._missing = self._has_missed = found is not None
-        found = found or self.first_reachable(self.grasps(name), above_by)
+        found = found or self.first_reachable(self.grasps(name), above_by, lift_by=lift_by)
         if found is not None:
             self.note("grasp", f"grasp {name} at yaw {hand_yaw(found):.4f} rad")
             return found
@@ -278,7 +276,7 @@ class Expert:
         """
         now = hand_yaw(self.tcp())
         places = [hand_down(position, yaw) for yaw in nearest_first(symmetric_yaws(now, 24), now)]
-        place = next(filter(self.reaches, places), None)
+        place = next(chain(filter(self.reaches, places), filter(self.reach.at_all, places)), None)
         if place is None:
             raise self._out_of_reach(f"{np.round(position, 3).tolist()}", places)
         return place
@@ -294,7 +292,7 @@ class Expert:
         self.phase = "perceive"
         above_by, lift = self._scale * behaviour.approach_height, self._scale * behaviour.lift_height
         start_height = world.pose(name).position[2]
-        grasp = self.reachable_grasp(name, above_by=above_by)
+        grasp = self.reachable_grasp(name, above_by=above_by, lift_by=lift)
 
         self.phase = "approach"
         self.gripper_target = self.open_width
@@ -416,8 +414,14 @@ class Expert:
         body, pose = self.world.body(goal.object), self.world.pose(goal.object)
         any_yaw = ANY_YAW if body.shape.mesh or not self._keeps_bytes else 0
         symmetry = 0 if keep_yaw else goal.yaw_symmetry or any_yaw
-        places = places_of(body, pose, goal_pose(self.world, goal), hand=self.tcp(), yaw_symmetry=symmetry)
-        for place in places:
-            if self.reaches(place) and self.reaches(raised(place, self._transport_height(place) - place.position[2])):
-                return place
-        raise self._out_of_reach(f"the goal of {goal.object}", places)
+        wanted, hand = goal_pose(self.world, goal), self.tcp()
+        places = places_of(body, pose, wanted, hand=hand, yaw_symmetry=symmetry)
+        height = self._transport_height(places[0]) - float(places[0].position[2])
+        others = places
+        if not (keep_yaw or goal.yaw_symmetry):
+            others = [*places, *places_of(body, pose, wanted, hand=hand, yaw_symmetry=ANY_YAW)]
+        found = chain(within(self.reaches, places, up_to=height), within(self.reach.at_all, others, up_to=height))
+        place = next(found, None)
+        if place is None:
+            raise self._out_of_reach(f"the goal of {goal.object}", places)
+        return place

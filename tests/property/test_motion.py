@@ -8,7 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from demorec.robots.motion import MotionLimits, plan_straight, quintic
+from demorec.core.geometry import Array
+from demorec.robots.motion import MotionLimits, plan_joints, plan_straight, quintic
 from demorec.robots.panda import PANDA
 from demorec.sim.arm import arm_kinematics
 from demorec.tasks.grasping import hand_down
@@ -18,6 +19,25 @@ HOME = np.array(PANDA.home_q)
 LIMITS = MotionLimits(
     joint_velocity=0.6 * np.array(PANDA.velocity_limit), joint_acceleration=0.8 * np.array(PANDA.acceleration_limit)
 )
+
+
+def assert_within_limits(rows: Array, fps: int) -> None:
+    """Of velocity and acceleration, of joint targets (T, 7), one a control step."""
+    assert (np.abs(np.diff(rows, axis=0)) * fps <= LIMITS.joint_velocity * (1 + 1e-9)).all()
+    assert (np.abs(np.diff(rows, 2, axis=0)) * fps**2 <= LIMITS.joint_acceleration * (1 + 1e-9)).all()
+
+
+@settings(max_examples=60)
+@given(
+    turns=st.lists(st.floats(-2.0, 2.0), min_size=7, max_size=7),
+    speed=st.floats(0.2, 5.0),
+    fps=st.sampled_from([10, 30, 60]),
+)
+def test_all_joints_at_once_keep_the_limits_too(turns: list[float], speed: float, fps: int) -> None:
+    goal = HOME + np.array(turns)
+    path = plan_joints(start=HOME, goal=goal, speed=speed, limits=LIMITS, dt=1 / fps)
+    assert_within_limits(np.vstack([HOME, HOME, path, path[-1]]), fps)
+    assert np.abs(path[-1] - goal).max() < 1e-9
 
 
 @settings(max_examples=60)
@@ -39,8 +59,7 @@ def test_velocity_and_acceleration_limits_hold(
     if path is None:
         return
     rows = np.vstack([q, q, path, path[-1]])
-    assert (np.abs(np.diff(rows, axis=0)) * fps <= LIMITS.joint_velocity * (1 + 1e-9)).all()
-    assert (np.abs(np.diff(rows, 2, axis=0)) * fps**2 <= LIMITS.joint_acceleration * (1 + 1e-9)).all()
+    assert_within_limits(rows, fps)
     end = ARM.forward(path[-1])
     assert math.dist(end.position, goal.position) < 3e-4
     assert (path >= ARM.lower).all()

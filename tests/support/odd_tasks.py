@@ -13,7 +13,8 @@ from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
 from demorec.tasks.grasping import raised
 from demorec.tasks.pick import PickPlace
-from demorec.tasks.sampling import Sampler
+from demorec.tasks.placing import Layout, on_table, random_cube
+from demorec.tasks.sampling import Region, Sampler
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert
 
@@ -55,6 +56,29 @@ class OutOfReach(PickPlace):
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         scene = super().sample_scene(robot, sampler)
         return replace(scene, goals=(replace(scene.goals[0], onto_from_goal=Pose.from_yaw((1.4, 0.0, 0.02))),))
+
+
+class FarAway(PickPlace):
+    """The cube lies beyond the arm's reach in every layout."""
+
+    def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
+        scene = super().sample_scene(robot, sampler)
+        (cube,) = scene.movable
+        x, y, z = cube.world_from_body.position.tolist()
+        cube = replace(cube, world_from_body=Pose.from_yaw((x + 0.5, y, z), 0.0))
+        return replace(scene, bodies=tuple(cube if body.name == cube.name else body for body in scene.bodies))
+
+
+class Wide(PickPlace):
+    """The cube lies up to 1.1 m from the base, much of which no arm reaches."""
+
+    def layout(self, sampler: Sampler) -> Layout:
+        start = sampler.point(Region(x=(0.4, 1.1), y=(-0.1, 0.1), max_radius=1.2))
+        body = random_cube(sampler, "red", start, sampler.yaw(), sides=(0.03, 0.06))
+        return [body], [on_table(body, (0.4, 0.3), 0.0)]
+
+    def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
+        return "move the cube"
 
 
 class DoneAlready(PickPlace):

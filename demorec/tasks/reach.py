@@ -1,0 +1,137 @@
+"""What an arm reaches: single poses of its hand, and all that a scene's goals ask of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from demorec.core.geometry import Array, Pose
+from demorec.episode.scene import Goal, Scene
+from demorec.robots.kinematics import ArmKinematics
+from demorec.robots.motion import MotionLimits, plan_joints, plan_straight
+from demorec.robots.robot import RobotSpec
+from demorec.sim.arm import arm_kinematics
+from demorec.tasks.grasping import grasps_of, hand_yaw, places_of, raised
+from demorec.tasks.script import Behaviour
+
+LEAST_ABOVE_GOAL = 0.10
+"""Metres of the TCP (of an arm of task_scale 1) above the goal on its way there; it stays at `lift_height` where that
+is higher."""
+ANY_YAW = 24
+"""Yaws that are tried where any will do."""
+JOINT_SPEED = 0.8
+"""Peak speed of a joint, rad/s, where all of them move at once instead of the TCP in a straight line."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reach:
+    """Where the hand of an arm gets to.
+
+    Attributes:
+        arm: Its kinematics.
+        world_from_base: Pose of its base.
+        home: (n,) home configuration, rad.
+    """
+
+    arm: ArmKinematics
+    world_from_base: Pose
+    home: Array
+
+    def rest_for(self, world_from_tcp: Pose) -> Array:
+        """The home configuration turned towards a pose: what the goal configuration is pulled to."""
+        return self.arm.turned_towards(self.home, self._in_base(world_from_tcp).position)
+
+    def at_once(self, world_from_tcp: Pose, start: Array) -> bool:
+        """Whether the inverse kinematics finds the way there from a configuration (n,), rad."""
+        rest = self.rest_for(world_from_tcp)
+        return self.arm.inverse(self._in_base(world_from_tcp), start=start, rest=rest) is not None
+
+    def at_all(self, world_from_tcp: Pose) -> bool:
+        """Whether the arm can get there."""
+        rest = self.rest_for(world_from_tcp)
+        return self.arm.find(self._in_base(world_from_tcp), start=rest, rest=rest) is not None
+
+    def path(
+        self,
+        world_from_tcp: Pose,
+        *,
+        start: Array,
+        speed: float,
+        pace: float,
+        limits: MotionLimits,
+        dt: float,
+        may_sink: float | None = None,
+    ) -> Array | None:
+        """Joint targets (T, n) there in a straight line, or with all joints at once; None where neither leads there.
+
+        Args:
+            world_from_tcp: Where to.
+            start: (n,) commanded configuration now, rad.
+            speed: Peak speed of the TCP, m/s.
+            pace: Factor on it, on the speed of turning and on that of the joints.
+            limits: Of joints and TCP.
+            dt: Control step, s.
+            may_sink: So far, metres, the TCP may come below both ends of the line where it leaves it; None: it may not
+                leave it.
+        """
+        goal, rest = self._in_base(world_from_tcp), self.rest_for(world_from_tcp)
+        line = plan_straight(
+            self.arm, start=start, goal=goal, rest=rest, speed=speed * pace, turn_speed=pace, limits=limits, dt=dt
+        )
+        if line is not None or may_sink is None:
+            return line
+        end = self.arm.find(goal, start=start, rest=rest)
+        if end is None:
+            return None
+        arc = plan_joints(start=start, goal=end, speed=JOINT_SPEED * pace, limits=limits, dt=dt)
+        heights = [float(self.arm.forward(q).position[2]) for q in (start, *arc)]
+        return arc if min(heights) > min(heights[0], heights[-1]) - may_sink else None
+
+    def why_not(self, world_from_tcp: Pose, start: Array) -> str:
+        """What of a pose cannot be had from a configuration (n,), rad, in words."""
+        rest = self.rest_for(world_from_tcp)
+        return self.arm.why_unreachable(self._in_base(world_from_tcp), start=start, rest=rest)
+
+    def _in_base(self, world_from_tcp: Pose) -> Pose:
+        return self.world_from_base.inverse() @ world_from_tcp
+
+
+def within(reaches: Callable[[Pose], bool], poses: Iterable[Pose], *, up_to: float) -> Iterator[Pose]:
+    """Those of the poses that are reached as they are and so many metres higher."""
+    return (pose for pose in poses if reaches(pose) and reaches(raised(pose, up_to)))
+
+
+def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Behaviour) -> bool:
+    """Whether the arm reaches what goals ask of it, one after the other: a grasp, above it, a place that goes with it.
+
+    Args:
+        scene: As it is at the start.
+        goals: Of it, in the order of their service.
+        robot: At the scene's scale.
+        behaviour: How the expert does it.
+    """
+    reach = Reach(
+        arm=arm_kinematics(robot, scale=scene.robot.scale),
+        world_from_base=scene.robot.world_from_base,
+        home=np.array(robot.home_q),
+    )
+    now = hand_yaw(reach.world_from_base @ reach.arm.forward(np.array(scene.robot.joint_position)))
+    approach, lift, least = (
+        robot.task_scale * height for height in (behaviour.approach_height, behaviour.lift_height, LEAST_ABOVE_GOAL)
+    )
+    poses = {body.name: body.world_from_body for body in scene.bodies}
+
+    def serves_one(goal: Goal) -> bool:
+        body, pose = scene.body(goal.object), poses[goal.object]
+        wanted = (poses[goal.onto] if goal.onto else Pose()) @ goal.onto_from_goal
+        poses[goal.object] = wanted
+        for grasp in within(reach.at_all, grasps_of(body, pose, now=now, robot=robot, behaviour=behaviour), up_to=lift):
+            places = places_of(body, pose, wanted, hand=grasp, yaw_symmetry=goal.yaw_symmetry or ANY_YAW)
+            height = max(float(grasp.position[2]) + lift - float(places[0].position[2]), least)
+            if reach.at_all(raised(grasp, approach)) and any(within(reach.at_all, places, up_to=height)):
+                return True
+        return False
+
+    return all(serves_one(goal) for goal in goals)

@@ -1,0 +1,49 @@
+"""What an arm can reach it reaches, however it stands; what it cannot is not asked of it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from support.sim import episode, run
+
+from demorec.episode.variation import Ranges
+
+
+@pytest.mark.parametrize(
+    ("task", "robot", "variation", "index"),
+    [
+        pytest.param("line_up", "iiwa", "full", 3, id="found from another start only"),
+        pytest.param("line_up", "iiwa", "full", 110, id="no way to lift it at the nearest yaw"),
+        pytest.param("sort_by_color", "panda", "full", 252, id="no straight line leads there"),
+        pytest.param("pick_shapes", "iiwa", "mild", 126, id="a duck that is dropped when held over beak and tail"),
+    ],
+)
+def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, index: int) -> None:
+    frames, outcome = run(episode(index, task=task, robot=robot, variation=variation))
+    assert outcome.success
+    assert outcome.num_retries == 0
+    assert frames[-1].observation.contact_force == 0
+
+
+def farthest(index: int, **config: Any) -> float:
+    """Of the middle of the cubes at the start, seen from above, metres from the base."""
+    scene = episode(index, task="support.odd_tasks:Wide", variation="none", **config).info.scene
+    return max(math.hypot(*body.world_from_body.position[:2].tolist()) for body in scene.movable)
+
+
+@pytest.mark.parametrize("robot", ["panda", "iiwa"])
+def test_layouts_are_drawn_anew_until_the_arm_reaches_everything(robot: str) -> None:
+    """The Panda's reach is 0.855 m from a shoulder 0.33 m up, its hand 0.21 m long; the iiwa's is no longer."""
+    assert max(farthest(index, robot=robot) for index in range(20)) < 0.83
+
+
+def test_a_layout_that_is_drawn_anew_is_in_the_held_out_rectangle_too() -> None:
+    ranges = Ranges(held_out_x=(0.4, 1.1), held_out_y=(0.0, 0.1))
+    for index in range(10):
+        made = episode(index, task="support.odd_tasks:Wide", variation="none", split="eval", ranges=ranges)
+        (cube,) = made.info.scene.movable
+        x, y, _ = cube.world_from_body.position.tolist()
+        assert 0.4 <= x < 0.83
+        assert 0.0 <= y <= 0.1
