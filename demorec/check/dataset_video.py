@@ -91,7 +91,7 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
     check_video(path)
     height, width = shape[:2]
     columns, rows = part_counts(width, height)
-    reformatter = VideoReformatter()  # a frame's own would be set up anew for each
+    reformatter, in_gray = VideoReformatter(), VideoReformatter()  # a frame's own would be set up anew for each
     try:
         with av.open(str(path), format="mp4") as container:
             for stream in container.streams.video:  # a few bytes can announce images of gigabytes
@@ -99,7 +99,7 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
             for number, frame in enumerate(container.decode(video=0)):
                 small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
                 cells = cast("NDArray[np.uint8]", small.to_ndarray())
-                detail = detail_of(frame.to_ndarray(format="gray"))
+                detail = detail_of(in_gray.reformat(frame, format="gray").to_ndarray())
                 yield cells, detail, None if number % _EVERY else _moments(frame)
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error
