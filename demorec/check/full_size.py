@@ -252,9 +252,9 @@ def compare_full_size(
 def _worst_color(sums: Array) -> tuple[float, int]:
     """The largest mean difference of a colour, and the image's number; of (N, 64, 7): pixels, differences, squares.
 
-    Over all images, and in each at a third of its weight: there the encoder's quality may be a little another one.
+    Over all images, and in each at half its weight: there the encoder's quality may be a little another one.
     """
-    each = _ratio(sums, sums[..., :1], least=_ONE_STEP) / 3
+    each = _ratio(sums, sums[..., :1], least=_ONE_STEP) / 2
     number = int(np.argmax(each))
     # What stands still is encoded alike in all of them: more images are no more blocks.
     most = sums[..., :1].max(axis=0, keepdims=True)

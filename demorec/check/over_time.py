@@ -293,7 +293,7 @@ def steady_sharpness(subject: Filmed) -> Iterator[Found]:
         starts = len(film.cells) - _BESIDE + 1
         parts = _coarse(film.cells)
         views = np.stack([parts[n : n + starts] for n in range(_BESIDE)]).mean(axis=0)
-        detail = np.median(np.lib.stride_tricks.sliding_window_view(film.detail, _BESIDE), axis=1)
+        detail = np.lib.stride_tricks.sliding_window_view(film.detail, _BESIDE).mean(axis=1)
         before, after = detail[:-_BESIDE], detail[_BESIDE:]
         times = np.maximum(before, after) / np.maximum(np.minimum(before, after), _LEAST_DETAIL)
         times[difference(views[_BESIDE:], views[:-_BESIDE]) > _SAME_LEVELS] = 1.0

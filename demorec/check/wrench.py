@@ -44,6 +44,7 @@ _MOVES = 0.3
 _FEWEST_FRAMES = 3
 _LOST_SHARE = 0.5
 """Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
+_FRAMES_A_SECOND = 15
 _MOST_LAG, _CLEAR, _UNCLEAR = 3, 0.25, 0.5
 """Frames up to which wrench and motors are shifted against each other; below which share of the usual shift's squares
 the best shift's is clear, and above which none fits: good recordings have 0.03, of arms of few joints 0.31."""
@@ -161,8 +162,8 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
     """Wrench and efforts are of one instant: of all shifts against each other none fits the last motors best. Where no
     shift fits clearly, one of the two was filtered, or they do not belong together.
 
-    Of the last two motors the one counts that tells the shift more clearly: at few frames a second noise moves what is
-    between the other and the hand in a way that frames do not show.
+    Of the last two motors those count that tell the shift clearly, and at few frames a second only the last one: noise
+    moves what is between the other and the hand in a way that frames do not show.
     """
     hand = episode.shared(_hand)
     if not isinstance(hand, _Hand):
@@ -173,19 +174,17 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
         return NotMeasured(why="there are too few joints or frames")
     lags, core = range(-_MOST_LAG, _MOST_LAG + 1), slice(_MOST_LAG, -_MOST_LAG)
     share = size = 0.0
-    found = list[tuple[float, Measurement]]()
-    for name in _motors(episode)[-2:]:
+    found = []
+    for name in _motors(episode)[-2 if episode.info.fps >= _FRAMES_A_SECOND else -1 :]:
         needed, effort = _of_joint(episode, hand, name)
         off = np.array([float(((np.roll(effort, -lag) - needed)[core] ** 2).mean()) for lag in lags])
         size, usual = float(np.sqrt((effort**2).mean())), float(np.median(off))
         share, lag = float(off.min()) / max(usual, 1e-12), lags[int(np.argmin(off))]
         if share < _CLEAR:
-            found.append((share, Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}")))
+            found.append(Measurement(value=abs(lag), detail=f"{lag:+d} frames by {name}"))
     if not found and share > _UNCLEAR and size > _LEAST_TORQUE / 2:  # nothing but the hand is beyond the last motor
         return Measurement(value=_MOST_LAG + 1, detail=f"no shift fits {name}")
-    if not found:
-        return NotMeasured(why="the wrist's motors do not tell one shift from another")
-    return min(found, key=lambda each: each[0])[1]
+    return worst(*found) or NotMeasured(why="the wrist's motors do not tell one shift from another")
 
 
 @physics_check(

@@ -30,7 +30,7 @@ def steady(**changes: Any) -> Episode:
         frames.append(SampledFrame(time_ns=time_ns, samples=samples, images={"top": index, "side": index}))
         pixels = episode.images["top"][index][1]
         top.append((time_ns, pixels))
-        side.append((time_ns, pixels[::-1].copy()))
+        side.append((time_ns, np.roll(pixels, 7, axis=0)))
     return replace(
         episode, frames=frames, images={"top": top, "side": side}, outcome=replace(episode.outcome, drops={})
     )
