@@ -281,7 +281,7 @@ def _coarse(cells: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 @film_check(
     measures="times as much detail that a fixed camera's images have before or after they become blurred or noisy",
-    warn=2.0,
+    warn=2.4,
     fail=float("inf"),
 )
 def steady_sharpness(subject: Filmed) -> Iterator[Found]:

@@ -150,23 +150,25 @@ def unit_quaternions(subject: Turning) -> Iterator[Found]:
 @physics_check(
     on=("external", "dataset"),
     needs="quaternions, by the names of elements",
-    measures="share of episodes in which a quaternion jumps to its own negative",
-    warn=0.05,
+    measures="episodes in which a quaternion jumps to its own negative",
+    warn=0,
     fail=math.inf,
 )
 def quaternions_keep_sign(subject: Turning) -> Found:
     """No quaternion changes its sign from one frame to the next: the rotation is the same, but a policy sees a jump.
 
-    Of two signs that are told apart by one element a few episodes cross the seam.
+    Where one element is never negative it chooses the sign, and a jump is where it is zero.
     """
-    jumps = [
-        (name, 1 + np.flatnonzero((table[1:] * table[:-1]).sum(axis=1) < 0)) for name, table in subject.quaternions()
-    ]
-    if not jumps:
+    tables = list(subject.quaternions())
+    if not tables:
         return None
-    wrong = [(name, int(frames[0])) for name, frames in jumps if len(frames)]
+    wrong = []
+    for name, table in tables:
+        jumps = 1 + np.flatnonzero((table[1:] * table[:-1]).sum(axis=1) < 0)
+        if len(jumps) and not (table >= 0).all(axis=0).any():
+            wrong.append((name, int(jumps[0])))
     name, frame = wrong[0] if wrong else ("", None)
-    return Measurement(value=len(wrong) / len(jumps), frame=frame, detail=name)
+    return Measurement(value=len(wrong), frame=frame, detail=name)
 
 
 @physics_check(
