@@ -113,9 +113,12 @@ def _moments(frame: av.VideoFrame) -> Array:
 
 
 def detail_of(gray: NDArray[Any]) -> float:
-    """Mean square of the differences of neighbouring pixels (H, W), of 255: falls with blur and rises with noise."""
-    values = gray.astype(np.float32)
-    return sum(float((np.diff(values, axis=axis) ** 2).mean()) for axis in (0, 1) if values.shape[axis] > 1)
+    """Mean square of the differences of neighbouring pixels (H, W), of 255: falls with blur and rises with noise.
+
+    Of every second line to either side.
+    """
+    across, down = (np.diff(lines.astype(np.float32)).reshape(-1) for lines in (gray[::2], gray[:, ::2].T))
+    return float(np.vdot(across, across)) / max(len(across), 1) + float(np.vdot(down, down)) / max(len(down), 1)
 
 
 def part_counts(width: int, height: int) -> tuple[int, int]:
