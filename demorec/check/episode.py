@@ -35,7 +35,6 @@ from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording, channels
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import Container
-from demorec.mcap.video import is_keyframe
 from demorec.render.recorded import RecordedWorld
 from demorec.robots.urdf import Urdf
 
@@ -268,12 +267,7 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def keyframes(self) -> Mapping[str, NDArray[np.int64]]:
         """Camera -> frames whose colour images are decoded without others."""
-        found = {}
-        for camera in self.cameras:  # one after the other, so that the images of all are not in memory together
-            codec = self.recording.video_settings(camera.name).codec
-            images = self.recording.coded_images([camera.name])[camera.name].messages()
-            found[camera.name] = np.flatnonzero([is_keyframe(codec, image) for image in images])
-        return found
+        return {camera.name: self.recording.keyframes(camera.name) for camera in self.cameras}
 
     def images(self, camera: SceneCamera, kind: ImageKind = "color") -> ImageSummary:
         """What the checks need of a camera's decoded images; decoded once."""

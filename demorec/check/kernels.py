@@ -253,6 +253,7 @@ def sum_colors_off(
 
 
 CODED = 3.0
+"""Levels, of 255, by which coding moves such a mix of two pixels."""
 
 
 @_njit  # type: ignore[untyped-decorator]

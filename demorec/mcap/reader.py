@@ -21,7 +21,7 @@ from demorec.mcap.episode_file import EpisodeFile
 from demorec.mcap.lossless import LabelDecoder, from_labels
 from demorec.mcap.numbers import Said, frame_times, read_columns
 from demorec.mcap.streams import SUBTASK, frame_streams
-from demorec.mcap.video import Rgb
+from demorec.mcap.video import Rgb, is_keyframe
 from demorec.robots.urdf import check_primitives
 
 
@@ -109,6 +109,11 @@ class RecordingReader(EpisodeFile):
             with damage_as_recording_error(self.path):
                 images[camera] = messages.coded_images(found[topic], self.video_settings(camera).codec)
         return images
+
+    def keyframes(self, camera: str) -> NDArray[np.int64]:
+        """Numbers of the images of a camera that are decoded without others; its images are in memory together."""
+        codec = self.video_settings(camera).codec
+        return np.flatnonzero([is_keyframe(codec, image) for image in self.coded_images([camera])[camera].messages()])
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Segmentation images, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""

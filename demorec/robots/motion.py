@@ -113,15 +113,13 @@ def plan_joints(*, start: Array, goal: Array, speed: float, limits: MotionLimits
         dt: Control step, s.
     """
     seconds = PEAK_VELOCITY * max(float(np.abs(goal - start).max()) / speed, limits.min_seconds)
-    path = start
-    for _ in range(_ROUNDS):
+    while True:
         steps = max(1, math.ceil(seconds / dt))
         path = start + quintic(np.arange(1, steps + 1) / steps)[:, np.newaxis] * (goal - start)
         factor = slowdown(path, start=start, limits=limits, dt=dt)
         if factor <= 1.0:
-            break
+            return path
         seconds *= 1.02 * factor
-    return path
 
 
 def slowdown(path: Array, *, start: Array, limits: MotionLimits, dt: float) -> float:

@@ -23,6 +23,10 @@ ANY_YAW = 24
 """Yaws that are tried where any will do."""
 JOINT_SPEED = 0.8
 """Peak speed of a joint, rad/s, where all of them move at once instead of the TCP in a straight line."""
+DESCEND_SPEED = 0.25
+"""Peak speed of the TCP, m/s, on its way down to a grasp."""
+_CONTROL_STEP = 1 / 30
+"""Seconds between the points at which the arm has to follow a line."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,11 +37,23 @@ class Reach:
         arm: Its kinematics.
         world_from_base: Pose of its base.
         home: (n,) home configuration, rad.
+        limits: What its motions keep to: less than its joints' own limits, with which noise on the way stays in them.
     """
 
     arm: ArmKinematics
     world_from_base: Pose
     home: Array
+    limits: MotionLimits
+
+    @classmethod
+    def of(cls, arm: ArmKinematics, scene: Scene, robot: RobotSpec) -> Reach:
+        """That of a scene's robot."""
+        limits = MotionLimits(
+            joint_velocity=0.6 * np.array(robot.velocity_limit),
+            joint_acceleration=0.8 * np.array(robot.acceleration_limit),
+        )
+        home = np.array(robot.home_q)
+        return cls(arm=arm, world_from_base=scene.robot.world_from_base, home=home, limits=limits)
 
     def rest_for(self, world_from_tcp: Pose) -> Array:
         """The home configuration turned towards a pose: what the goal configuration is pulled to."""
@@ -53,6 +69,18 @@ class Reach:
         rest = self.rest_for(world_from_tcp)
         return self.arm.find(self._in_base(world_from_tcp), start=rest, rest=rest) is not None
 
+    def descends(self, world_from_tcp: Pose, *, by: float, start: Array) -> bool:
+        """Whether a straight line leads there from so many metres above, where the arm comes from `start` (n,), rad."""
+        above, goal = self._in_base(raised(world_from_tcp, by)), self._in_base(world_from_tcp)
+        rest = self.rest_for(world_from_tcp)
+        q = self.arm.find(above, start=start, rest=rest)
+        if q is None:
+            return False
+        line = plan_straight(
+            self.arm, start=q, goal=goal, rest=rest, speed=DESCEND_SPEED, limits=self.limits, dt=_CONTROL_STEP
+        )
+        return line is not None
+
     def path(
         self,
         world_from_tcp: Pose,
@@ -60,7 +88,6 @@ class Reach:
         start: Array,
         speed: float,
         pace: float,
-        limits: MotionLimits,
         dt: float,
         may_sink: float | None = None,
     ) -> Array | None:
@@ -71,21 +98,20 @@ class Reach:
             start: (n,) commanded configuration now, rad.
             speed: Peak speed of the TCP, m/s.
             pace: Factor on it, on the speed of turning and on that of the joints.
-            limits: Of joints and TCP.
             dt: Control step, s.
             may_sink: So far, metres, the TCP may come below both ends of the line where it leaves it; None: it may not
                 leave it.
         """
         goal, rest = self._in_base(world_from_tcp), self.rest_for(world_from_tcp)
         line = plan_straight(
-            self.arm, start=start, goal=goal, rest=rest, speed=speed * pace, turn_speed=pace, limits=limits, dt=dt
+            self.arm, start=start, goal=goal, rest=rest, speed=speed * pace, turn_speed=pace, limits=self.limits, dt=dt
         )
         if line is not None or may_sink is None:
             return line
         end = self.arm.find(goal, start=start, rest=rest)
         if end is None:
             return None
-        arc = plan_joints(start=start, goal=end, speed=JOINT_SPEED * pace, limits=limits, dt=dt)
+        arc = plan_joints(start=start, goal=end, speed=JOINT_SPEED * pace, limits=self.limits, dt=dt)
         heights = [float(self.arm.forward(q).position[2]) for q in (start, *arc)]
         return arc if min(heights) > min(heights[0], heights[-1]) - may_sink else None
 
@@ -112,12 +138,9 @@ def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Beh
         robot: At the scene's scale.
         behaviour: How the expert does it.
     """
-    reach = Reach(
-        arm=arm_kinematics(robot, scale=scene.robot.scale),
-        world_from_base=scene.robot.world_from_base,
-        home=np.array(robot.home_q),
-    )
-    now = hand_yaw(reach.world_from_base @ reach.arm.forward(np.array(scene.robot.joint_position)))
+    reach = Reach.of(arm_kinematics(robot, scale=scene.robot.scale), scene, robot)
+    start = np.array(scene.robot.joint_position)
+    now = hand_yaw(reach.world_from_base @ reach.arm.forward(start))
     approach, lift, least = (
         robot.task_scale * height for height in (behaviour.approach_height, behaviour.lift_height, LEAST_ABOVE_GOAL)
     )
@@ -130,7 +153,7 @@ def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Beh
         for grasp in within(reach.at_all, grasps_of(body, pose, now=now, robot=robot, behaviour=behaviour), up_to=lift):
             places = places_of(body, pose, wanted, hand=grasp, yaw_symmetry=goal.yaw_symmetry or ANY_YAW)
             height = max(float(grasp.position[2]) + lift - float(places[0].position[2]), least)
-            if reach.at_all(raised(grasp, approach)) and any(within(reach.at_all, places, up_to=height)):
+            if reach.descends(grasp, by=approach, start=start) and any(within(reach.at_all, places, up_to=height)):
                 return True
         return False
 

@@ -186,7 +186,7 @@ def _go_home(expert: Expert) -> Iterator[Step]:
     home = np.array(expert.world.robot.home_q)
     dt = 1.0 / expert.world.fps
     for joint_target in plan_joints(
-        start=expert.joint_target, goal=home, speed=JOINT_SPEED, limits=expert.limits, dt=dt
+        start=expert.joint_target, goal=home, speed=JOINT_SPEED, limits=expert.reach.limits, dt=dt
     ):
         expert.joint_target = joint_target
         yield expert.step()

@@ -18,7 +18,6 @@ from demorec.core.geometry import Pose
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, Goal
 from demorec.robots.kinematics import WHOLE_POSE
-from demorec.robots.motion import MotionLimits
 from demorec.sim.world import World
 from demorec.tasks.grasping import (
     clear_first,
@@ -32,15 +31,16 @@ from demorec.tasks.grasping import (
     raised,
     symmetric_yaws,
 )
-from demorec.tasks.reach import ANY_YAW, LEAST_ABOVE_GOAL, Reach, within
+from demorec.tasks.reach import ANY_YAW, DESCEND_SPEED, LEAST_ABOVE_GOAL, Reach, within
 from demorec.tasks.script import Behaviour, Step, steady_width
 from demorec.tasks.success import goal_pose, is_at_rest, on_support, placement_checks
 
 MAX_TRIES = 3
-FREE_SPEED, DESCEND_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.25, 0.3, 0.08
+FREE_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.3, 0.08
 """Peak speeds of the TCP, m/s."""
 MOST_BELOW_LINE = 0.02
-"""Metres (of an arm of task_scale 1) that the TCP may then come below the lower end of the line."""
+"""Metres (of an arm of task_scale 1) that the TCP may come below the lower end of a line where the arm cannot follow it
+and goes joint by joint."""
 SETTLE_TOLERANCE, SETTLE_SECONDS = 0.03, 0.1
 """Joint error, rad, at which a motion counts as finished; waited for at most so long."""
 ARRIVAL_TOLERANCE, ARRIVAL_SECONDS = 0.006, 0.34
@@ -90,18 +90,12 @@ class Expert:
         self.arm = self.world.arm.kinematics
         self.joint_target = self.world.arm.target.copy()
         self.gripper_target = self.world.arm.gripper_target
-        self.limits = MotionLimits(
-            joint_velocity=0.6 * np.array(robot.velocity_limit),
-            joint_acceleration=0.8 * np.array(robot.acceleration_limit),
-        )
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
         # Recordings of arms of six joints and more are made again byte for byte: what was learnt later is not for them.
         self._keeps_bytes = self.arm.freedom == WHOLE_POSE
         # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
         self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
-        self._base_from_world = self.world.arm.world_from_base.inverse()
-        home = np.array(robot.home_q)
-        self.reach = Reach(arm=self.arm, world_from_base=self.world.arm.world_from_base, home=home)
+        self.reach = Reach.of(self.arm, self.world.scene, robot)
 
     @property
     def open_width(self) -> float:
@@ -149,12 +143,20 @@ class Expert:
         return self.reach.at_once(world_from_tcp, self.joint_target)
 
     def first_reachable(self, grasps: Sequence[Pose], above_by: float, *, lift_by: float = 0.0) -> Pose | None:
-        """The first grasp that the arm reaches, there and `above_by` and `lift_by` metres higher.
+        """The first grasp that the arm reaches from `above_by` metres higher, and can lift by `lift_by` metres.
 
         From where it is, or failing that at all.
         """
         found = chain(within(self.reaches, grasps, up_to=above_by), within(self.reach.at_all, grasps, up_to=above_by))
-        return next((grasp for grasp in found if self.reach.at_all(raised(grasp, lift_by))), None)
+        return next(
+            (
+                grasp
+                for grasp in found
+                if self.reach.descends(grasp, by=above_by, start=self.joint_target)
+                and self.reach.at_all(raised(grasp, lift_by))
+            ),
+            None,
+        )
 
     def move(
         self,
@@ -185,7 +187,6 @@ class Expert:
             start=self.joint_target,
             speed=speed,
             pace=self.behaviour.speed,
-            limits=self.limits,
             dt=1.0 / self.world.fps,
             may_sink=MOST_BELOW_LINE * self._scale if free and clear_height == -math.inf else None,
         )

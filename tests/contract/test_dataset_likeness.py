@@ -92,6 +92,7 @@ def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Pa
 
 
 VIEWS = (
+    "steady_sharpness",
     "images_stay_upright",
     "views_upright",
     "views_alike",
