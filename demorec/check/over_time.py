@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import partial
 from itertools import combinations
@@ -31,8 +32,11 @@ _REACH_S = 0.7
 """How far apart in time motions of images and state are compared, seconds."""
 _SHOWN = 0.35
 """The least usual correlation from which anything is concluded."""
-_BACKWARDS = 0.5
-"""The least correlation with the state's course from its end on that is none by chance."""
+_BACKWARDS, _BY_CHANCE = 0.5, 2.5
+"""The least correlation with the state's course from its end on that is none by chance, and its least z in standard
+errors: the best of all lags is taken."""
+_SMOOTH = 3
+"""Frames over which courses are averaged."""
 _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
 _FEWEST_OF_SIDE = 10
@@ -214,7 +218,8 @@ def images_follow_state(subject: Filmed) -> Iterator[Found]:
     """Images move when the robot does: catches those of another episode, late, backwards or frozen ones.
 
     How much an image changes is correlated with the speed of the state. What counts is how far that is below the
-    camera's usual correlation (of few episodes nobody knows it) and below that at another lag, or backwards, added.
+    camera's usual correlation (of few episodes nobody knows it) and below that at another lag, or backwards, added. Of
+    short episodes a correlation says less: it counts as higher by Fisher's standard error.
     """
     for camera, films in subject.films.items():
         known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
@@ -227,7 +232,8 @@ def images_follow_state(subject: Filmed) -> Iterator[Found]:
             speed = np.linalg.norm(np.diff(state / scale, axis=0), axis=1)
             if len(speed) >= 4 * reach and (np.diff(film.frames) == 1).all():
                 table, backwards = (_correlations(film.step, course, reach) for course in (speed, speed[::-1]))
-                clearly = [backwards.max()] if backwards.max() > _BACKWARDS else []
+                least = max(_BACKWARDS, math.tanh(_BY_CHANCE * _error(len(speed) - 2 * reach)))
+                clearly = [backwards.max()] if backwards.max() > least else []
                 tables.append((film, table, float(max([table.max(), *clearly]))))
         usual = float(np.median([_near(table) for _, table, _ in tables])) if tables else 0.0
         if len(tables) < _FEWEST_EPISODES:
@@ -236,19 +242,25 @@ def images_follow_state(subject: Filmed) -> Iterator[Found]:
             yield NotMeasured(why=f"{camera} hardly shows when the robot moves")
             continue
         for film, table, best in tables:
-            below = max(usual - _near(table), 0.0) if len(tables) >= _FEWEST_EPISODES else 0.0
-            yield Measurement(value=below + best - _near(table), detail=film.where)
+            own = math.tanh(math.atanh(min(_near(table), 0.999)) + _error(len(film.step) - (len(table) - 1)))
+            below = max(usual - own, 0.0) if len(tables) >= _FEWEST_EPISODES else 0.0
+            yield Measurement(value=below + max(best - own, 0.0), detail=film.where)
 
 
 def _correlations(steps: Array, speed: Array, reach: int) -> Array:
     """(2 reach + 1,) of the roots of two courses (T,), smoothed over three frames, with `steps` so much later."""
-    a, b = (np.convolve(np.sqrt(values), np.ones(3) / 3, mode="same") for values in (steps, speed))
+    a, b = (np.convolve(np.sqrt(values), np.ones(_SMOOTH) / _SMOOTH, mode="same") for values in (steps, speed))
     b = b[reach : len(b) - reach] - b[reach : len(b) - reach].mean()
     found = np.zeros(2 * reach + 1)
     for lag in range(2 * reach + 1):
         c = a[lag : lag + len(b)] - a[lag : lag + len(b)].mean()
         found[lag] = (c * b).sum() / max(float(np.sqrt((c * c).sum() * (b * b).sum())), 1e-9)
     return found
+
+
+def _error(count: int) -> float:
+    """Standard error of the z (inverse hyperbolic tangent) of a correlation of two smoothed courses (Fisher, 1921)."""
+    return 1.0 / math.sqrt(max(count / _SMOOTH - 3.0, 1.0))
 
 
 def _near(table: Array) -> float:
