@@ -39,6 +39,9 @@ _SEVERAL = 3
 """Episodes that do not all go to one place."""
 _FAR, _FAR_SHARE = 0.2, 0.2
 """rad or m that no element goes by itself, and the share of what another one goes: some states are in degrees."""
+_END, _LASTS, _MOST_STROKES = 0.25, 0.1, 8
+"""Share of its range in which a gripper is open, or closed; of the frames in which it is, at least; and how often one
+opens and closes in an episode. Of normal noise a fifteenth is in each."""
 _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
@@ -165,9 +168,25 @@ def elements_alive(subject: Moving) -> Found:
     unsent = np.all(sent_at_all == sent_at_all[0], axis=0) & (len(pairs) >= _SEVERAL)  # one may have one goal
     ways = np.max([np.ptp(state, axis=0) for state, _ in pairs], axis=0)
     moves = ways > max(_FAR, _FAR_SHARE * ways.max())
+    gripper = subject.motions.all[0].gripper
+    if gripper is not None:
+        moves[gripper] = _opens_and_closes([state[:, gripper] for state, _ in pairs])
     is_dead = (stands & sent) | (unsent & moves)
     dead = [name for name, row in zip(subject.motions.all[0].names, is_dead, strict=True) if row]
     return Measurement(value=len(dead), detail=", ".join(dead))
+
+
+def _opens_and_closes(openings: list[Array]) -> bool:
+    """Whether a gripper goes from one end of its range to the other a few times in most episodes, as noise does not."""
+    lowest, highest = (float(end(np.concatenate(openings))) for end in (np.min, np.max))
+    count = 0
+    for opening in openings:
+        share = (opening - lowest) / max(highest - lowest, 1e-9)
+        closed, opened = share < _END, share > 1 - _END
+        ends = opened[closed | opened]
+        lasts = min(closed.mean(), opened.mean()) > _LASTS
+        count += lasts and np.count_nonzero(ends[1:] != ends[:-1]) <= _MOST_STROKES
+    return count > len(openings) / 2
 
 
 @check(

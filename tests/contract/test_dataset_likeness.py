@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from support import loose
 from support.check import level_of, simulate_run
-from support.dataset_edits import FRONT, WRIST, blurred, film, halved, late, numbers, pixels
+from support.dataset_edits import FRONT, WRIST, blurred, columns, film, halved, late, numbers, pixels
 from support.dataset_particular import repeats
 from support.export import export
 
@@ -65,6 +65,9 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
     "a zero that is moved in one episode": (
         numbers("observation.state", lambda rows: rows + 0.1 * (np.arange(8) == 1), only=(2,)), "mounts_alike", "warn"
     ),
+    "a gripper that nobody tells to close": (
+        numbers("action", lambda rows: columns(rows, -1, lambda width: 0 * width + 0.08)), "elements_alive", "fail"
+    ),
     "an encoder of eight bits": (
         numbers("observation.state", lambda rows: np.round(rows * 40) / 40), "encoder_steps", "warn"
     ),
@@ -81,6 +84,14 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
 
 def test_good_ones_pass(increments: Path) -> None:
     assert [level_of(increments, law, "dataset") for law in LAWS] == ["pass"] * len(LAWS)
+
+
+def test_a_gripper_that_is_not_used_may_tremble(increments: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
+    numbers("action", lambda rows: columns(rows, -1, lambda width: 0 * width + 0.08))(dataset)
+    noise = np.random.default_rng(0)
+    numbers("observation.state", lambda rows: columns(rows, -1, lambda w: noise.normal(0.08, 3e-4, w.shape)))(dataset)
+    assert level_of(dataset, "elements_alive", "dataset") == "pass"
 
 
 @pytest.mark.parametrize("name", FAULTS)
