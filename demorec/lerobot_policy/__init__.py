@@ -80,6 +80,13 @@ def _words(text: str) -> list[str]:
     return _WORD.findall(text.lower())
 
 
+class _Gru(nn.GRU):  # type: ignore[misc]
+    """One whose weights stay tensors of their own on a GPU, too: safetensors saves no parts of cuDNN's buffer."""
+
+    def flatten_parameters(self) -> None:
+        """Do nothing."""
+
+
 class _InstructionReader(nn.Module):  # type: ignore[misc]
     """From instructions to scale and shift of the features of each camera.
 
@@ -93,7 +100,7 @@ class _InstructionReader(nn.Module):  # type: ignore[misc]
         self._number = {word: number for number, word in enumerate(vocabulary, start=1)}  # 0 is any other
         self._shape = (num_cameras, 2, num_features)
         self.words = nn.Embedding(len(vocabulary) + 1, _WORD_SIZE)
-        self.sentence = nn.GRU(_WORD_SIZE, _INSTRUCTION_SIZE, batch_first=True)
+        self.sentence = _Gru(_WORD_SIZE, _INSTRUCTION_SIZE, batch_first=True)
         self.modulation = nn.Linear(_INSTRUCTION_SIZE, num_cameras * 2 * num_features)
         nn.init.zeros_(self.modulation.bias)
 
@@ -102,7 +109,8 @@ class _InstructionReader(nn.Module):  # type: ignore[misc]
         different, device = sorted(set(instructions)), self.words.weight.device
         numbers = [[self._number.get(word, 0) for word in _words(text)] or [0] for text in different]
         sentences = [self.words(torch.tensor(row, device=device)) for row in numbers]
-        _, state = self.sentence(nn.utils.rnn.pack_sequence(sentences, enforce_sorted=False))
+        with torch.backends.cudnn.flags(enabled=False):  # which warns of weights that are no single buffer
+            _, state = self.sentence(nn.utils.rnn.pack_sequence(sentences, enforce_sorted=False))
         found: torch.Tensor = self.modulation(state[0])
         place = {text: row for row, text in enumerate(different)}
         return found[[place[text] for text in instructions]].unflatten(1, self._shape).permute(1, 2, 0, 3)

@@ -129,6 +129,35 @@ def test_lerobot_loads_the_policy_by_its_name_and_it_acts(pretrained: Path) -> N
     assert not torch.equal(actions, policy.predict_action_chunk(changed))
 
 
+def test_a_policy_that_reads_can_be_saved_from_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU, weights of a torch.nn.GRU become parts of one buffer, which safetensors refuses to save."""
+    import torch
+    from lerobot.configs import FeatureType, PolicyFeature
+    from safetensors.torch import save_model
+
+    from demorec.lerobot_policy import ActKeypointsConfig, ActKeypointsPolicy
+
+    def as_on_a_gpu(module: torch.nn.RNNBase) -> None:
+        weights = [weight for weight in module._flat_weights if weight is not None]
+        parts = torch.cat([weight.detach().reshape(-1) for weight in weights]).split([w.numel() for w in weights])
+        for weight, part in zip(weights, parts, strict=True):
+            weight.data = part.view_as(weight)
+
+    monkeypatch.setattr(torch.nn.RNNBase, "flatten_parameters", as_on_a_gpu)
+    images = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 24, 32))
+    state = PolicyFeature(type=FeatureType.STATE, shape=(8,))
+    config = ActKeypointsConfig(
+        input_features={"observation.images.front": images, "observation.state": state},
+        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(8,))},
+        vocabulary=("blue", "red"),
+        device="cpu",
+    )
+    with pytest.raises(RuntimeError, match="save"):
+        save_model(torch.nn.ModuleList([torch.nn.GRU(4, 4)]), tmp_path / "plain.safetensors")
+    ActKeypointsPolicy(config).to("cpu").save_pretrained(tmp_path / "policy")
+    assert (tmp_path / "policy/model.safetensors").exists()
+
+
 def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, pretrained: Path, tmp_path: Path) -> None:
     from demorec.learn.training import pretrain as pretraining
     from demorec.learn.training.command import training_config
