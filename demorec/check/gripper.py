@@ -17,6 +17,8 @@ _FIRST = 9
 """Frames after the first of a way."""
 _OPENS = 0.6
 """Of its opening, a second: fingers that open faster are on their way."""
+_BESIDE_MOTORS = 1.1
+"""Times the force of their motors with which fingers press that open onto something: their motion ends there, too."""
 _MOST_LAG = 4
 """Frames up to which contact force and fingers are shifted against each other."""
 _PRESSES, _APART, _STANDS = 0.25, 0.02, 0.15
@@ -120,7 +122,8 @@ def _pressed_while_opening(episode: CheckedEpisode) -> Found:
     motors = np.abs(c.joint_effort[:, episode.num_arm :]).sum(axis=1)
     at_work = float(np.median(motors[presses]))
     speed = np.diff(c.gripper_width, prepend=c.gripper_width[:1]) * episode.info.fps
-    allowed = float(np.median(c.contact_force[presses])) * motors / at_work if at_work else np.full(len(motors), np.inf)
+    usual = _BESIDE_MOTORS * float(np.median(c.contact_force[presses]))
+    allowed = usual * motors / at_work if at_work else np.full(len(motors), np.inf)
     beyond = np.where(speed > _OPENS * robot.gripper.open_width, c.contact_force - allowed, 0.0)
     return worst_frame(np.maximum(beyond, 0.0), "while the fingers open")
 

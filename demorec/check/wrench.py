@@ -35,6 +35,8 @@ _LEAST_TORQUE = 0.012
 clean episodes of all tasks and arms at 10 to 60 frames a second, seeds 920000 and 930000 on), half of this."""
 _STOP = 2e-3
 """Radians before its limit at which a joint is at its stop."""
+_STEADY = 5
+"""Frames whose median torque is that of the weight alone."""
 _OFTEN, _OWN_INERTIA = 0.9, 0.15
 """Share of the frames by whose worst efforts are judged; of a motor's peak that its links' own inertia may make."""
 _AROUND = 6
@@ -224,7 +226,11 @@ def _of_joints(episode: CheckedEpisode, dynamics: Dynamics) -> Iterator[tuple[in
 
 
 def _is_loaded(torque: Array, dynamics: Dynamics) -> bool:
-    return bool(np.median(np.abs(torque[dynamics.is_judged])) >= MIN_LOAD)
+    """Whether the weight that a joint bears is more than noise shakes it, by the torque (T,) that it needs, N m."""
+    padded = np.pad(torque, _STEADY // 2, mode="edge")
+    steady = np.median(np.lib.stride_tricks.sliding_window_view(padded, _STEADY), axis=1)
+    shaken, borne = (values[dynamics.is_judged] for values in (torque - steady, steady))
+    return bool(np.median(np.abs(borne)) >= max(MIN_LOAD, float(np.sqrt((shaken**2).mean()))))
 
 
 @physics_check(

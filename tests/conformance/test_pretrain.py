@@ -153,7 +153,7 @@ def test_a_policy_that_reads_can_be_saved_from_a_gpu(tmp_path: Path, monkeypatch
         device="cpu",
     )
     with pytest.raises(RuntimeError, match="save"):
-        save_model(torch.nn.ModuleList([torch.nn.GRU(4, 4)]), tmp_path / "plain.safetensors")
+        save_model(torch.nn.ModuleList([torch.nn.GRU(4, 4)]), str(tmp_path / "plain.safetensors"))
     ActKeypointsPolicy(config).to("cpu").save_pretrained(tmp_path / "policy")
     assert (tmp_path / "policy/model.safetensors").exists()
 
