@@ -1,9 +1,9 @@
-"""How well the episodes cover what was randomised: the largest gaps."""
+"""Is every episode there once, and how well do they cover what was randomised."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -19,6 +19,8 @@ MIN_VALUES = 10
 _MAX_SHARE = 1 / 8
 """A value that more of the episodes share was chosen and not drawn."""
 _TWIN_DISTANCE = 1e-4
+_PIECE, _WAY = 8, 0.25
+"""Rows in their order, at least, and how far they go, in deviations, from which on they are a piece of a motion."""
 _UNITS = {"x": "m", "y": "m", "size": "m", "mass": "kg", "yaw": "rad"}
 """Last word of a quantity's name -> its unit."""
 
@@ -132,6 +134,35 @@ def twins(rows: Sequence[Array], names: Sequence[str], what: str) -> Measurement
                     first = first or f"{names[group[later]]} is like {names[group[earlier]]}"
         count += int(is_twin.sum())
     return Measurement(value=count, detail=first or f"{len(rows)} different {what}")
+
+
+def pieces(tables: Iterable[Array], names: Sequence[str]) -> Measurement:
+    """How many tables (T, D) hold a piece of another one, or of themselves, bit for bit; and the first such pair.
+
+    A start that two have in common is none, unless it is half of one.
+    """
+    tables, first = list(tables), dict[bytes, tuple[int, int]]()
+    spread = np.concatenate(tables).std(axis=0)
+    spread = np.where(spread > 0, spread, np.inf)
+    found = []
+    for number, table in enumerate(tables):
+        begin, before = 0, (-1, -1)
+        for row, data in enumerate(np.ascontiguousarray(table)):
+            place = first.setdefault(data.tobytes(), (number, row))
+            if place == (number, row):  # seen for the first time
+                before = (-1, -1)
+                continue
+            if place != (before[0], before[1] + 1):
+                begin = row
+            before, length = place, row - begin + 1
+            is_start = place[1] == row and 2 * length < len(table)
+            way = float((np.abs(data - table[begin]) / spread).max())
+            if length >= _PIECE and way > _WAY and not is_start:
+                found.append(
+                    f"from row {begin} on {names[number]} is {names[place[0]]} from row {place[1] - length + 1}"
+                )
+                break
+    return Measurement(value=len(found), detail=found[0] if found else "")
 
 
 def motion_vector(joint_position: Array) -> Array:

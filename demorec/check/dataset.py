@@ -276,6 +276,16 @@ class Dataset:
         motions = [motion_vector(rows[STATE]) for rows in self.rows] if STATE in self.info.features else []
         return [f"episode {number}" for number in range(len(motions))], motions, []
 
+    def numbers(self) -> Iterator[Array]:
+        """(T, D) observations and actions of each episode."""
+        names = [
+            name
+            for name, feature in self.info.features.items()
+            if feature.is_numeric and (name == ACTION or name.startswith("observation."))
+        ]
+        for rows in self.rows:
+            yield np.concatenate([rows[name].reshape(len(rows["index"]), -1) for name in names], axis=1)
+
     def tcp_poses(self, info: EpisodeInfo, rows: Rows) -> dict[str, Array]:
         """Feature -> the TCP's poses (T, 7) that it holds, base frame."""
         poses = {EE_POSE: rows[EE_POSE].astype(np.float64)} if EE_POSE in rows else {}

@@ -21,7 +21,7 @@ from demorec.core.errors import ExportError, MissingDependencyError, ResourceErr
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.layout import VIDEO_PATH
+from demorec.datasets.lerobot.layout import TASKS_PATH, VIDEO_PATH
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
 
@@ -66,7 +66,12 @@ def dataset_counts(dataset: Dataset) -> Measurement:
         if names != set(place.tasks):
             wrong.append(f"the task of episode {number}")
         start += place.length
-    wrong += [*_wrong_ends(dataset), *(() if info.is_old else (*_wrong_ranges(dataset), *_stray_rows(dataset)))]
+    wrong += _wrong_ends(dataset)
+    if not info.is_old:
+        # LeRobot takes the row of a number, whatever number stands in it.
+        numbers = read_table(dataset.path / TASKS_PATH, ["task_index"]).column("task_index").to_pylist()
+        wrong += ["the tasks' numbers"] if numbers != list(range(len(numbers))) else []
+        wrong += [*_wrong_ranges(dataset), *_stray_rows(dataset)]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{start} frames at {info.fps} fps")
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from demorec.check.dataset_statistics import episode_column, numbers_of, read_st
 from demorec.check.drawn import judge_lag, judge_unlike
 from demorec.core.geometry import Array
 
+_DOUBTFUL, _CLEARLY = 0.012, 0.35
+"""How far colours are off, of 1, that may be another's, and the share of that by which they are off those of that one.
+Of single episodes they are off by up to 0.007, since LeRobot takes a sample of images; nearest to others' by 0.0015."""
 _IN_ORDER = ("min", "q01", "q10", "q50", "q90", "q99", "max")
 """Statistics from the smallest to the largest."""
 
@@ -30,7 +34,7 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
     other statistics are colours of 0 to 1 in their order, as many as of other features."""
     if dataset.info.is_old:
         return
-    stats = read_statistics(dataset)
+    stats, of_cameras = read_statistics(dataset), {}
     for key in dataset.colour_keys:
         images = dataset.images(key)
         if not images:
@@ -42,10 +46,16 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
         yield _off_colour(told.get("mean"), mean, key)
         yield _off_colour(told.get("std"), std, f"deviation of {key}")
         yield _disordered(told, stats, key)
-        for quantity in ("mean", "std"):
-            stated = episode_column(dataset, f"stats/{key}/{quantity}")
+        own = [(*p.mean, *p.std) for p in images]
+        columns = [episode_column(dataset, f"stats/{key}/{quantity}") for quantity in ("mean", "std")]
+        for quantity, stated in zip(("mean", "std"), columns, strict=True):
             for number, (said, p) in enumerate(zip(stated, images, strict=False)):
                 yield _off_colour(said, getattr(p, quantity), f"{quantity} of {key}, episode {number}")
+        stated = [np.concatenate([numbers_of(said) for said in pair]) for pair in zip(*columns, strict=True)]
+        yield _exchanged(stated, own, [f"{key}, episode {number}" for number in range(len(own))])
+        of_cameras[key] = (*numbers_of(told.get("mean")), *numbers_of(told.get("std"))), (*mean, *std)
+    said, true = [pair[0] for pair in of_cameras.values()], [pair[1] for pair in of_cameras.values()]
+    yield _exchanged(said, true, list(of_cameras))
 
 
 def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
@@ -54,6 +64,19 @@ def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
         return Measurement(value=math.inf, detail=detail)
     off = np.nan_to_num(np.abs(stated - true))  # NaN: too few images were seen
     return Measurement(value=float(off.max()), detail=detail)
+
+
+def _exchanged(said: Sequence[Sequence[float]], true: Sequence[Sequence[float]], names: Sequence[str]) -> Measurement:
+    """Whether the colours that are said of one are those of another, and the other way round; 1 for such a pair."""
+    known = [i for i, numbers in enumerate(said) if len(numbers) == len(true[i]) and np.isfinite(numbers).all()]
+    table, own = np.array([said[i] for i in known]), np.array([true[i] for i in known])
+    off = [float(np.nanmean(np.abs(row - mine))) for row, mine in zip(table, own, strict=True)]
+    doubtful = [i for i, value in enumerate(off) if value > _DOUBTFUL]
+    for i, j in combinations(doubtful, 2):
+        as_other = np.nanmean(np.abs(table[i] - own[j])) + np.nanmean(np.abs(table[j] - own[i]))
+        if as_other < _CLEARLY * (off[i] + off[j]):
+            return Measurement(value=1.0, detail=f"exchanged: {names[known[i]]} and {names[known[j]]}")
+    return Measurement(value=0.0, detail="")
 
 
 def _disordered(told: Mapping[str, Any], stats: Mapping[str, Any], key: str) -> Measurement | None:

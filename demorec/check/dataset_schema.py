@@ -22,6 +22,7 @@ from demorec.episode.info import EpisodeInfo
 _TYPES = {
     "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
 }  # fmt: skip
+_CHANNELS, _CHANNEL_COUNTS = ("channel", "channels"), (1, 3, 4)
 _RATE_TOLERANCE = 0.01
 """Files that were put together have rates that are a little off."""
 
@@ -68,6 +69,9 @@ def _fits(found: pa.DataType, feature: DatasetFeature) -> bool:
 
 def _names(dataset: Dataset) -> Iterator[str]:
     for name, feature in dataset.info.features.items():
+        for place, told in enumerate(feature.names or ()) if len(feature.shape) == 3 else ():
+            if told in _CHANNELS and place < 3 and feature.shape[place] not in _CHANNEL_COUNTS:
+                yield f"{name} has {feature.shape[place]} {told} by its names"
         if feature.names is None or len(feature.shape) != 1:
             continue
         if len(feature.names) != feature.shape[0]:
@@ -89,6 +93,7 @@ def _videos(dataset: Dataset) -> Iterator[str]:
         info = feature.info or {}
         said: dict[str, Any] = {"height": height, "width": width}
         said |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
+        said |= {"sound": info["has_audio"]} if isinstance(info.get("has_audio"), bool) else {}
         positions = dict.fromkeys(place.videos[key][0] for place in dataset.places)
         for position in positions:
             path = dataset.path / position.path(dataset.info.video_path or VIDEO_PATH, key)
@@ -118,6 +123,7 @@ def _stream(path: Path) -> tuple[dict[str, Any], float]:
             rate = container.streams.video[0].average_rate
             codec = {"libdav1d": "av1"}.get(context.name, context.name)
             found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}
+            found["sound"] = bool(container.streams.audio)
     except (OSError, IndexError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
     return found, float(rate or 0)

@@ -20,6 +20,8 @@ from demorec.datasets.lerobot.stats import NAMES, QUANTILES
 _NUMBERING = ("index", "episode_index", "task_index")
 _SMALLEST_DEVIATION = 1e-4
 """A component that hardly moves is measured against this."""
+_STALE = 0.02
+"""Value of statistics of what is no feature (any more): a warning."""
 _MERGED = 0.02
 """Standard deviations by which a quantile is off at most, where it may come from LeRobot's merge: a warning."""
 
@@ -30,7 +32,7 @@ _MERGED = 0.02
     fail=0.05,
 )
 def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
-    """meta/stats.json: minimum, maximum, mean, deviation, count and quantiles of every feature.
+    """meta/stats.json: minimum, maximum, mean, deviation, count and quantiles of every feature, and of nothing else.
 
     A quantile may also be the mean of the episodes' ones, as LeRobot has it. Its merge takes means of the datasets' own
     instead, and drops the sidecar: without one, a quantile that lies between the episodes' own is warned of, no more.
@@ -54,6 +56,8 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
         }
         ranges = (_quantile_ranges(np.concatenate(episodes)), averaged)
         yield _off(stats.get(name), true, ranges, {} if dataset.sidecar else between, detail=name)
+    strays = [name for name in stats if name not in dataset.info.features]
+    yield Measurement(value=_STALE if strays else 0.0, detail=f"{', '.join(strays[:3])}: no feature" if strays else "")
 
 
 @dataset_check(

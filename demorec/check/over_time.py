@@ -185,7 +185,7 @@ def _moving(film: Film) -> Flags:
 
 @film_check(
     measures="by what share every second image is nearer to the mean of its neighbours than the others are",
-    warn=0.4,
+    warn=0.46,
     fail=float("inf"),
 )
 def interpolated_images(subject: Filmed) -> Iterator[Found]:
@@ -211,8 +211,8 @@ def interpolated_images(subject: Filmed) -> Iterator[Found]:
 
 @film_check(
     measures="by how much less than usual an episode's images move when its state does, as a correlation",
-    warn=0.35,
-    fail=0.45,
+    warn=0.52,
+    fail=0.7,
 )
 def images_follow_state(subject: Filmed) -> Iterator[Found]:
     """Images move when the robot does: catches those of another episode, late, backwards or frozen ones.

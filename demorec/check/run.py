@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.check.base import SCENE, Form, Found, Lacking, Measurement, NotMeasured, run_check, worst
-from demorec.check.coverage import MIN_EPISODES, motion_vector, start_vector, twins, worst_gap
+from demorec.check.coverage import MIN_EPISODES, motion_vector, pieces, start_vector, twins, worst_gap
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ConfigError, RecordingError, describe_error, resource_error
 from demorec.core.files import open_regular, read_json_limited
@@ -236,18 +236,21 @@ def _config_off(config: Any, info: EpisodeInfo) -> Iterator[str]:
 
 
 @run_check(
-    measures="episodes that have the start or the motion of another",
+    measures="episodes that have the start or the motion of another, or a piece of it",
     on=("run", "external run", "dataset"),
     needs="two episodes",
 )  # fmt: skip
 def duplicates(subject: CheckedRun | Dataset) -> Found:
-    """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike."""
+    """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike; and in datasets
+    none has a piece of another one, or twice of itself, bit for bit."""
     names, motions, starts = subject.courses()
     if len(names) < 2:
         return Lacking(need="two episodes")
     if subject.has_equal_starts:
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
-    return worst(*([twins(starts, names, "starts")] if starts else []), twins(motions, names, "motions"))
+    found = [twins(starts, names, "starts")] if starts else []
+    found += [pieces(subject.numbers(), names)] if isinstance(subject, Dataset) else []
+    return worst(*found, twins(motions, names, "motions"))
 
 
 @run_check(

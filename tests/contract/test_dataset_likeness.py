@@ -20,7 +20,7 @@ Fault = Callable[[Path], None]
 Images = NDArray[Any]
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
-    "mounts_alike", "encoder_steps", "quaternions_keep_sign",
+    "mounts_alike", "encoder_steps", "quaternions_keep_sign", "duplicates",
 )  # fmt: skip
 
 
@@ -47,6 +47,16 @@ def at_half_the_rate(dataset: Path) -> None:
 def without_a_second(dataset: Path) -> None:
     parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
     loose.reframe(dataset, [parts[0], np.delete(parts[1], range(29, 39)), *parts[2:]])
+
+
+def twice(dataset: Path) -> None:
+    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
+    loose.reframe(dataset, [parts[0], parts[0][:-1], *parts[2:]])
+
+
+def with_a_piece_twice(dataset: Path) -> None:
+    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
+    loose.reframe(dataset, [np.concatenate([parts[0][:40], parts[0][25:]]), *parts[1:]])
 
 
 def other_sign(poses: Images) -> Images:
@@ -77,6 +87,8 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
         "warn",
     ),
     "an episode that was cut off": (cut_off, "whole_episodes", "warn"),
+    "an episode twice, once without its last row": (twice, "duplicates", "fail"),
+    "a piece of an episode twice": (with_a_piece_twice, "duplicates", "fail"),
     "a second that is missing": (without_a_second, "missing_frames", "warn"),
     "an episode of half the rate": (at_half_the_rate, "velocity_matches_position", "fail"),
 }  # fmt: skip
