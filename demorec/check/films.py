@@ -54,6 +54,11 @@ class Film:
         """(rows, columns, 3) median of the first fifth of the images, 0 to 255."""
         return np.asarray(np.median(self.cells[: max(len(self.cells) // 5, 1)], axis=0))
 
+    @property
+    def stands(self) -> bool:
+        """Whether it is of a camera that stands still, as far as that can be told."""
+        return not isinstance(self.gains, NotMeasured)
+
     @cached_property
     def gains(self) -> Array | NotMeasured:
         """(3, N) of each image, against the median one of a camera that stands still, by colour.
@@ -78,6 +83,8 @@ class Film:
 
 _STANDS = 0.02
 """Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
+_DIFFERENT, _ALIKE = 0.9, 0.98
+"""Correlations of two cameras that show different things, and of one whose images were encoded twice."""
 _BLANK_LEVELS = 1.0
 """Of 255, standard deviation over an image's parts below which it is of one colour: black, green or otherwise empty."""
 
@@ -169,9 +176,12 @@ def parts_of(images: Iterable[NDArray[np.uint8]]) -> tuple[NDArray[np.uint8], Ar
 
 
 def likeness_of_films(films: Films) -> Iterator[tuple[str, float]]:
-    """(two cameras and the episode, correlation of their images), of the first three episodes."""
+    """(two cameras and the episode, correlation of their images); 1 where they are alike in one episode alone."""
     for one, other in combinations(films, 2):
-        for a, b in zip(films[one][:3], films[other][:3], strict=False):
+        found = dict[str, float]()
+        for a, b in zip(films[one], films[other], strict=False):
             count = min(len(a.cells), len(b.cells))
             if count and a.cells.shape[1:] == b.cells.shape[1:]:
-                yield f"{a.where} and {other}", correlation(a.cells[:count], b.cells[:count])
+                found[f"{a.where} and {other}"] = correlation(a.cells[:count], b.cells[:count])
+        differ = len(found) > 1 and np.median(list(found.values())) < _DIFFERENT
+        yield from ((names, 1.0 if differ and value > _ALIKE else value) for names, value in found.items())

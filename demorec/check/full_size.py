@@ -48,6 +48,8 @@ _WORST_SHARE = 0.3
 """Of its worst block's error an encoder may leave in any: at low quality a small thing's colour is lost, or is not."""
 _ONE_STEP = 4.0
 """Levels by which a flat colour is off as a whole in an image of a little other quality."""
+_DOUBTS, _COMMON = 2.0, 16.0
+"""Standard errors of a displacement that may be chance, and how many pixels have the same of the encoder's errors."""
 _DEPTH_METRES = 0.004
 """Depth is stored in millimetres; another machine draws edges a little elsewhere."""
 
@@ -58,7 +60,8 @@ class FullSize:
 
     Attributes:
         frames: (N,) which they are.
-        displacement: Pixels by which something is elsewhere: shift, and what turn, size, shear do half-way to a corner.
+        displacement: Pixels by which something is elsewhere: shift, and what turn, size, shear do half-way to a corner;
+            less twice the standard error, which counts where images are small and coarsely encoded.
         sharpness: Pixels squared: half the variance of the blur that would make the difference; negative if sharpened.
         color: The mean difference of a colour, in units of its encoder's error (one level at least), the largest.
         color_frame: Where that is.
@@ -226,10 +229,14 @@ def compare_full_size(
     from demorec.check import kernels
 
     count, height, width, _ = drawn.shape
-    gram, right = np.zeros((7, 7)), np.zeros(7)
-    kernels.full_size_equations(seen, expected, drawn, gram, right)
-    gram += np.eye(7) * max(1e-6 * float(np.trace(gram)) / 7, 1e-9)
-    moved = np.linalg.solve(gram, right)
+    reach = min(height, width) / 4
+    all_of = np.zeros((8, 8))
+    used = kernels.full_size_equations(seen, expected, drawn, all_of)
+    gram, right = all_of[:7, :7], all_of[:7, 7]
+    covariance = np.linalg.inv(gram + np.eye(7) * max(1e-6 * float(np.trace(gram)) / 7, 1e-9))
+    moved = covariance @ right
+    left = max(float(all_of[7, 7] - moved @ right), 0.0) * _COMMON / max(used, 1)  # mean square of what is left
+    doubt = np.sqrt(left * np.diag(covariance))
     colors = np.zeros((count, 64, 7))
     kernels.sum_colors_off(seen, expected, drawn, colors)
     off, own = np.zeros((count, height // BLOCK, width // BLOCK)), np.zeros((count, height // BLOCK, width // BLOCK))
@@ -239,7 +246,7 @@ def compare_full_size(
     cells = [np.stack([grid.read("color", image).cells for image in images]) for images in (expected, drawn)]
     return FullSize(
         frames=frames,
-        displacement=float(np.hypot(*moved[:2]) + np.abs(moved[2:6]).max() * min(height, width) / 4),
+        displacement=max(_displacement(moved, reach) - _DOUBTS * _displacement(doubt, reach), 0.0),
         sharpness=float(moved[6]),
         color=color,
         color_frame=int(frames[frame]),
@@ -247,6 +254,10 @@ def compare_full_size(
         * np.where(frames < frames[0] + _PAIR, 1.0, _LATER_WEIGHT),
         encoded=float(np.sqrt(np.mean((cells[0] - cells[1]) ** 2))),
     )
+
+
+def _displacement(moved: Array, reach: float) -> float:
+    return float(np.hypot(*moved[:2]) + np.abs(moved[2:6]).max() * reach)
 
 
 def _worst_color(sums: Array) -> tuple[float, int]:

@@ -203,15 +203,15 @@ def full_size_equations(
     expected: NDArray[np.uint8],
     drawn: NDArray[np.uint8],
     gram: NDArray[np.float64],
-    right: NDArray[np.float64],
-) -> None:
-    """Add gram (7, 7) and right (7,) of the least squares seen - expected = bases, over images (N, H, W, 3).
+) -> int:
+    """Add gram (8, 8) of the bases of the least squares seen - expected = bases, and of seen - expected, over images
+    (N, H, W, 3); how many pixels were added.
 
     The bases are what the brightness of drawn changes by when it is shifted right and down (pixels), when x and y grow
     with x and y (four shares), and when it is blurred (half the variance, pixels squared).
     """
     count, height, width, _ = drawn.shape
-    bases = np.empty(7)
+    bases, used = np.empty(8), 0
     lines = np.empty((height, width))
     for n in range(count):
         for y in range(height):
@@ -227,11 +227,12 @@ def full_size_equations(
                 around = lines[i, j + 1] + lines[i, j - 1] + lines[i + 1, j] + lines[i - 1, j]
                 bases[0], bases[1], bases[2], bases[3] = -across, -down, -beside * across, -below * across
                 bases[4], bases[5], bases[6] = -beside * down, -below * down, around - 4 * lines[i, j]
-                error = _brightness(seen[n], i, j) - _brightness(expected[n], i, j)
-                for a in range(7):
-                    right[a] += bases[a] * error
-                    for b in range(7):
+                bases[7] = _brightness(seen[n], i, j) - _brightness(expected[n], i, j)
+                for a in range(8):
+                    for b in range(8):
                         gram[a, b] += bases[a] * bases[b]
+                used += 1
+    return used
 
 
 @_njit  # type: ignore[untyped-decorator]

@@ -321,7 +321,8 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
     """Each camera shows its own view: catches two that change places, within an episode or from one to another.
 
     A view is the median of the first fifth of an episode's images, of all episodes together. Cameras that move leave
-    theirs: what counts is how far the images of both, taken together, are from either order of the two.
+    theirs: what counts is how far the images of both, taken together, are from either order of the two; and whether the
+    one that always moves stands still while the one that always stands moves.
     """
     pairs = list(combinations(subject.films, 2))
     if not pairs:
@@ -332,11 +333,14 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
         if not films or films[0][0].cells.shape[1:] != films[0][1].cells.shape[1:]:
             continue
         views = [np.median([film.first_view for film in side], axis=0) for side in zip(*films, strict=True)]
-        for a, b in films:
+        stand = np.array([(a.stands, b.stands) for a, b in films])
+        usually = stand.mean(axis=0) > 0.5
+        moved = (stand == usually[::-1]).all(axis=1) & (usually[0] != usually[1])
+        for (a, b), is_moved in zip(films, moved, strict=True):
             count = min(len(a.cells), len(b.cells))
             one_cells, other_cells = a.cells[:count], b.cells[:count]
             as_named = difference(one_cells, views[0][None]) + difference(other_cells, views[1][None])
             exchanged = difference(one_cells, views[1][None]) + difference(other_cells, views[0][None])
-            wrong = exchanged < _OTHER_VIEW * as_named
+            wrong = (exchanged < _OTHER_VIEW * as_named) | is_moved
             frame = int(a.frames[int(np.argmax(wrong))]) if wrong.any() else None
             yield Measurement(value=int(wrong.sum()), frame=frame, detail=f"{a.where} and {other}")

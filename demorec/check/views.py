@@ -19,6 +19,8 @@ _ALIKE_PARTS = 0.95
 _LEVELS = 1.5
 """By how much a view is off at least that is usual, of 255."""
 _FEWEST_TO_TURN = 3
+_GRAY_LEVELS, _COLOURED_LEVELS = 1.0, 5.0
+"""Of 255, mean difference of red, green and blue in gray images, and in coloured ones at least."""
 _FEWEST_OF_SESSION, _SESSION = 5, 0.05
 """Episodes of a session at least, and share of all."""
 
@@ -74,7 +76,8 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
 def views_upright(dataset: Dataset) -> Iterator[Found]:
     """No episode has images that are mirrored, turned, gray or in another order of colours, where others are not.
 
-    What looks alike both ways is not found: most scenes seen from the front, mirrored.
+    What looks alike both ways is not found: most scenes seen from the front, mirrored. Images without any colour are
+    found where scenes vary, too.
     """
     for films in dataset.films.values():
         count = len(films)
@@ -86,7 +89,10 @@ def views_upright(dataset: Dataset) -> Iterator[Found]:
             others = (number + 1 + np.arange(min(count - 1, _NEIGHBOURS))) % count
             usual = np.median(views[others], axis=0)
             otherwise = min(float(_difference(view, other)) for other in turned(usual))
-            yield Measurement(value=float(_difference(view, usual)) / max(otherwise, _LEVELS), detail=film.where)
+            times = float(_difference(view, usual)) / max(otherwise, _LEVELS)
+            if np.ptp(view, axis=-1).mean() < _GRAY_LEVELS < _COLOURED_LEVELS < np.ptp(usual, axis=-1).mean():
+                times = math.inf
+            yield Measurement(value=times, detail=film.where)
 
 
 @views_check(
