@@ -53,6 +53,15 @@ def of_video(**values: Any) -> Fault:
     return of_info(lambda data: data["features"][CAMERA]["info"].update({f"video.{k}": v for k, v in values.items()}))
 
 
+def of_tasks(column: str, value: Callable[[int], Any]) -> Fault:
+    def fault(dataset: Path) -> None:
+        path = dataset / "meta/tasks.parquet"
+        table = pq.read_table(path)
+        pq.write_table(replaced(table, column, [value(number) for number in range(table.num_rows)]), path)
+
+    return fault
+
+
 def of_stats(name: str, quantity: str, value: Callable[[Any], Any]) -> Fault:
     return lambda dataset: edit_json(
         dataset / "meta/stats.json", lambda data: data[name].update({quantity: value(data[name][quantity])})
@@ -177,6 +186,13 @@ ALONE: dict[str, tuple[Fault, str]] = {
         lambda dataset: edit_column(dataset, "observation.ee_pose", lambda rows: rows * [1, 1, 1, 1.1, 1.1, 1.1, 1.1]),
         "unit_quaternions",
     ),
+    "tasks numbered from 1": (of_tasks("task_index", lambda number: number + 1), "dataset_counts"),
+    "names of dimensions in another order": (
+        of_feature(CAMERA, names=["channels", "height", "width"]), "dataset_schema"
+    ),
+    "sound that is not there": (
+        of_info(lambda data: data["features"][CAMERA]["info"].update(has_audio=True)), "dataset_schema"
+    ),
     "statistics that are gone": (lambda dataset: (dataset / "meta/stats.json").unlink(), "dataset_statistics"),
 }  # fmt: skip
 """Name -> what is done to the files of a dataset without sidecar, and the check that fails."""
@@ -199,15 +215,13 @@ def second_video(dataset: Path) -> None:
     shutil.copy(path, path.with_name("file-001.mp4"))
 
 
-def placeholder(dataset: Path) -> None:
-    path = dataset / "meta/tasks.parquet"
-    table = pq.read_table(path)
-    pq.write_table(replaced(table, "task", [f"task_{number}" for number in range(table.num_rows)]), path)
-
-
 WARNED: dict[str, tuple[Fault, str]] = {
     "a file of images that no episode has": (second_video, "dataset_strays"),
-    "placeholders for instructions": (placeholder, "dataset_instructions"),
+    "placeholders for instructions": (of_tasks("task", lambda number: f"task_{number}"), "dataset_instructions"),
+    "statistics of what is no feature": (
+        lambda dataset: edit_json(dataset / "meta/stats.json", lambda data: data.update(force=data["action"])),
+        "dataset_statistics",
+    ),
 }
 
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from support import loose
 from support.check import level_of, simulate_run
-from support.dataset_edits import FRONT, WRIST, blurred, columns, film, halved, late, numbers, pixels
+from support.dataset_edits import FRONT, WRIST, blurred, both, columns, film, halved, late, numbers, pixels, stats
 from support.dataset_particular import repeats
 from support.export import export
 
@@ -117,6 +117,9 @@ def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Pa
 VIEWS = (
     "steady_sharpness",
     "images_stay_upright",
+    "exchanged_cameras",
+    "distinct_cameras",
+    "dataset_image_statistics",
     "views_upright",
     "views_alike",
     "views_stay",
@@ -124,6 +127,7 @@ VIEWS = (
     "interpolated_images",
     "offsets_alike",
 )
+FAILS = ("images_stay_upright", "exchanged_cameras", "distinct_cameras", "dataset_image_statistics")
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +166,12 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a tenth of the images repeats the one before": (
         film(WRIST, lambda r: repeats(r, 10), only=None), "stale_images"
     ),
+    "cameras exchanged in one episode": (both(lambda a, b: (b, a)), "exchanged_cameras"),
+    "one camera under both names in one episode": (both(lambda a, b: (a, a)), "distinct_cameras"),
+    "gray images in one episode": (film(FRONT, pixels(gray)), "views_upright"),
+    "statistics of two cameras exchanged": (
+        stats(lambda data: data.update({FRONT: data[WRIST], WRIST: data[FRONT]})), "dataset_image_statistics"
+    ),
     "every second image is made of its neighbours": (
         film(FRONT, lambda r: halved(r.astype(np.float32)), only=None), "interpolated_images"
     ),
@@ -177,7 +187,7 @@ def test_targets_and_images_unlike_the_others(name: str, filmed: Path, tmp_path:
     fault, law = FILMED_FAULTS[name]
     dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
     fault(dataset)
-    assert level_of(dataset, law, "dataset") == ("fail" if law == "images_stay_upright" else "warn")
+    assert level_of(dataset, law, "dataset") == ("fail" if law in FAILS else "warn")
 
 
 def test_views_of_different_instructions_are_not_compared(filmed: Path, tmp_path: Path) -> None:
