@@ -18,6 +18,8 @@ from demorec.core.geometry import Array
 
 _ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
 """An image from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
+_LOST_BLOCK, _LOST_LEVELS, _LOST_SHARE = (0, 135, 0), 16, 0.01
+"""What a block of zeros is decoded to, of 255 (BT.601), levels from that, and share of an image."""
 _BESIDE = 4
 """Images before and after a jump whose medians are compared."""
 _SAME_LEVELS, _LEAST_DETAIL = 0.7, 10.0
@@ -61,19 +63,26 @@ def _all(subject: Filmed) -> Iterator[Film]:
     measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
 )
 def stray_images(subject: Filmed) -> Iterator[Found]:
-    """No image is empty, and none is from another moment or place than those around it.
+    """No image is empty or has the green blocks of lost packets, and none is from another moment or place than those
+    around it.
 
     Where most are empty `images_show_something` says so.
     """
     wrong, count = [], 0
     for film in _all(subject):
-        odd = _alien(film) if is_blank(film) else _alien(film) | flat_images(film)
+        odd = _alien(film) if is_blank(film) else _alien(film) | flat_images(film) | _torn(film)
         wrong += [(film, row) for row in np.flatnonzero(odd).tolist()]
         count += len(film.cells)
     if count:
         named = "; ".join(f"{film.where}, frame {film.frames[row]}" for film, row in wrong[:3])
         frame = int(wrong[0][0].frames[wrong[0][1]]) if wrong else None
         yield Measurement(value=len(wrong), frame=frame, detail=named or f"{count} images")
+
+
+def _torn(film: Film) -> Flags:
+    """(N,) images with more of the green that a lost block is decoded to than most of their film have."""
+    green = (np.abs(film.cells.astype(np.int16) - _LOST_BLOCK).max(axis=-1) < _LOST_LEVELS).mean(axis=(1, 2))
+    return np.asarray(green > np.median(green) + _LOST_SHARE)
 
 
 def _alien(film: Film) -> Flags:
@@ -97,6 +106,23 @@ def _alien(film: Film) -> Flags:
 
 def _moves(speed: Array) -> Flags:
     return np.asarray(speed > _MOVING * float(np.sqrt((speed**2).sum() / max(len(speed), 1))))
+
+
+@film_check(
+    measures="times as much as in any other frame that a camera's images change in one",
+    warn=4.0,
+    fail=float("inf"),
+)
+def image_cuts(subject: Filmed) -> Iterator[Found]:
+    """What a camera sees goes on from frame to frame: catches one that is hit, light that is switched, films that were
+    put together."""
+    for film in _all(subject):
+        if len(film.cells) < _FEWEST_IMAGES or is_blank(film):
+            continue
+        row = int(np.argmax(film.step))
+        others = np.delete(film.step, range(max(row - 1, 0), row + 2))
+        times = float(film.step[row] / max(float(others.max()), _CHANGES)) if film.step[row] > _ALIEN_LEVELS else 1.0
+        yield Measurement(value=times, frame=int(film.frames[row + 1]), detail=film.where)
 
 
 @film_check(
