@@ -122,6 +122,10 @@ def action_lag(episode: CheckedEpisode) -> Measurement | None:
     return Measurement(value=abs(lag), detail=f"commands run {lag:+d} frames behind the actions")
 
 
+_PRESSED = 0.2
+"""Of the speed with which a gripper opens: slower, it is pressed apart."""
+
+
 @alignment_check(
     measures="lag between gripper command and opening, frames beyond the motor's",
 )
@@ -132,7 +136,10 @@ def gripper_lag(episode: CheckedEpisode) -> Iterator[Found]:
     for frame in jumps.tolist():
         direction = math.copysign(1.0, float(c.command_gripper[frame] - c.command_gripper[frame - 1]))
         window = slice(max(frame - round(0.4 * fps), 0), frame + round(0.5 * fps) + 1)
-        moved = direction * np.diff(c.gripper_width[window]) > 5e-4 * 30 / fps
+        steps = direction * np.diff(c.gripper_width[window])
+        moved = steps > 5e-4 * 30 / fps
+        # What is put down may press fingers apart a little, before they open.
+        moved[: frame - window.start] &= steps[: frame - window.start] > _PRESSED * steps.max(initial=0.0)
         if not moved.any():
             continue
         start = window.start + int(np.argmax(moved))  # the last frame before the opening changes
