@@ -120,7 +120,7 @@ def image_cuts(subject: Filmed) -> Iterator[Found]:
         if len(film.cells) < _FEWEST_IMAGES or is_blank(film):
             continue
         row = int(np.argmax(film.step))
-        others = np.delete(film.step, range(max(row - 1, 0), row + 2))
+        others = np.delete(film.step, slice(max(row - 1, 0), row + 2))
         times = float(film.step[row] / max(float(others.max()), _CHANGES)) if film.step[row] > _ALIEN_LEVELS else 1.0
         yield Measurement(value=times, frame=int(film.frames[row + 1]), detail=film.where)
 

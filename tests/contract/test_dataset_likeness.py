@@ -174,6 +174,9 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a camera that is hit": (
         film(FRONT, lambda r: np.concatenate([r[:30], np.roll(r[30:], 24, axis=1)])), "image_cuts"
     ),
+    "a last image from elsewhere": (
+        film(FRONT, lambda r: np.concatenate([r[:-1], np.roll(r[-1:], 24, axis=1)])), "image_cuts"
+    ),
     "gray images in one episode": (film(FRONT, pixels(gray)), "views_upright"),
     "statistics of two cameras exchanged": (
         stats(lambda data: data.update({FRONT: data[WRIST], WRIST: data[FRONT]})), "dataset_image_statistics"
