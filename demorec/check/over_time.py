@@ -18,8 +18,6 @@ from demorec.core.geometry import Array
 
 _ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
 """An image from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
-_LOST_BLOCK, _LOST_LEVELS, _LOST_SHARE = (0, 135, 0), 16, 0.01
-"""What a block of zeros is decoded to, of 255 (BT.601), levels from that, and share of an image."""
 _BESIDE = 4
 """Images before and after a jump whose medians are compared."""
 _SAME_LEVELS, _LEAST_DETAIL = 0.7, 10.0
@@ -63,26 +61,19 @@ def _all(subject: Filmed) -> Iterator[Film]:
     measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
 )
 def stray_images(subject: Filmed) -> Iterator[Found]:
-    """No image is empty or has the green blocks of lost packets, and none is from another moment or place than those
-    around it.
+    """No image is empty, and none is from another moment or place than those around it.
 
     Where most are empty `images_show_something` says so.
     """
     wrong, count = [], 0
     for film in _all(subject):
-        odd = _alien(film) if is_blank(film) else _alien(film) | flat_images(film) | _torn(film)
+        odd = _alien(film) if is_blank(film) else _alien(film) | flat_images(film)
         wrong += [(film, row) for row in np.flatnonzero(odd).tolist()]
         count += len(film.cells)
     if count:
         named = "; ".join(f"{film.where}, frame {film.frames[row]}" for film, row in wrong[:3])
         frame = int(wrong[0][0].frames[wrong[0][1]]) if wrong else None
         yield Measurement(value=len(wrong), frame=frame, detail=named or f"{count} images")
-
-
-def _torn(film: Film) -> Flags:
-    """(N,) images with more of the green that a lost block is decoded to than most of their film have."""
-    green = (np.abs(film.cells.astype(np.int16) - _LOST_BLOCK).max(axis=-1) < _LOST_LEVELS).mean(axis=(1, 2))
-    return np.asarray(green > np.median(green) + _LOST_SHARE)
 
 
 def _alien(film: Film) -> Flags:
