@@ -35,6 +35,9 @@ _SHOWN = 0.35
 _BACKWARDS, _BY_CHANCE = 0.5, 2.5
 """The least correlation with the state's course from its end on that is none by chance, and its least z in standard
 errors: the best of all lags is taken."""
+_LAG_WEIGHT = 1.5
+"""Of how far a correlation is below that at another lag of the same episode, but for a quarter of its standard error:
+chance moves both alike."""
 _SMOOTH = 3
 """Frames over which courses are averaged."""
 _FEWEST_EPISODES = 3
@@ -228,7 +231,7 @@ def interpolated_images(subject: Filmed) -> Iterator[Found]:
 
 @film_check(
     measures="by how much less than usual an episode's images move when its state does, as a correlation",
-    warn=0.52,
+    warn=0.54,
     fail=0.7,
 )
 def images_follow_state(subject: Filmed) -> Iterator[Found]:
@@ -259,9 +262,11 @@ def images_follow_state(subject: Filmed) -> Iterator[Found]:
             yield NotMeasured(why=f"{camera} hardly shows when the robot moves")
             continue
         for film, table, best in tables:
-            own = math.tanh(math.atanh(min(_near(table), 0.999)) + _error(len(film.step) - (len(table) - 1)))
+            near, error = _near(table), _error(len(film.step) - (len(table) - 1))
+            own = math.tanh(math.atanh(min(near, 0.999)) + error)
             below = max(usual - own, 0.0) if len(tables) >= _FEWEST_EPISODES else 0.0
-            yield Measurement(value=below + max(best - own, 0.0), detail=film.where)
+            later = _LAG_WEIGHT * (float(table.max()) - near - error / 4)
+            yield Measurement(value=max(below + max(best - own, 0.0), later), detail=film.where)
 
 
 def _correlations(steps: Array, speed: Array, reach: int) -> Array:
