@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -136,28 +136,28 @@ def twins(rows: Sequence[Array], names: Sequence[str], what: str) -> Measurement
     return Measurement(value=count, detail=first or f"{len(rows)} different {what}")
 
 
-def pieces(tables: Iterable[Array], names: Sequence[str]) -> Measurement:
+def pieces(tables: Callable[[], Iterable[Array]], names: Sequence[str]) -> Measurement:
     """How many tables (T, D) hold a piece of another one, or of themselves, bit for bit; and the first such pair.
 
-    A start that two have in common is none, unless it is half of one.
+    A start that two have in common is none, unless it is half of one. They are read twice, as all together may not fit
+    into memory; of each row a hash is kept.
     """
-    tables, first = list(tables), dict[bytes, tuple[int, int]]()
-    spread = np.concatenate(tables).std(axis=0)
+    spread = np.sqrt(np.mean([table.var(axis=0) for table in tables()], axis=0))
     spread = np.where(spread > 0, spread, np.inf)
-    found = []
-    for number, table in enumerate(tables):
+    first, found = dict[int, tuple[int, int]](), []
+    for number, table in enumerate(tables()):
         begin, before = 0, (-1, -1)
         for row, data in enumerate(np.ascontiguousarray(table)):
-            place = first.setdefault(data.tobytes(), (number, row))
+            place = first.setdefault(hash(data.tobytes()), (number, row))
             if place == (number, row):  # seen for the first time
                 before = (-1, -1)
                 continue
             if place != (before[0], before[1] + 1):
                 begin = row
             before, length = place, row - begin + 1
-            is_start = place[1] == row and 2 * length < len(table)
-            way = float((np.abs(data - table[begin]) / spread).max())
-            if length >= _PIECE and way > _WAY and not is_start:
+            if length < _PIECE or (place[1] == row and 2 * length < len(table)):
+                continue
+            if (np.abs(data - table[begin]) / spread).max() > _WAY:
                 found.append(
                     f"from row {begin} on {names[number]} is {names[place[0]]} from row {place[1] - length + 1}"
                 )

@@ -68,15 +68,19 @@ def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
 
 def _exchanged(said: Sequence[Sequence[float]], true: Sequence[Sequence[float]], names: Sequence[str]) -> Measurement:
     """Whether the colours that are said of one are those of another, and the other way round; 1 for such a pair."""
-    known = [i for i, numbers in enumerate(said) if len(numbers) == len(true[i]) and np.isfinite(numbers).all()]
-    table, own = np.array([said[i] for i in known]), np.array([true[i] for i in known])
-    off = [float(np.nanmean(np.abs(row - mine))) for row, mine in zip(table, own, strict=True)]
-    doubtful = [i for i, value in enumerate(off) if value > _DOUBTFUL]
-    for i, j in combinations(doubtful, 2):
-        as_other = np.nanmean(np.abs(table[i] - own[j])) + np.nanmean(np.abs(table[j] - own[i]))
-        if as_other < _CLEARLY * (off[i] + off[j]):
-            return Measurement(value=1.0, detail=f"exchanged: {names[known[i]]} and {names[known[j]]}")
+    doubtful = []
+    for told, own, name in zip(said, true, names, strict=False):
+        if len(told) == len(own) and np.isfinite(told).all() and (off := _mean_off(told, own)) > _DOUBTFUL:
+            doubtful.append((told, own, off, name))
+    for one, other in combinations(doubtful, 2):
+        if _mean_off(one[0], other[1]) + _mean_off(other[0], one[1]) < _CLEARLY * (one[2] + other[2]):
+            return Measurement(value=1.0, detail=f"exchanged: {one[3]} and {other[3]}")
     return Measurement(value=0.0, detail="")
+
+
+def _mean_off(told: Sequence[float], true: Sequence[float]) -> float:
+    """Mean difference; what is NaN in `true` is not known."""
+    return float(np.nanmean(np.abs(np.subtract(told, true))))
 
 
 def _disordered(told: Mapping[str, Any], stats: Mapping[str, Any], key: str) -> Measurement | None:

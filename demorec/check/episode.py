@@ -141,8 +141,6 @@ class CheckedEpisode(ExitStack):
         """How many events and subtasks there are."""
         return len(self.events) + len(self.recording.subtasks)
 
-    # ------------------------------------------------------------------------------------------- the robot
-
     @cached_property
     def motions(self) -> Motions:
         """The one of its robot, if it has a state."""
@@ -250,8 +248,6 @@ class CheckedEpisode(ExitStack):
         near = np.linalg.norm(position - self.world_from_tcp[:, :3, 3], axis=1) < 0.05
         is_closed = c.command_gripper < 0.5 * c.gripper_width
         return np.asarray(near & (position[:, 2] > position[0, 2] + height) & is_closed)
-
-    # ------------------------------------------------------------------------------------------- the cameras
 
     @property
     def cameras(self) -> tuple[SceneCamera, ...]:

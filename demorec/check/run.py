@@ -249,7 +249,7 @@ def duplicates(subject: CheckedRun | Dataset) -> Found:
     if subject.has_equal_starts:
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
     found = [twins(starts, names, "starts")] if starts else []
-    found += [pieces(subject.numbers(), names)] if isinstance(subject, Dataset) else []
+    found += [pieces(subject.numbers, names)] if isinstance(subject, Dataset) else []
     return worst(*found, twins(motions, names, "motions"))
 
 

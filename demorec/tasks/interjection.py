@@ -71,9 +71,8 @@ def mistake(expert: Expert, interjection: Interjection) -> Iterator[Step]:
 def _brake(expert: Expert, velocity: Array) -> Iterator[Step]:
     """Bring the arm to rest within half of the acceleration that a motion has, and hold it; velocity in rad a frame."""
     dt = 1.0 / expert.world.fps
-    count = max(
-        1, math.ceil(float((np.abs(velocity) / (0.5 * expert.reach.limits.joint_acceleration * dt * dt)).max()))
-    )
+    most = 0.5 * expert.reach.limits.joint_acceleration * dt * dt
+    count = max(1, math.ceil(float((np.abs(velocity) / most).max())))
     for number in range(1, count + 1):
         expert.joint_target = expert.joint_target + velocity * (1.0 - number / count)
         yield expert.step()
