@@ -149,8 +149,11 @@ def deepest_finger(episode: Episode, frames: Sequence[Frame]) -> tuple[float, st
         parts = _parts(links[name], path.parent)
         for body in scene.movable:
             pose = _poses(frames, body)
-            near = np.flatnonzero(np.linalg.norm(pose[:, :3, 3] - finger[:, :3, 3], axis=1) < 0.25)
-            for part, piece in itertools.product(parts, _pieces(body)) if len(near) else ():
+            for part, piece in itertools.product(parts, _pieces(body)):
+                gap = np.linalg.norm(_centres(piece, pose) - _centres(part, finger), axis=1)
+                near = np.flatnonzero(gap < part.reach + piece.reach)
+                if not len(near):
+                    continue
                 depth = depth_in(part, finger[near], piece, pose[near])
                 frame = frames[int(near[int(np.argmax(depth))])]
                 deepest = max(deepest, (float(depth.max()), f"{frame.phase} {body.name} frame {frame.frame_index}"))
@@ -173,6 +176,11 @@ def lifted(episode: Episode, frames: Sequence[Frame]) -> tuple[int, float]:
             count += 1
             slip = max(slip, float(np.linalg.norm(nearest[:, :3, 3] - nearest[0, :3, 3], axis=1).max()))
     return count, slip
+
+
+def _centres(body: Convex, world_from_body: Array) -> Array:
+    """(T, 3) in the world, metres, for poses (T, 4, 4)."""
+    return np.asarray(world_from_body[:, :3, :3] @ body.centre + world_from_body[:, :3, 3])
 
 
 def _poses(frames: Sequence[Frame], body: Body) -> Array:

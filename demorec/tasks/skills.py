@@ -345,8 +345,9 @@ class Expert:
             self.phase = "lower"
             wanted = self._place_pose(goal, keep_yaw=True)
             yield from self.move(raised(wanted, 0.015), speed=LIFT_SPEED, settle=False)
-            # A faster behaviour does not hurry here: the target stops in one step, harder than the joints may.
-            speed = TOUCH_DOWN_SPEED / max(1.0, self.behaviour.speed)
+            # A faster behaviour does not hurry here: the target stops in one step, harder than the joints may. And who
+            # looks less often is slower, since the hand presses until it is seen that the object stands.
+            speed = TOUCH_DOWN_SPEED * min(1.0, world.fps / 30) / max(1.0, self.behaviour.speed)
             yield from self.move(raised(wanted, -0.004), speed=speed, until=lambda: on_support(world, name, goal.onto))
         if not self._is_apart(LOST_WIDTH):
             self.note("drop", f"dropped {name}", trouble=True)
