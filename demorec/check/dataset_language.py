@@ -94,6 +94,8 @@ def _entry_faults(row: Row, styles: set[Any], dataset: Dataset) -> Iterator[str]
         yield f"{style!r} stands in the wrong column, or is no style"
     if row.get("role") not in _ROLES:
         yield f"a {style} by {row.get('role')!r}"
+    if style == "task_aug" and row.get("role") != "user":
+        yield "a wording that is not the user's, which LeRobot leaves out"
     if not (row.get("content") or row.get("tool_calls")):
         yield f"a {style} that says nothing"
     if style in _ABOUT_IMAGES and camera not in dataset.info.video_keys:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, NotMeasured, worst
-from demorec.check.rows import LinkMatrices
+from demorec.check.rows import LinkMatrices, finest_lag
 from demorec.core.errors import SceneError, as_reason
 from demorec.core.geometry import Array
 from demorec.episode.episode import Columns
@@ -32,6 +32,8 @@ from demorec.robots.urdf import Urdf, UrdfJoint
 MIN_LOAD, LEAST_LOAD = 3.0, 1.0
 """N m, root mean square: joints that bear less say nothing of a gain; of an offset they do, as if they bore so much."""
 MIN_FRAMES = 20
+_TOLD = 0.3
+"""Share of the torques' variance that the best lag leaves open at most."""
 LIFTED_HEIGHT = 0.01
 """Metres above its start from which on the arm bears an object in the hand."""
 MAX_CHANGE = 2.0
@@ -182,6 +184,28 @@ class Dynamics:
                 gain = float((values * torque).sum() / (torque**2).sum())
                 found.append(Measurement(value=abs(gain - 1), detail=f"{name} gives {gain:.3g} of {size:.0f} N m"))
         return worst(*found) or NotMeasured(why="no joint of the arm is known")
+
+    def lag_of(self, joints: Sequence[str], effort: Array, *, reach: int) -> float | None:
+        """By how many frames, `reach` at most, efforts (T, n) run behind the torques that the motion needs.
+
+        None where no joint's load changes much; 0 where no lag tells most of it and twice as well as none.
+        """
+        rows = np.flatnonzero(self.is_judged)
+        rows = rows[(rows >= reach) & (rows < len(effort) - reach)]
+        known = {joint.name: joint for joint in self._urdf.joints if joint.kind != "prismatic"}
+        lags, errors, number = range(-reach, reach + 1), np.zeros(2 * reach + 1), 0
+        for name, values in zip(joints, effort.T, strict=True):
+            if name not in known or not np.isfinite(values).all() or len(rows) < max(MIN_FRAMES, 4 * reach):
+                continue
+            torque = self.torque(known[name])[rows]
+            if (spread := float(torque.std())) >= MIN_LOAD:
+                errors += [float(((values[rows + lag] - torque) / spread).var()) for lag in lags]
+                number += 1
+        if not number:
+            return None
+        least = errors[1:-1].min()
+        is_told = errors.min() == least <= _TOLD * number and errors[reach] > 2 * least
+        return finest_lag(lags, errors.tolist()) if is_told else 0.0
 
 
 class Arm(Protocol):

@@ -6,7 +6,8 @@ Whoever recorded them: nothing has to be known of the robot.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -32,6 +33,8 @@ _LIVELY = 0.25
 _TARGET = 0.65
 """Share of an action's variance that the states of the same frame tell, in the median of its elements, above which it
 is a target: of targets 0.84 to 0.99, of increments 0.15 to 0.47."""
+_CARTESIAN = re.compile(r"(^|[._])d?(x|y|z|[rq]?[xyzw]|roll|pitch|yaw)$")
+"""Names of elements whose increments may be told in another frame than the pose."""
 _REACH_S = 1.0
 _LATEST_S = 0.35
 """How far behind its action a motion may be, seconds: as for states that follow targets."""
@@ -179,7 +182,8 @@ def motion_follows_action(dataset: Dataset) -> Found:
     """Increments, deltas of a pose and velocities make the state move in the same frame and soon after: catches those
     that were recorded late, early, or filtered. Targets are left to `state_follows_action`.
 
-    By the lag at which an action is best told as a linear function of the ways that the states go in one frame.
+    By the lag at which an action is best told as a linear function of the ways that the states go in one frame. A joint
+    that goes the other way than its action is infinitely late.
     """
     found = _scaled(dataset)
     if not isinstance(found, _Scaled):
@@ -207,7 +211,24 @@ def motion_follows_action(dataset: Dataset) -> Found:
     if not len(clear):
         return NotMeasured(why="the actions do not go with the states' motion")
     lag = float(np.median([finest_lag(lags, (-told[:, element]).tolist()) for element in clear]))
+    for joint, state in _same_joints(dataset):
+        size_of = math.sqrt(max(float(square[state, state] * all_of[joint]), 1e-9))
+        if float(products[int(np.argmax(told[:, joint])), state, joint]) / size_of < -_CLEAR:
+            return Measurement(value=math.inf, detail=f"{_names(dataset, ACTION)[joint]} moves it the other way")
     return Measurement(value=max(-lag, lag - _LATEST_S * fps, 0.0), detail=f"the states follow by {lag:+.2f} frames")
+
+
+def _names(dataset: Dataset, feature: str) -> Sequence[str]:
+    return dataset.info.features[feature].names or ()
+
+
+def _same_joints(dataset: Dataset) -> Iterator[tuple[int, int]]:
+    """Elements of action and state that are called after the same joint."""
+    joints = [name.rpartition(".")[0] or name for name in _names(dataset, STATE)]
+    for number, name in enumerate(_names(dataset, ACTION)):
+        joint = name.rpartition(".")[0] or name
+        if joints.count(joint) == 1 and not is_gripper(name) and not _CARTESIAN.search(name):
+            yield number, joints.index(joint)
 
 
 @likeness_check(

@@ -35,6 +35,8 @@ from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
 from demorec.robots.urdf import Urdf
 
+_LATEST_S = 0.5
+"""Lags of torques that are tried, seconds."""
 _FEW_FPS = 20
 """Frames a second below which exploration noise moves a joint to and fro between two frames."""
 FEWEST = 30
@@ -328,6 +330,29 @@ def effort_matches_dynamics(subject: Moving) -> Iterator[Found]:
             yield Lacking(need=EFFORTS)
             return
         yield dynamics if isinstance(dynamics, NotMeasured) else dynamics.compare(motion.joints, motion.effort)
+
+
+@motion_check(
+    on=("external", "dataset"),
+    measures="how far torques are behind the motion that needs them, or before it",
+    unit="s",
+    warn=0.15,
+    fail=math.inf,
+    needs=EFFORTS,
+)
+def effort_lag(subject: Moving) -> Iterator[Found]:
+    """Torques are of the same moment as the joints, where the load of a joint changes much: filters are faster."""
+    for motion in subject.motions.all:
+        dynamics = subject.dynamics_of(motion)
+        if motion.effort is None or dynamics is None:
+            yield Lacking(need=EFFORTS)
+            return
+        if isinstance(dynamics, NotMeasured):
+            yield dynamics
+        elif (lag := dynamics.lag_of(motion.joints, motion.effort, reach=math.ceil(_LATEST_S * motion.fps))) is None:
+            yield NotMeasured(why="no joint's load changes much")
+        else:
+            yield Measurement(value=abs(lag) / motion.fps, detail=f"{lag:+.1f} frames, {motion.where}".rstrip(", "))
 
 
 def point_masses(motion: Motion) -> Dynamics | NotMeasured | None:

@@ -16,8 +16,8 @@ from demorec.core.geometry import Array
 
 _ALIKE_PARTS = 0.95
 """Share of an image's parts that are compared: the others may show an object that lies elsewhere."""
-_LEVELS = 1.5
-"""By how much a view is off at least that is usual, of 255."""
+_LEVELS, _EDGE_LEVELS = 1.5, 0.5
+"""By how much a view is off at least that is usual, and by how much where there are edges, of 255."""
 _FEWEST_TO_TURN = 3
 _GRAY_LEVELS, _COLOURED_LEVELS = 1.0, 5.0
 """Of 255, mean difference of red, green and blue in gray images, and in coloured ones at least."""
@@ -37,6 +37,21 @@ def _difference(one: Array, other: Array) -> Array:
     return np.asarray(parts[..., : max(round(_ALIKE_PARTS * parts.shape[-1]), 1)].mean(axis=-1))
 
 
+def _usual(views: Array, number: int) -> Array:
+    """(rows, columns, 3) what the episodes after one show: the median of nine at most."""
+    others = (number + 1 + np.arange(min(len(views) - 1, _NEIGHBOURS))) % len(views)
+    return np.asarray(np.median(views[others], axis=0))
+
+
+def _edges_off(view: Array, usual: Array) -> float:
+    """Levels by which half of the edges that are usual are off: an object that lies elsewhere has few of them."""
+    edges = np.linalg.norm(np.gradient(usual, axis=(0, 1)), axis=0).mean(axis=-1).reshape(-1) + 0.05
+    off = np.abs(view - usual).mean(axis=-1).reshape(-1)
+    order = np.argsort(off)
+    heavier = np.cumsum(edges[order])
+    return float(off[order[np.searchsorted(heavier, heavier[-1] / 2)]])
+
+
 def _instructions(dataset: Dataset) -> Array:
     """(N,) number of the first one of each episode."""
     return np.array([int(rows["task_index"].reshape(-1)[0]) for rows in dataset.rows])
@@ -49,7 +64,8 @@ def _instructions(dataset: Dataset) -> Array:
 )
 def views_alike(dataset: Dataset) -> Iterator[Found]:
     """A camera begins each episode with about the same view, if nearly all do: catches one that was moved, turned or
-    zoomed, or whose colours were changed. Where scenes vary much, or episodes are few, only much is seen.
+    zoomed, or whose colours were changed. Where scenes vary much, or episodes are few, only much is seen. Of cameras
+    that stand, edges are also compared by themselves: they show turns and zooms that leave most of the image as it is.
 
     An episode that alone has its instruction may show something else.
     """
@@ -63,6 +79,9 @@ def views_alike(dataset: Dataset) -> Iterator[Found]:
             continue
         views = np.stack([film.first_view for film in films])
         odd = far_off(_difference(views, np.median(views, axis=0)), _LEVELS)
+        if 2 * sum(film.stands for film in films) > len(films):
+            edges = [_edges_off(view, _usual(views, number)) for number, view in enumerate(views)]
+            odd |= far_off(np.array(edges), _EDGE_LEVELS)
         strange = np.flatnonzero(odd & np.isin(tasks, tasks[~odd])).tolist()
         named = ", ".join(map(str, strange[:5]))
         yield Measurement(value=len(strange), detail=f"{camera}, episode {named}" if strange else camera)
@@ -86,8 +105,7 @@ def views_upright(dataset: Dataset) -> Iterator[Found]:
             continue
         views = np.stack([film.first_view for film in films])
         for number, (film, view) in enumerate(zip(films, views, strict=True)):
-            others = (number + 1 + np.arange(min(count - 1, _NEIGHBOURS))) % count
-            usual = np.median(views[others], axis=0)
+            usual = _usual(views, number)
             otherwise = min(float(_difference(view, other)) for other in turned(usual))
             times = float(_difference(view, usual)) / max(otherwise, _LEVELS)
             if np.ptp(view, axis=-1).mean() < _GRAY_LEVELS < _COLOURED_LEVELS < np.ptp(usual, axis=-1).mean():

@@ -105,7 +105,7 @@ CHECKS: Registry[Check] = Registry(
         ("physics", "command_tracking", "action_matches_command"),
         ("wrench", "wrench_bears_the_hand", "wrench_turns_the_wrist", "wrench_lag", "force_spikes"),
         ("wrench", "effort_in_each_frame"),
-        ("motion", "effort_matches_dynamics", "stuck_sensors"),
+        ("motion", "effort_matches_dynamics", "effort_lag", "stuck_sensors"),
         ("targets", "elements_alive"),
         ("frames", "repeated_frames", "interpolated_frames", "missing_frames"),
         ("motion", "gripper_follows"),

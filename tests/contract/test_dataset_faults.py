@@ -170,6 +170,12 @@ ALONE: dict[str, tuple[Fault, str]] = {
     ),
     "rows of no episode": (of_table("data", lambda t: pa.concat_tables([t, t.slice(0, 5)])), "dataset_counts"),
     "an episode that is done early": (value_of("next.done", 10, True), "dataset_counts"),
+    "episodes that are never done": (
+        lambda dataset: edit_column(dataset, "next.done", np.zeros_like), "dataset_counts"
+    ),
+    "a table of episodes in another file": (
+        value_of("meta/episodes/file_index", 1, 9, "meta/episodes"), "dataset_counts"
+    ),
     "a reward without a success": (value_of("next.reward", 10, 1.0), "dataset_counts"),
     "a depth map of three channels": (
         of_info(lambda d: d["features"][CAMERA]["info"].update(is_depth_map=True)), "dataset_schema"

@@ -146,6 +146,7 @@ FAULTS: dict[str, tuple[str, Callable[[Episode], None]]] = {
     "a time between two frames": ("dataset_language", everywhere("plan", of(timestamp=0.05))),
     "a camera that is none": ("dataset_language", first_event(of(camera="observation.images.back"))),
     "no camera": ("dataset_language", first_event(of(camera=None), "trace")),
+    "a wording of the robot's": ("dataset_language", everywhere("task_aug", of(role="assistant"))),
     "a subtask about a camera": ("dataset_language", everywhere("subtask", of(camera=CAMERA))),
     "an unknown style": ("dataset_language", everywhere("motion", of(style="dance"))),
     "a question among the states": ("dataset_language", everywhere("motion", of(style="vqa", camera=CAMERA))),

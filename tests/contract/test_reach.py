@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
+from support.check import checked, simulate
 from support.sim import episode, run
 
 from demorec.episode.variation import Ranges
@@ -27,6 +29,16 @@ def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed
     on_purpose = [event for frame in frames for event in frame.events if "on purpose" in event.message]
     assert outcome.num_retries == len(on_purpose)
     assert frames[-1].observation.contact_force == 0
+
+
+def test_a_hand_that_looks_ten_times_a_second_does_not_press_what_it_puts_down(tmp_path: Path) -> None:
+    """This cylinder was pushed a millimetre into a finger before it was seen that it stood."""
+    path = simulate(
+        tmp_path / "a.mcap", task="pick_shapes", robot="iiwa", variation="mild", seed=61000, fps=10, episode_index=3
+    )
+    found = next(r for r in checked(path, only=["finger_depth"]).results if r.check == "finger_depth")
+    assert found.value is not None
+    assert found.value < 5e-4
 
 
 def farthest(index: int, **config: Any) -> float:
