@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,9 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("HF_DATASETS_OFFLINE", "1")
 # Containers often forbid Python to write bytecode; every process that a test starts would then compile PyTorch anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell switches Ctrl-C off for what runs in its background, and for all that this starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 from support.export import without_verification
 
 from demorec.mcap.video import ordinary_scheduling

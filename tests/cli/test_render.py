@@ -16,10 +16,6 @@ from support.export import files_of, make_run
 from demorec.episode.episode import Outcome
 from demorec.mcap import EpisodeWriter
 
-INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-"""Whoever runs the tests in the background of a shell has switched it off."""
-DEMOREC = [sys.executable, "-c", f"{INTERRUPTIBLE}; from demorec.cli import main; main()"]
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -110,7 +106,7 @@ def test_ended_from_outside_it_is_quiet_and_goes_on(tmp_path: Path, number: sign
     """With two workers, which hold semaphores that Python would call leaked. The last recording takes seconds."""
     run, out = make_run(tmp_path / "run", (3, 3, 40), cameras=("front",)), tmp_path / "out"
     options = ("--width", "512", "--height", "512", "--looks", "1", "--workers")
-    command = [*DEMOREC, "render", str(run), "--out", str(out), *options, "2"]
+    command = [sys.executable, "-m", "demorec", "render", str(run), "--out", str(out), *options, "2"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
     deadline = time.monotonic() + 120
     while not list(out.glob("episodes/*.part")):

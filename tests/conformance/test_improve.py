@@ -130,16 +130,10 @@ def test_what_is_not_its_own_is_refused(
     assert "The settings of the training cannot be read" in capsys.readouterr().err
 
 
-HEARING_CTRL_C = (
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from demorec.cli import main; main()"
-)
-"""The command, which hears Ctrl-C even where the tests are a shell's background job and do not."""
-
-
 def killed_when(words: list[str], path: Path, *, signal_number: int) -> None:
     """Run the command until something is at a path, and kill it; nothing of it goes on then."""
     process = subprocess.Popen(
-        [sys.executable, "-c", HEARING_CTRL_C, *words],
+        [sys.executable, "-m", "demorec", *words],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
