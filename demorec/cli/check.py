@@ -9,10 +9,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tyro.conf import Positional
-
 from demorec.cli.replay import demonstrations, describe_replay
-from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, MappingFile, Readable, allowed_modules
 from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import need_paths, reading, tell_unfinished
@@ -49,11 +47,8 @@ class Check:
       demorec check recordings/cubes/episodes/episode_000007.mcap --deep
     """
 
-    paths: Positional[tuple[Path, ...]]
-    """Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
-    mapping: Path | None = None
-    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
-    writes, if it leaves nothing to decide)."""
+    paths: Readable
+    mapping: MappingFile = None
     images: bool = True
     """Decode all images; without it, a recording is checked at about 50 times real time."""
     only: tuple[str, ...] = ()

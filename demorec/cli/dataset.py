@@ -274,8 +274,9 @@ class Dataset:
                 return operations.set_task(source, self.task, self._chosen(source))
             case "reorder":
                 return operations.reorder(source, self.by, _numbers(self.order), descending=self.descending)
-            case _:
+            case "shuffle":
                 return operations.shuffle(source, self.seed)
+        raise NotImplementedError(self.command)
 
     def _merge(self, sources: Sequence[Source]) -> Plan:
         from demorec.datasets.editing.merge import DatasetsDifferError, merge

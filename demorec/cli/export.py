@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
+from demorec.cli.shared.flags import MappingFile, Readable
 from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
@@ -36,13 +37,10 @@ class Export:
 
     format: Annotated[Positional[str], arg(metavar="FORMAT")]
     """Format of the dataset: lerobot or hdf5."""
-    sources: Positional[tuple[Path, ...]]
-    """Runs, recordings, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
+    sources: Readable
     out: Path
     """Folder (LeRobot) or file (HDF5) to create."""
-    mapping: Path | None = None
-    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
-    writes, if it leaves nothing to decide)."""
+    mapping: MappingFile = None
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
     """How to export."""
 

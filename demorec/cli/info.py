@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tyro.conf import Positional
-
+from demorec.cli.shared.flags import MappingFile, Readable
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
 from demorec.cli.shared.paths import need_paths, reading
 from demorec.core.errors import ExportError, RecordingError, describe_error, resource_error, without_path
@@ -34,11 +33,8 @@ class Info:
       demorec info datasets/cubes --json
     """
 
-    paths: Positional[tuple[Path, ...]]
-    """Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."""
-    mapping: Path | None = None
-    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
-    writes, if it leaves nothing to decide)."""
+    paths: Readable
+    mapping: MappingFile = None
     json: bool = False
     """Print JSON: one object, or a list for several paths."""
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, MappingFile, allowed_modules
 from demorec.cli.shared.output import counted, say, size_in_words
 from demorec.cli.shared.paths import places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
@@ -36,9 +36,7 @@ class Report:
     """A run, a recording, an evaluation, a LeRobot dataset, an HDF5 file, a bag, or a folder of recordings or bags."""
     against: Path | None = None
     """A LeRobot dataset that the dataset is compared with, as by demorec dataset diff."""
-    mapping: Path | None = None
-    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
-    writes, if it leaves nothing to decide)."""
+    mapping: MappingFile = None
     out: Path
     """The page (.html)."""
     camera: str = ""

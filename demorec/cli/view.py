@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, MappingFile, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
 from demorec.cli.shared.paths import places_read, reading, refuse_inside, tell_unfinished
 from demorec.core.errors import ConfigError, check_option
@@ -44,9 +44,7 @@ class View:
 
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, LeRobot datasets, HDF5 files, bags, folders of recordings or of bags, or .rrd files."""
-    mapping: Path | None = None
-    """Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import --suggest
-    writes, if it leaves nothing to decide)."""
+    mapping: MappingFile = None
     compare: bool = False
     """Overlay two episodes: the same streams in the same views, and the distance between them."""
     episodes: str = ""

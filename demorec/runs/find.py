@@ -55,7 +55,8 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
 """What each kind is called, and what to do where it was not expected."""
 ROSBAG2 = "metadata.yaml"
 """In a folder that is a bag of rosbag2."""
-_BAG_SUFFIXES = (".db3", ".mcap.zstd", ".db3.zstd")
+BAG_SUFFIXES = (".db3", ".mcap.zstd", ".db3.zstd")
+"""Of files that are bags, beside .mcap, which may be a recording."""
 OUR_METADATA = b"demorec."
 """How the names of our recordings' metadata begin."""
 _HEAD_BYTES = 1 << 16
@@ -171,7 +172,7 @@ def expect_recordings(found: Found, files: Sequence[Path]) -> None:
 def _file(path: Path) -> Found:
     with open_regular(path) as file:
         head = file.read(max(len(magic) for magic, _ in _MAGICS))
-        kind: PathKind | None = "rosbag" if path.name.endswith(_BAG_SUFFIXES) else _SUFFIXES.get(path.suffix)
+        kind: PathKind | None = "rosbag" if path.name.endswith(BAG_SUFFIXES) else _SUFFIXES.get(path.suffix)
         if kind != "unfinished":
             kind = next((kind for magic, kind in _MAGICS if head.startswith(magic)), kind)
         if kind == "recording" and _is_foreign(file):
@@ -226,7 +227,7 @@ def _holds_bags(path: Path, recordings: Sequence[Path]) -> bool:
         with suppress(OSError, ValueError), open_regular(recordings[0]) as file:
             return _is_foreign(file)
         return False
-    return any(entry.name.endswith(_BAG_SUFFIXES) or _is_there(entry / ROSBAG2) for entry in _entries(path))
+    return any(entry.name.endswith(BAG_SUFFIXES) or _is_there(entry / ROSBAG2) for entry in _entries(path))
 
 
 def _is_there(path: Path) -> bool:

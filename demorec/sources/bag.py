@@ -22,12 +22,12 @@ from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.scan import ScannedMessage
+from demorec.runs.find import BAG_SUFFIXES, ROSBAG2
 from demorec.runs.run_file import sha256_of
 from demorec.sources.bag_files import MAX_TIME_NS, SQLITE_MAGIC, BagError, read_mcap, read_sqlite
 from demorec.sources.words import in_natural_order
 
-METADATA = "metadata.yaml"
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_SUFFIXES = (".mcap", *BAG_SUFFIXES)
 """Of files that a folder of bags holds; what else lies in it is nobody's bag."""
 _MAX_METADATA_BYTES = 16 << 20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -116,13 +116,13 @@ def bags_in(path: Path) -> list[Path]:
     They are rosbag2 folders, MCAP and .db3 files, and those files in folders in it whose metadata.yaml was lost. A
     folder that holds none of them is given back itself.
     """
-    if not path.is_dir() or os.path.lexists(path / METADATA) or (path / INFO_PATH).is_file():
+    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or (path / INFO_PATH).is_file():
         return [path]
     found: list[Path] = []
     for entry in _entries(path):
         if not entry.is_dir():
             found += [entry] if entry.name.endswith(_SUFFIXES) else []
-        elif os.path.lexists(entry / METADATA):
+        elif os.path.lexists(entry / ROSBAG2):
             found.append(entry)
         else:
             found += [file for file in _entries(entry) if file.name.endswith(_SUFFIXES)]
@@ -184,11 +184,9 @@ def _kind_of(path: Path) -> bytes:
 
 def _folder(path: Path) -> Bag:
     try:
-        if (path / METADATA).is_symlink():
-            _refuse_link(path / METADATA)
-        information = _plain_yaml(read_text_limited(path / METADATA, _MAX_METADATA_BYTES))[
-            "rosbag2_bagfile_information"
-        ]
+        if (path / ROSBAG2).is_symlink():
+            _refuse_link(path / ROSBAG2)
+        information = _plain_yaml(read_text_limited(path / ROSBAG2, _MAX_METADATA_BYTES))["rosbag2_bagfile_information"]
         names = [PurePath(str(name)).name for name in information["relative_file_paths"]]
         mode = str(information.get("compression_mode") or "").lower()
         compression = str(information.get("compression_format") or "")
@@ -198,18 +196,18 @@ def _folder(path: Path) -> Bag:
                 f"This is a LeRobot dataset, no bag: demorec import lerobot {path} --out RUN makes a run of it: {path}"
             ) from None
         raise BagError(
-            f"The folder holds no {METADATA}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
+            f"The folder holds no {ROSBAG2}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
             f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"
         ) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f" ({error})" if isinstance(error, LimitError) else ""
-        raise resource_error(error, path) or BagError(f"The bag's {METADATA} cannot be read{reason}: {path}") from error
+        raise resource_error(error, path) or BagError(f"The bag's {ROSBAG2} cannot be read{reason}: {path}") from error
     if mode not in ("", "none") and compression != "zstd":
         raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is read: {path}")
     if not names:
-        raise BagError(f"The bag's {METADATA} names no files: {path}")
+        raise BagError(f"The bag's {ROSBAG2} names no files: {path}")
     if len(names) > _MAX_FILES or len(set(names)) < len(names):
-        raise BagError(f"The bag's {METADATA} names a file twice, or more than {_MAX_FILES:,}: {path}")
+        raise BagError(f"The bag's {ROSBAG2} names a file twice, or more than {_MAX_FILES:,}: {path}")
     files = tuple(path / name for name in names)
     if missing := [file.name for file in files if not os.path.lexists(file)]:
         raise BagError(f"The bag lacks its file {missing[0][:80]}: {path}")

@@ -22,7 +22,7 @@ from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction, arg
 from tyro.constructors import (
     MISSING_NONPROP,
     ConstructorRegistry,
@@ -192,6 +192,19 @@ def _kind_beside_none(kind: Any) -> Any:
 
 Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_behavior_hint="(may be given again)")]
 """One module or package each time, since paths may follow."""
+
+
+Readable = Annotated[
+    Positional[tuple[Path, ...]],
+    arg(help="Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."),
+]
+MappingFile = Annotated[
+    Path | None,
+    arg(
+        help="Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import "
+        "--suggest writes, if it leaves nothing to decide)."
+    ),
+]
 
 
 def allowed_modules(names: tuple[str, ...]) -> tuple[str, ...]:
