@@ -1,0 +1,76 @@
+"""What a fixed camera shows in the episodes of a dataset, on made-up views: a room, and a thing that lies elsewhere."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from demorec.check.base import Measurement
+from demorec.check.films import Film
+from demorec.check.views import views_alike, views_stay
+
+Views = NDArray[np.float64]
+
+
+def room(count: int, seed: int) -> Views:
+    """(N, 28, 28, 3) views of the same soft shapes, with a dark square at another place in each."""
+    rng = np.random.default_rng(seed)
+    walls = 60 + 120 * ndimage.zoom(rng.random((7, 7, 3)), (4, 4, 1), order=1)
+    views = np.repeat(walls[None], count, axis=0)
+    for view in views:
+        row, column = rng.integers(4, 20, 2)
+        view[row : row + 4, column : column + 4] = 30
+    return views
+
+
+def values(law: Any, views: Views) -> list[float]:
+    """What a law finds in a dataset whose films show these views, ten images each."""
+    films = [
+        Film(
+            where=f"front, episode {number}",
+            fps=10,
+            cells=np.repeat(np.rint(view)[None], 10, axis=0).astype(np.uint8),
+            detail=np.ones(10),
+            frames=np.arange(10),
+            state=None,
+        )
+        for number, view in enumerate(views)
+    ]
+    rows = [{"task_index": np.zeros(10, dtype=np.int64)}] * len(films)
+    found = law.measure(SimpleNamespace(films={"front": films}, rows=rows))
+    found = [found] if isinstance(found, Measurement) else list(found)
+    return [each.value for each in found]
+
+
+def moved(views: Views, parts: float) -> Views:
+    return np.asarray(ndimage.shift(views, (0, parts, 0, 0), order=1, mode="nearest"))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_camera_that_was_nudged_between_two_sessions(seed: int) -> None:
+    """By half a 28th of the image's height."""
+    views = room(12, seed)
+    assert max(values(views_stay, views)) < 3
+    assert max(values(views_stay, np.concatenate([views[:6], moved(views[6:], 0.5)]))) > 3.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_another_light_moves_no_edges(seed: int) -> None:
+    views = room(12, seed)
+    assert max(values(views_stay, np.concatenate([views[:6], 0.98 * views[6:]]))) < 3.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_camera_that_was_nudged_before_one_episode(seed: int) -> None:
+    views = room(8, seed)
+    assert values(views_alike, views) == [0]
+    assert values(views_alike, np.concatenate([views[:3], moved(views[3:4], 0.5), views[4:]])) == [1]
+
+
+def test_images_of_a_single_row_of_parts_have_no_edges() -> None:
+    assert values(views_alike, room(8, 0)[:, :1]) == [0]
