@@ -24,6 +24,7 @@ from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.datasets.lerobot.language import SpokenEpisode
 from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
+from demorec.episode.features import EE_POSE
 from demorec.episode.info import EpisodeInfo
 
 Row = dict[str, Any]
@@ -31,6 +32,10 @@ _ABOUT_IMAGES = ("vqa", "trace")
 _EVENTS = {*_ABOUT_IMAGES, "interjection", None}
 _WORD, _FEWEST_WORDS = re.compile(r"[^\W\d_]{2,}"), 2
 _ROLES = ("user", "assistant", "system", "tool")
+_ROLE_OF = {"task_aug": "user", "subtask": "assistant", "plan": "assistant", "memory": "assistant"}
+"""As lerobot-annotate writes them; LeRobot's trainings leave wordings of others than the user out."""
+_GOES_M = 0.02
+"""How far a hand goes that is said to move up or down."""
 
 
 @dataset_check(
@@ -45,6 +50,7 @@ def dataset_language(dataset: Dataset) -> Measurement | None:
         for number, episode in enumerate(dataset.spoken)
         for text in _malformed(dataset, episode)
     ]
+    wrong += _wrong_motions(dataset)
     entries = sum(len(episode.persistent) + sum(map(len, episode.events.values())) for episode in dataset.spoken)
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{entries} entries")
 
@@ -62,6 +68,23 @@ def dataset_instructions(dataset: Dataset) -> Measurement:
     wrong = [text for text in dataset.tasks if text.isascii() and len(_WORD.findall(text)) < _FEWEST_WORDS]
     wrong += [text for number, text in enumerate(dataset.tasks) if text in dataset.tasks[:number]]
     return Measurement(value=len(wrong), detail="; ".join(map(repr, wrong[:3])) or f"{len(dataset.tasks)} tasks")
+
+
+def _wrong_motions(dataset: Dataset) -> Iterator[str]:
+    """Motions that say up or down, and a hand that mostly goes the other way."""
+    ways = []
+    for rows, episode in zip(dataset.rows, dataset.spoken, strict=True):
+        motions = [row for row in episode.persistent if row.get("style") == "motion"] if EE_POSE in rows else []
+        begins = sorted(round(row["timestamp"] * dataset.info.fps) for row in motions)
+        for row in motions:
+            said = {"up", "down"} & set(_WORD.findall(str(row.get("content")).lower()))
+            first = round(row["timestamp"] * dataset.info.fps)
+            last = min([begin for begin in begins if begin > first], default=len(rows[EE_POSE])) - 1
+            if len(said) == 1 and 0 <= first < last:
+                up = float(rows[EE_POSE][last, 2] - rows[EE_POSE][first, 2])
+                ways += [up if said == {"up"} else -up] if abs(up) > _GOES_M else []
+    if sum(way < 0 for way in ways) > max(len(ways) / 2, 2):
+        yield "motions say up where the hand goes down, and down where it goes up"
 
 
 def _malformed(dataset: Dataset, episode: SpokenEpisode) -> Iterator[str]:
@@ -92,10 +115,8 @@ def _entry_faults(row: Row, styles: set[Any], dataset: Dataset) -> Iterator[str]
     style, camera = row.get("style"), row.get("camera")
     if style not in styles:
         yield f"{style!r} stands in the wrong column, or is no style"
-    if row.get("role") not in _ROLES:
+    if row.get("role") not in _ROLES or row.get("role") != _ROLE_OF.get(str(style), row.get("role")):
         yield f"a {style} by {row.get('role')!r}"
-    if style == "task_aug" and row.get("role") != "user":
-        yield "a wording that is not the user's, which LeRobot leaves out"
     if not (row.get("content") or row.get("tool_calls")):
         yield f"a {style} that says nothing"
     if style in _ABOUT_IMAGES and camera not in dataset.info.video_keys:

@@ -14,8 +14,10 @@ from functools import partial
 import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.cells import correlation
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.evidence import Flags, Motion, is_gripper, quaternion_places
+from demorec.check.motion import MOVES
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE
@@ -35,6 +37,8 @@ _TARGET = 0.65
 is a target: of targets 0.84 to 0.99, of increments 0.15 to 0.47."""
 _CARTESIAN = re.compile(r"(^|[._])d?(x|y|z|[rq]?[xyzw]|roll|pitch|yaw)$")
 """Names of elements whose increments may be told in another frame than the pose."""
+_SAME = 0.5
+"""Correlation below which two courses are not of one thing."""
 _REACH_S = 1.0
 _LATEST_S = 0.35
 """How far behind its action a motion may be, seconds: as for states that follow targets."""
@@ -253,6 +257,48 @@ def offsets_alike(dataset: Dataset) -> Found:
             off = np.abs(means[:, element] - np.median(means[:, element])) / spread[element]
             name = motions[0].names[element]
             wrong += [f"{name}, {motions[row].where}" for row in np.flatnonzero(far_off(off, _OFFSET))]
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+
+
+@likeness_check(
+    group="alignment",
+    measures="joints whose action is called a position, as their state is, where no action is a target of the state",
+    warn=0,
+    fail=math.inf,
+)
+def targets_as_named(dataset: Dataset) -> Found:
+    """What state and action call joint.pos is a position in both: catches increments and speeds of that name."""
+    named = [name for name in _names(dataset, ACTION) if name.endswith(".pos") and name in _names(dataset, STATE)]
+    if not named or not dataset.motions.moving.any():
+        return NotMeasured(why="no joint that moves is called a position (.pos) in state and action")
+    wrong = [] if dataset.motions.targets else named
+    return Measurement(value=len(wrong), detail=", ".join(wrong[:3]))
+
+
+@check(
+    group="alignment",
+    on=("dataset",),
+    needs="an element that two observations have",
+    measures="elements of one name that go their own ways in two observations",
+    warn=0,
+    fail=math.inf,
+)
+def same_by_name(dataset: Dataset) -> Found:
+    """What two observations call by one name (tcp.x) goes the same way in both, in any unit: catches one that is of
+    another episode, very late, or frozen. Names without a thing (x) may mean several."""
+    places: dict[str, list[tuple[str, int]]] = {}
+    for feature, described in dataset.info.features.items():
+        if feature.startswith("observation.") and described.is_numeric:
+            for number, name in enumerate(described.names or ()):
+                places.setdefault(name, []).append((feature, number))
+    twice = {name: found[:2] for name, found in places.items() if "." in name and len(found) > 1}
+    if not twice:
+        return Lacking(need="an element that two observations have")
+    wrong = []
+    for name, ((one, i), (other, k)) in twice.items():
+        a, b = (np.concatenate([rows[f][:, n] for rows in dataset.rows]) for f, n in ((one, i), (other, k)))
+        if max(np.ptp(a), np.ptp(b)) > MOVES and abs(correlation(a, b)) < _SAME:
+            wrong.append(f"{name} of {one} and {other}")
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
 
 

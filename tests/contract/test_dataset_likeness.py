@@ -19,9 +19,10 @@ from support.export import export
 
 Fault = Callable[[Path], None]
 Images = NDArray[Any]
+WORLD = "observation.environment_state"
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
-    "mounts_alike", "encoder_steps", "quaternions_keep_sign", "duplicates", "effort_lag",
+    "mounts_alike", "encoder_steps", "quaternions_keep_sign", "duplicates", "effort_lag", "same_by_name",
 )  # fmt: skip
 
 
@@ -30,8 +31,8 @@ def increments(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four episodes of increments, nothing of demorec beside them."""
     folder = tmp_path_factory.mktemp("likeness")
     run = simulate_run(folder / "run", 4, seed=3, fps=10, cameras=())
-    features = [f"observation.{name}" for name in ("velocity", "effort", "ee_pose")]
-    export(run, folder / "dataset", action="joint_increment", features=(*features, "next.done"))
+    features = tuple(f"observation.{name}" for name in ("velocity", "effort", "ee_pose", "environment_state"))
+    export(run, folder / "dataset", action="joint_increment", features=(*features, "next.done"), privileged=True)
     shutil.rmtree(folder / "dataset" / "demorec")
     return folder / "dataset"
 
@@ -80,6 +81,10 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
     "torques four frames late": (
         numbers("observation.effort", lambda rows: late(rows, 4)), "effort_lag", "warn"
     ),
+    "objects of another episode": (
+        lambda dataset: loose.put_rows(dataset, WORLD, loose.rows_of(dataset, WORLD)[::-1]), "same_by_name", "warn"
+    ),
+    "objects that never move": (numbers(WORLD, lambda rows: 0 * rows + rows[:1]), "same_by_name", "warn"),
     "a zero that is moved in one episode": (
         numbers("observation.state", lambda rows: rows + 0.1 * (np.arange(8) == 1), only=(2,)), "mounts_alike", "warn"
     ),
@@ -136,6 +141,7 @@ VIEWS = (
     "stale_images",
     "interpolated_images",
     "offsets_alike",
+    "targets_as_named",
 )
 FAILS = ("images_stay_upright", "exchanged_cameras", "distinct_cameras", "dataset_image_statistics")
 
@@ -170,6 +176,9 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
         film(FRONT, lambda r: np.roll(r, 24, axis=1), only=range(5, 10)), "views_stay"
     ),
     "a gain in one episode": (film(FRONT, pixels(lambda r: 0.7 * r)), "views_alike"),
+    "increments that are called positions": (
+        numbers("action", lambda r: np.diff(r, axis=0, prepend=r[:1])), "targets_as_named"
+    ),
     "a leader that drifts in one episode": (
         numbers("action", lambda r: r + np.linspace(0, 0.6, len(r))[:, None] * (np.arange(6) == 1), only=(1,)),
         "offsets_alike",

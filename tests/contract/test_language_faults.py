@@ -117,6 +117,14 @@ def drop_first_subtask(episode: Episode) -> None:
         persistent.remove(next(row for row in persistent if row["style"] == "subtask"))
 
 
+def turned_round(episode: Episode) -> None:
+    """All motions say up for down, and down for up."""
+    for persistent, _ in episode:
+        for row in persistent:
+            if row["style"] == "motion":
+                row["content"] = row["content"].replace("up", "UP").replace("down", "up").replace("UP", "down")
+
+
 def of(**values: Any) -> Callable[[Row], None]:
     return lambda row: row.update(values)
 
@@ -146,6 +154,8 @@ FAULTS: dict[str, tuple[str, Callable[[Episode], None]]] = {
     "a time between two frames": ("dataset_language", everywhere("plan", of(timestamp=0.05))),
     "a camera that is none": ("dataset_language", first_event(of(camera="observation.images.back"))),
     "no camera": ("dataset_language", first_event(of(camera=None), "trace")),
+    "motions of the other direction": ("dataset_language", turned_round),
+    "a subtask of the user's": ("dataset_language", everywhere("subtask", of(role="user"))),
     "a wording of the robot's": ("dataset_language", everywhere("task_aug", of(role="assistant"))),
     "a subtask about a camera": ("dataset_language", everywhere("subtask", of(camera=CAMERA))),
     "an unknown style": ("dataset_language", everywhere("motion", of(style="dance"))),
