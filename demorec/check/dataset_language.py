@@ -34,6 +34,7 @@ _WORD, _FEWEST_WORDS = re.compile(r"[^\W\d_]{2,}"), 2
 _ROLES = ("user", "assistant", "system", "tool")
 _ROLE_OF = {"task_aug": "user", "subtask": "assistant", "plan": "assistant", "memory": "assistant"}
 """As lerobot-annotate writes them; LeRobot's trainings leave wordings of others than the user out."""
+_STEPS, _LONG_WORD = re.compile(r"^\s*2[.)]", re.MULTILINE), re.compile(r"[^\W\d_]{4,}")
 _GOES_M = 0.02
 """How far a hand goes that is said to move up or down."""
 
@@ -50,7 +51,7 @@ def dataset_language(dataset: Dataset) -> Measurement | None:
         for number, episode in enumerate(dataset.spoken)
         for text in _malformed(dataset, episode)
     ]
-    wrong += _wrong_motions(dataset)
+    wrong += [*_wrong_motions(dataset), *_wrong_plans(dataset)]
     entries = sum(len(episode.persistent) + sum(map(len, episode.events.values())) for episode in dataset.spoken)
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{entries} entries")
 
@@ -85,6 +86,24 @@ def _wrong_motions(dataset: Dataset) -> Iterator[str]:
                 ways += [up if said == {"up"} else -up] if abs(up) > _GOES_M else []
     if sum(way < 0 for way in ways) > max(len(ways) / 2, 2):
         yield "motions say up where the hand goes down, and down where it goes up"
+
+
+def _wrong_plans(dataset: Dataset) -> Iterator[str]:
+    """Plans, and the subtasks that they are plans of."""
+    said = [{style: _said(episode, style) for style in ("plan", "subtask")} for episode in dataset.spoken]
+    both = [texts for texts in said if all(texts.values())]
+    if both and all(len(texts["subtask"]) == 1 for texts in both) and any(_STEPS.search(t["plan"][0]) for t in both):
+        yield "plans have several steps, and no episode has a second subtask"
+    words = [[set(_LONG_WORD.findall(" ".join(said).lower())) for said in texts.values()] for texts in both]
+    # Other scripts than Latin have no spaces between words.
+    is_latin = all(text.isascii() for texts in both for said in texts.values() for text in said)
+    if is_latin and sum(not plan & subtasks for plan, subtasks in words) > max(len(both) / 2, 2):
+        yield "plans have no word in common with the subtasks"
+
+
+def _said(episode: SpokenEpisode, style: str) -> list[str]:
+    """Texts of a style."""
+    return [str(row.get("content")) for row in episode.persistent if row.get("style") == style]
 
 
 def _malformed(dataset: Dataset, episode: SpokenEpisode) -> Iterator[str]:

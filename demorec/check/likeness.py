@@ -45,6 +45,8 @@ _LATEST_S = 0.35
 
 _END_S = 0.15
 """How long the first and last moments of an episode are, seconds."""
+_LONG_S = 0.5
+"""What counts of a second in which nothing changes: 0.2 s are usual then, and one is not."""
 _MOST, _ALIKE, _OTHER, _RARE = 0.7, 0.1, 0.5, 0.05
 """Share of the episodes that are alike, how alike (in deviations of the opening, and shares of the mean speed), how far
 one is off that is not, and the share of those that are not from which on it is another way to do it."""
@@ -320,13 +322,13 @@ def _told_by_states(found: _Scaled) -> Array:
     group="alignment",
     on=("dataset",),
     needs=STATE_ALONE,
-    measures="episodes that alone begin or end in the middle of a motion, or with another opening of the gripper",
+    measures="episodes that alone begin or end in the middle of a motion, with another opening, or standing still",
     warn=0,
     fail=math.inf,
 )
 def whole_episodes(dataset: Dataset) -> Found:
     """An episode begins and ends as the others do, if these are alike, and some of its own instruction among them:
-    catches recordings that were cut off, halves of episodes, and two in one."""
+    catches recordings that were cut off, halves of episodes, two in one, and ends that were filled up."""
     long = [
         (motion, int(rows["task_index"].reshape(-1)[0]))
         for motion, rows in zip(dataset.motions.all, dataset.rows, strict=False)
@@ -340,6 +342,7 @@ def whole_episodes(dataset: Dataset) -> Found:
     for word, row in (("begins", 0), ("ends", -1)):
         speeds = np.array([_speed_at(motion, row, spread) for motion in motions])
         told = {"in the middle of a motion": speeds}
+        told["with one and the same row for long"] = _LONG_S * np.array([_stays_at(motion, row) for motion in motions])
         if gripper is not None:
             opening = np.array([motion.state[row, gripper] / spread[gripper] for motion in motions])
             told["with another opening"] = np.abs(opening - np.median(opening))
@@ -357,6 +360,13 @@ def _speed_at(motion: Motion, row: int, spread: Array) -> float:
     speed = np.linalg.norm(np.diff(arm, axis=0), axis=1)
     few = max(1, round(_END_S * motion.fps))
     return float(speed[row * few :][:few].mean() / max(float(np.sqrt((speed**2).mean())), 1e-9))
+
+
+def _stays_at(motion: Motion, row: int) -> float:
+    """How long, seconds, state and action are those of the first row, or the last one, to the last bit."""
+    rows = motion.state if motion.action is None else np.column_stack([motion.state, motion.action])
+    differ = ((rows != rows[row]) & ~np.isnan(rows)).any(axis=1)[:: 1 if row == 0 else -1]
+    return (int(np.argmax(differ)) if differ.any() else len(rows)) / motion.fps
 
 
 def far_off(off: Array, least: float) -> Flags:

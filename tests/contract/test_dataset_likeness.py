@@ -52,6 +52,11 @@ def without_a_second(dataset: Path) -> None:
     loose.reframe(dataset, [parts[0], np.delete(parts[1], range(29, 39)), *parts[2:]])
 
 
+def filled_up(dataset: Path) -> None:
+    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
+    loose.reframe(dataset, [parts[0], np.concatenate([np.repeat(parts[1][:1], 20), parts[1]]), *parts[2:]])
+
+
 def twice(dataset: Path) -> None:
     parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
     loose.reframe(dataset, [parts[0], parts[0][:-1], *parts[2:]])
@@ -99,6 +104,7 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
         "quaternions_keep_sign",
         "warn",
     ),
+    "an episode that was filled up in front": (filled_up, "whole_episodes", "warn"),
     "an episode that was cut off": (cut_off, "whole_episodes", "warn"),
     "an episode twice, once without its last row": (twice, "duplicates", "fail"),
     "a piece of an episode twice": (with_a_piece_twice, "duplicates", "fail"),

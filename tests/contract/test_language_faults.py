@@ -125,6 +125,12 @@ def turned_round(episode: Episode) -> None:
                 row["content"] = row["content"].replace("up", "UP").replace("down", "up").replace("UP", "down")
 
 
+def only_first_subtask(episode: Episode) -> None:
+    for persistent, _ in episode:
+        subtasks = [row for row in persistent if row["style"] == "subtask"]
+        persistent[:] = [row for row in persistent if row not in subtasks[1:]]
+
+
 def of(**values: Any) -> Callable[[Row], None]:
     return lambda row: row.update(values)
 
@@ -155,6 +161,7 @@ FAULTS: dict[str, tuple[str, Callable[[Episode], None]]] = {
     "a camera that is none": ("dataset_language", first_event(of(camera="observation.images.back"))),
     "no camera": ("dataset_language", first_event(of(camera=None), "trace")),
     "motions of the other direction": ("dataset_language", turned_round),
+    "no subtask but the first": ("dataset_language", only_first_subtask),
     "a subtask of the user's": ("dataset_language", everywhere("subtask", of(role="user"))),
     "a wording of the robot's": ("dataset_language", everywhere("task_aug", of(role="assistant"))),
     "a subtask about a camera": ("dataset_language", everywhere("subtask", of(camera=CAMERA))),
@@ -181,6 +188,14 @@ def test_a_fault_in_the_words_is_found(name: str, dataset: Path) -> None:
     spoil(dataset, change)
     assert level_of(dataset, check, "dataset") == "fail"
     assert level_of(dataset, "dataset_sidecar", "dataset") == "fail"  # the content digest
+
+
+def test_plans_of_another_task(tmp_path: Path) -> None:
+    run = simulate_run(tmp_path / "run", 3, seed=5, fps=10)
+    export(run, tmp_path / "dataset", language=("subtask", "plan"))
+    assert level_of(tmp_path / "dataset", "dataset_language", "dataset") == "pass"
+    spoil(tmp_path / "dataset", everywhere("plan", of(content="1. fold a towel")))
+    assert level_of(tmp_path / "dataset", "dataset_language", "dataset") == "fail"
 
 
 @pytest.mark.parametrize(
