@@ -24,7 +24,6 @@ from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.datasets.lerobot.language import SpokenEpisode
 from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
-from demorec.episode.features import EE_POSE
 from demorec.episode.info import EpisodeInfo
 
 Row = dict[str, Any]
@@ -74,16 +73,20 @@ def dataset_instructions(dataset: Dataset) -> Measurement:
 def _wrong_motions(dataset: Dataset) -> Iterator[str]:
     """Motions that say up or down, and a hand that mostly goes the other way."""
     ways = []
-    for rows, episode in zip(dataset.rows, dataset.spoken, strict=True):
-        motions = [row for row in episode.persistent if row.get("style") == "motion"] if EE_POSE in rows else []
-        begins = sorted(round(row["timestamp"] * dataset.info.fps) for row in motions)
-        for row in motions:
-            said = {"up", "down"} & set(_WORD.findall(str(row.get("content")).lower()))
-            first = round(row["timestamp"] * dataset.info.fps)
-            last = min([begin for begin in begins if begin > first], default=len(rows[EE_POSE])) - 1
-            if len(said) == 1 and 0 <= first < last:
-                up = float(rows[EE_POSE][last, 2] - rows[EE_POSE][first, 2])
-                ways += [up if said == {"up"} else -up] if abs(up) > _GOES_M else []
+    for motion, episode in zip(dataset.motions.all, dataset.spoken, strict=False):
+        if motion.ee_pose is None:
+            return
+        height = motion.ee_pose[:, 2]
+        times = (np.arange(len(height)) / dataset.info.fps).astype(np.float32).tolist()
+        said = [row for row in episode.persistent if row.get("style") == "motion" and row.get("timestamp") in times]
+        begins = sorted(times.index(row["timestamp"]) for row in said)
+        for row in said:
+            words = {"up", "down"} & set(_WORD.findall(str(row.get("content")).lower()))
+            first = times.index(row["timestamp"])
+            last = min([begin for begin in begins if begin > first], default=len(height)) - 1
+            if len(words) == 1 and first < last:
+                up = float(height[last] - height[first])
+                ways += [up if words == {"up"} else -up] if abs(up) > _GOES_M else []
     if sum(way < 0 for way in ways) > max(len(ways) / 2, 2):
         yield "motions say up where the hand goes down, and down where it goes up"
 

@@ -225,7 +225,10 @@ def motion_follows_action(dataset: Dataset) -> Found:
 
 
 def _names(dataset: Dataset, feature: str) -> Sequence[str]:
-    return dataset.info.features[feature].names or ()
+    """Of the elements of a feature; none where it is not there, or names something else."""
+    described = dataset.info.features.get(feature)
+    names = () if described is None else described.names or ()
+    return names if described is not None and described.shape == (len(names),) else ()
 
 
 def _same_joints(dataset: Dataset) -> Iterator[tuple[int, int]]:
@@ -291,7 +294,7 @@ def same_by_name(dataset: Dataset) -> Found:
     places: dict[str, list[tuple[str, int]]] = {}
     for feature, described in dataset.info.features.items():
         if feature.startswith("observation.") and described.is_numeric:
-            for number, name in enumerate(described.names or ()):
+            for number, name in enumerate(_names(dataset, feature)):
                 places.setdefault(name, []).append((feature, number))
     twice = {name: found[:2] for name, found in places.items() if "." in name and len(found) > 1}
     if not twice:
