@@ -21,7 +21,7 @@ from demorec.core.errors import ExportError, MissingDependencyError, ResourceErr
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.layout import EPISODES_PATH, TASKS_PATH, VIDEO_PATH
+from demorec.datasets.lerobot.layout import TASKS_PATH, VIDEO_PATH
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
 
@@ -76,22 +76,13 @@ def dataset_counts(dataset: Dataset) -> Measurement:
 
 
 def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
-    """Where the episodes' table says that things are: rows of the dataset, seconds of each video, and itself: LeRobot
-    goes on with the file after the one that the last row names."""
-    own = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
+    """Where the episodes' table says that things are: rows of the dataset, and seconds of each video."""
     ends = [f"videos/{key}/to_timestamp" for key in dataset.info.video_keys]
     for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
         columns = open_table(path).schema_arrow.names
         names = [name for name in ("dataset_to_index", *ends) if name in columns]
         begins = [name.replace("to_", "from_") for name in names]
-        places = own if set(own) <= set(columns) else []
-        for row in read_table(path, ["episode_index", "length", *names, *begins, *places]).to_pylist():
-            if (
-                places
-                and EPISODES_PATH.format(chunk_index=row[own[0]], file_index=row[own[1]])
-                != path.relative_to(dataset.path).as_posix()
-            ):
-                yield f"the file of the row of episode {row['episode_index']}"
+        for row in read_table(path, ["episode_index", "length", *names, *begins]).to_pylist():
             for begin, end in zip(begins, names, strict=True):
                 unit = 1 if end == "dataset_to_index" else dataset.info.fps
                 if not abs((row[end] - row[begin]) * unit - row["length"]) < 0.5:

@@ -100,7 +100,7 @@ def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
     """An object moves or turns only when touched, or for a moment after it (falling, rolling, tipping). What lies still
     is woken by a force on the fingers, also in the hand's reach, or by another object.
 
-    0.1 m/s are counted for each rad/s. Over a thirtieth of a second at least: meshes at rest twitch, and lie again.
+    0.1 m/s are counted for each rad/s. Of meshes over a thirtieth of a second at least: at rest they twitch.
     """
     fps, force = episode.info.fps, episode.columns.contact_force
     speeds = {
@@ -110,11 +110,12 @@ def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
     quiet = np.zeros(max(len(force) - 1, 0), dtype=np.bool_)  # in the frames before and after a step and around these
     quiet[1:-1] = np.max([force[:-3], force[1:-2], force[2:-1], force[3:]], axis=0) == 0 if len(force) > 3 else False
     moving = {name: speed > _LIES for name, speed in speeds.items()}
-    lain, span = max(3, round(_LAIN_SECONDS * fps)), max(1, round(fps / 30))
+    lain, shapes = max(3, round(_LAIN_SECONDS * fps)), {b.name: b.shape.kind for b in episode.info.scene.movable}
     for name, touched in _touched(episode).items():
         lies = np.zeros_like(quiet)
         lies[lain:] = ~held_for(moving[name], lain - 1)[lain - 1 : -1]
         asleep = lies & quiet & ~np.any([rows for other, rows in moving.items() if other != name] or [~quiet], axis=0)
+        span = 1 if shapes[name] in SOLID else max(1, round(fps / 30))
         free, count = ~touched | asleep, max(len(touched) - span + 1, 0)
         pose = episode.world_from_object(name)
         speed = displacement(pose[span:], pose[:-span]) * fps / span

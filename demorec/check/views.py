@@ -12,6 +12,7 @@ from demorec.check.base import Found, Measurement, NotMeasured, image_check
 from demorec.check.dataset import Dataset
 from demorec.check.films import Film, turned
 from demorec.check.likeness import FEWEST_TO_COMPARE, far_off
+from demorec.check.motion import FEWEST
 from demorec.core.geometry import Array
 
 _ALIKE_PARTS = 0.95
@@ -57,8 +58,9 @@ def _edges_off(view: Array, usual: Array) -> float:
 
 
 def _show_edges(films: Sequence[Film]) -> bool:
-    """Whether they are of a camera that stands, and of more than one part in each direction."""
-    return 2 * sum(film.stands for film in films) > len(films) and min(films[0].cells.shape[1:3]) > 1
+    """Whether they are of a camera that stands, as far as films of some length tell, and have parts side by side."""
+    stand = sum(len(film.cells) >= FEWEST and film.stands for film in films)
+    return 2 * stand > len(films) and min(films[0].cells.shape[1:3]) > 1
 
 
 def _instructions(dataset: Dataset) -> Array:

@@ -173,9 +173,6 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "episodes that are never done": (
         lambda dataset: edit_column(dataset, "next.done", np.zeros_like), "dataset_counts"
     ),
-    "a table of episodes in another file": (
-        value_of("meta/episodes/file_index", 1, 9, "meta/episodes"), "dataset_counts"
-    ),
     "a reward without a success": (value_of("next.reward", 10, 1.0), "dataset_counts"),
     "a depth map of three channels": (
         of_info(lambda d: d["features"][CAMERA]["info"].update(is_depth_map=True)), "dataset_schema"

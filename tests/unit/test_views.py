@@ -29,19 +29,19 @@ def room(count: int, seed: int) -> Views:
 
 
 def values(law: Any, views: Views) -> list[float]:
-    """What a law finds in a dataset whose films show these views, ten images each."""
+    """What a law finds in a dataset whose films show these views, 30 images each."""
     films = [
         Film(
             where=f"front, episode {number}",
             fps=10,
-            cells=np.repeat(np.rint(view)[None], 10, axis=0).astype(np.uint8),
-            detail=np.ones(10),
-            frames=np.arange(10),
+            cells=np.repeat(np.rint(view)[None], 30, axis=0).astype(np.uint8),
+            detail=np.ones(30),
+            frames=np.arange(30),
             state=None,
         )
         for number, view in enumerate(views)
     ]
-    rows = [{"task_index": np.zeros(10, dtype=np.int64)}] * len(films)
+    rows = [{"task_index": np.zeros(30, dtype=np.int64)}] * len(films)
     found = law.measure(SimpleNamespace(films={"front": films}, rows=rows))
     found = [found] if isinstance(found, Measurement) else list(found)
     return [each.value for each in found]
