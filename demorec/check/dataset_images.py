@@ -114,8 +114,8 @@ def dataset_images_as_drawn(dataset: Dataset) -> Iterator[Found]:
 
 @drawn_check(
     measures="lag between an episode's first images and its states, frames",
-    warn=0.4,
-    fail=0.7,
+    warn=0.73,
+    fail=0.85,
 )
 def dataset_image_lag(dataset: Dataset) -> Iterator[Found]:
     """Image t shows state t, in each episode and camera, until the fingers close, for 3 s at most."""

@@ -217,9 +217,11 @@ def motion_follows_action(dataset: Dataset) -> Found:
     if not len(clear):
         return NotMeasured(why="the actions do not go with the states' motion")
     lag = float(np.median([finest_lag(lags, (-told[:, element]).tolist()) for element in clear]))
+    soon = slice(reach, reach + max(2, round(_LATEST_S * fps)))
     for joint, state in _same_joints(dataset):
         size_of = math.sqrt(max(float(square[state, state] * all_of[joint]), 1e-9))
-        if float(products[int(np.argmax(told[:, joint])), state, joint]) / size_of < -_CLEAR:
+        goes = products[soon, state, joint] / size_of
+        if goes.min() < -_CLEAR and goes.max() < _CLEAR / 2:  # noise that is taken back goes both ways
             return Measurement(value=math.inf, detail=f"{_names(dataset, ACTION)[joint]} moves it the other way")
     return Measurement(value=max(-lag, lag - _LATEST_S * fps, 0.0), detail=f"the states follow by {lag:+.2f} frames")
 

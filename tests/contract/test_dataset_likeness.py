@@ -239,6 +239,13 @@ def test_views_of_different_instructions_are_not_compared(filmed: Path, tmp_path
     assert [level_of(dataset, law, "dataset") for law in ("views_alike", "views_stay")] == ["skip", "skip"]
 
 
+def test_a_joint_that_only_trembles_does_not_move_the_other_way(tmp_path: Path) -> None:
+    """Its increments take back the noise of the frame before."""
+    run = simulate_run(tmp_path / "run", 3, task="tutorial", robot="iiwa", variation="mild", seed=654866, fps=15)
+    export(run, tmp_path / "dataset", action="joint_increment")
+    assert level_of(tmp_path / "dataset", "motion_follows_action", "dataset") == "pass"
+
+
 def test_an_arm_that_begins_to_move_has_no_dead_band(tmp_path: Path) -> None:
     """What is sent to an arm at rest is 0.02 rad away within one frame of ten a second."""
     run = simulate_run(tmp_path / "run", 3, robot="so101", variation="mild", seed=3604, fps=10)
