@@ -30,7 +30,7 @@ from demorec.core.tables import ROBOTS, TASKS
 
 SIZES = {(64, 64): 3, (96, 96): 3, (96, 72): 3, (128, 96): 2, (160, 120): 1}
 ACTIONS = ("joint", "joint_increment", "ee", "ee_delta")
-FEATURES = ("velocity", "effort", "ee_pose", "environment_state")
+FEATURES = ("velocity", "effort", "ee_pose")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,6 @@ def made(folder: Path, seed: int, number: int) -> tuple[str, Path | None, str]:
     for command in (
         [commands / "generate-dataset", *words, "--cameras", "front", "wrist", "--out", run, "--no-export"],
         [commands / "demorec", "export", "lerobot", run, "--out", dataset, "--action", action, "--no-verify",
-         *(["--privileged"] if "observation.environment_state" in features else []),
          "--features", *features, *cameras],
     ):  # fmt: skip
         done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
