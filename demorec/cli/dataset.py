@@ -276,7 +276,7 @@ class Dataset:
                 return operations.reorder(source, self.by, _numbers(self.order), descending=self.descending)
             case "shuffle":
                 return operations.shuffle(source, self.seed)
-        raise NotImplementedError(self.command)
+        raise AssertionError(f"{self.command} has no plan")
 
     def _merge(self, sources: Sequence[Source]) -> Plan:
         from demorec.datasets.editing.merge import DatasetsDifferError, merge
