@@ -98,8 +98,9 @@ def main() -> None:
             settings, dataset, error = made(Path(folder), options.seed, number)
             found: list[list[tuple[object, ...]]] = [[], []]
             if dataset is not None:
-                for alarms, spoil in zip(found, (lambda _: None, bare), strict=True):
-                    spoil(dataset)
+                for alarms, sidecar in zip(found, (True, False), strict=True):
+                    if not sidecar:
+                        bare(dataset)
                     alarms += [(r.level, r.check, r.value, r.detail) for r in judge(dataset)]
         row = Row(seed=options.seed, number=number, settings=settings, error=error, alarms=found[0], bare=found[1])
         rows.append(row)
