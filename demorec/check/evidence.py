@@ -88,10 +88,15 @@ class Motion:
     stroke_s: float = 0.0
 
     @property
+    def grippers(self) -> Flags:
+        """(D,) elements that are called after a gripper or its fingers."""
+        return np.array([is_gripper(name) for name in self.names], dtype=np.bool_)
+
+    @property
     def gripper(self) -> int | None:
         """The element that is the opening of a gripper, if one is."""
-        found = [i for i, name in enumerate(self.names) if is_gripper(name)]
-        return found[0] if len(found) == 1 else None
+        found = np.flatnonzero(self.grippers)
+        return int(found[0]) if len(found) == 1 else None
 
     @property
     def joint_position(self) -> dict[str, Array]:

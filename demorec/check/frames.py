@@ -11,8 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Measurement
-from demorec.check.evidence import Motion
+from demorec.check.evidence import Motion, quaternion_places
 from demorec.check.motion import FEWEST, Moving, motion_check
+from demorec.core.geometry import signs_of_course
 
 _MIDWAY = 1e-6
 """Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
@@ -56,7 +57,7 @@ def interpolated_frames(subject: Moving) -> Iterator[Found]:
     A gripper may move at one speed while the arm stands still.
     """
     for motion in subject.motions.all:
-        state = motion.state[:, [i for i in range(len(motion.names)) if i != motion.gripper]]
+        state = motion.state[:, ~motion.grippers]
         if len(state) < FEWEST or not state.size:
             continue
         near, way = _MIDWAY * max(float(np.ptp(state, axis=0).max()), 1e-9), np.abs(state[2:] - state[:-2])
@@ -79,7 +80,7 @@ def missing_frames(subject: Moving) -> Iterator[Found]:
     """An arm is as fast in a frame as in the two before and after, within a few times: catches frames that were lost,
     as the next one then is as far away as several, and angles that wrap.
 
-    Grippers may be that quick, and are left out.
+    Grippers may be that quick, and are left out; a quaternion and its negative are the same place.
     """
     for motion in subject.motions.all:
         if len(motion.state) >= FEWEST:
@@ -87,7 +88,10 @@ def missing_frames(subject: Moving) -> Iterator[Found]:
 
 
 def _farthest(motion: Motion) -> Measurement | None:
-    state = motion.state[:, [i for i in range(len(motion.names)) if i != motion.gripper]]
+    state = motion.state.copy()
+    for place in quaternion_places(motion.names):
+        state[:, place : place + 4] *= signs_of_course(state[:, place : place + 4])[:, None]
+    state = state[:, ~motion.grippers]
     way = np.abs(np.diff(state, axis=0))
     finest = np.where(way > 0, way, np.inf).min(axis=0)  # of an encoder of coarse steps one is no jump
     moves = np.ptp(state, axis=0) > _STEPS * finest

@@ -361,7 +361,7 @@ def whole_episodes(dataset: Dataset) -> Found:
 
 def _speed_at(motion: Motion, row: int, spread: Array) -> float:
     """Of the arm at the first row or the last one, as a share of its mean."""
-    arm = np.delete(motion.state / spread, [] if motion.gripper is None else motion.gripper, axis=1)
+    arm = (motion.state / spread)[:, ~motion.grippers]
     speed = np.linalg.norm(np.diff(arm, axis=0), axis=1)
     few = max(1, round(_END_S * motion.fps))
     return float(speed[row * few :][:few].mean() / max(float(np.sqrt((speed**2).mean())), 1e-9))

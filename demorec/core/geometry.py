@@ -154,6 +154,12 @@ def quat_product(a: Iterable[Any], b: Iterable[Any]) -> list[Any]:
     ]
 
 
+def signs_of_course(quaternions: Array) -> Array:
+    """(T,) by which each of (T, 4) is nearest to the one before: both signs mean the same rotation."""
+    flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    return np.concatenate(([1.0], np.cumprod(flips)))
+
+
 def rotate(quat_xyzw: ArrayLike, vector: ArrayLike) -> Array:
     """Rotate one vector (3,) by a unit quaternion (x, y, z, w)."""
     r = rotation_from_quat(quat_xyzw)

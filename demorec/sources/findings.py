@@ -6,13 +6,14 @@ Nothing is repaired: a finding tells what the rows hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.geometry import signs_of_course
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.streams import NO_STAMP, Stream
 
@@ -30,7 +31,9 @@ _SPIKE = 25.0
 """Times the usual step of an element."""
 _LEAST_JUMP = 1e-4
 """rad, m: what no sensor tells from noise."""
-_GOES_ON = 0.2
+_AS_FAST = 1.5
+"""Times the largest step of what goes on."""
+_GOES_ON = 0.1
 """Share of a step that the next one, or the one before, has in the same direction where something moves."""
 _EARLY_S = 0.05
 """By which a header may be later than its recording, in which it was no more: clocks that NTP sets differ by less."""
@@ -161,21 +164,33 @@ def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
         yield "zeros", "all numbers are 0"
         return
     yield from _still_findings(elements, names, line)
-    signs: dict[int, NDArray[np.float64]] = {}
-    for start in stream.layout.quaternions:
-        signs |= dict.fromkeys(range(start, start + 4), _signs(elements.quaternion(start)))
-    for column, (name, element) in enumerate(zip(names, elements, strict=True)):
-        change = np.diff(element * signs[column] if column in signs else element)
-        steps = np.abs(change)
+    for name, change in _changes(elements, names, stream.layout.quaternions):
+        steps = np.linalg.norm(change, axis=1)
         usual = float(np.percentile(steps, 90))
-        # What begins to move after a long rest goes on, as an opening gripper does.
-        beside, least = change[1:] * change[:-1], _GOES_ON * change**2
-        steps[np.append(beside > least[:-1], False) | np.insert(beside > least[1:], 0, False)] = 0.0
+        # What begins to move after a long rest goes on, as an opening gripper does. At a low rate a shorter way takes
+        # one step, but no larger one than those of the longer.
+        beside, least = (change[1:] * change[:-1]).sum(axis=1), _GOES_ON * steps**2
+        goes_on = np.append(beside > least[:-1], False) | np.insert(beside > least[1:], 0, False)
+        limit = max(_SPIKE * usual, _LEAST_JUMP, _AS_FAST * float(steps[goes_on].max(initial=0.0)))
+        steps[goes_on] = 0.0
         largest = int(steps.argmax())
-        if usual > 0 and steps[largest] > max(_SPIKE * usual, _LEAST_JUMP):
+        if usual > 0 and steps[largest] > limit:
             at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS
             yield "jump", f"{name!r} jumps by {steps[largest]:.3g} at {at:.2f} s, usual are {usual:.2g}"
             break
+
+
+def _changes(
+    elements: _Elements, names: tuple[str, ...], quaternions: Sequence[int]
+) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """(T - 1, n) from each message to the next, of every element and of every rotation as a whole."""
+    turns = {start + part for start in quaternions for part in range(4)}
+    for column, (name, element) in enumerate(zip(names, elements, strict=True)):
+        if column in quaternions:
+            quaternion = elements.quaternion(column)
+            yield name, np.diff(quaternion * signs_of_course(quaternion)[:, None], axis=0)
+        elif column not in turns:
+            yield name, np.diff(element)[:, None]
 
 
 class _Elements:
@@ -210,12 +225,6 @@ def _number_findings(elements: _Elements, names: tuple[str, ...]) -> Iterator[tu
         yield kind, f"{len(rows)} messages hold no finite number, the first in {names[column]!r}"
 
 
-def _signs(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T,) by which each of (T, 4) is nearest to the one before: both signs mean the same rotation."""
-    flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    return np.concatenate(([1.0], np.cumprod(flips)))
-
-
 def _still_findings(elements: _Elements, names: tuple[str, ...], line: Timeline) -> Iterator[tuple[str, str]]:
     """Elements with noise that suddenly have none."""
     stuck = []
@@ -235,9 +244,14 @@ def _still_findings(elements: _Elements, names: tuple[str, ...], line: Timeline)
 
 def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
     """First and last index of the longest run of equal numbers."""
-    edges = np.concatenate(([0], np.flatnonzero(np.diff(numbers) != 0) + 1, [len(numbers)]))
+    edges = _run_edges(numbers)
     longest = int(np.argmax(np.diff(edges)))
     return int(edges[longest]), int(edges[longest + 1]) - 1
+
+
+def _run_edges(numbers: NDArray[Any]) -> Int:
+    """First index of each run of equal numbers, and their count."""
+    return np.concatenate(([0], np.flatnonzero(np.diff(numbers) != 0) + 1, [len(numbers)]))
 
 
 def _image_findings(line: Timeline) -> Iterator[tuple[str, str]]:
@@ -251,9 +265,11 @@ def _image_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     sizes = {(head.width, head.height) for head in stream.heads.kinds() if head.width}
     if len(sizes) > 1:
         yield "size", f"its images change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
-    sums = np.asarray(stream.image_sums)[line.order]
-    begin, end = _longest_run(sums.astype(np.int64))
-    if end - begin + 1 >= FROZEN:
+    sums = np.asarray(stream.image_sums)[line.order].astype(np.int64)
+    begin, end = _longest_run(sums)
+    runs = np.diff(_run_edges(sums))
+    has_noise = not ((runs > 1) & (runs < FROZEN)).any()  # a drawn camera gives the same again wherever all rests
+    if end - begin + 1 >= FROZEN and has_noise:
         at = (line.times_ns[begin] - line.times_ns[0]) / NS
         yield "frozen", f"{end - begin + 1} images from {at:.2f} s on have the very same bytes"
     if stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:

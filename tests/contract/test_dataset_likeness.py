@@ -16,6 +16,7 @@ from support.check import level_of, simulate_run
 from support.dataset_edits import FRONT, WRIST, blurred, both, columns, film, halved, late, numbers, pixels, stats
 from support.dataset_particular import repeats
 from support.export import export
+from support.foreign_dataset import write_foreign
 
 Fault = Callable[[Path], None]
 Images = NDArray[Any]
@@ -244,6 +245,28 @@ def test_a_joint_that_only_trembles_does_not_move_the_other_way(tmp_path: Path) 
     run = simulate_run(tmp_path / "run", 3, task="tutorial", robot="iiwa", variation="mild", seed=654866, fps=15)
     export(run, tmp_path / "dataset", action="joint_increment")
     assert level_of(tmp_path / "dataset", "motion_follows_action", "dataset") == "pass"
+
+
+def test_a_quick_gripper_and_a_rotation_of_the_other_sign_miss_no_frame(tmp_path: Path) -> None:
+    """Two fingers shut within a frame of ten a second; a hand that points down turns its quaternion's sign."""
+
+    def rows(moment: NDArray[Any]) -> dict[str, Any]:
+        tilt, signs = 1e-5 * np.cos(moment), np.where(moment > 2, -1, 1)
+        left = 0.04 - 0.01 * (moment > 1)
+        quaternion = (np.cos(0.1 * np.sin(moment)), np.sin(0.1 * np.sin(moment)), tilt, np.abs(tilt))
+        return {
+            "x": 0.2 * np.sin(moment),
+            "y": 0.1 * np.cos(moment),
+            "left_finger": left,
+            "right_finger": left + 1e-5 * moment,
+            **{f"rotation.{axis}": signs * values for axis, values in zip("xyzw", quaternion, strict=True)},
+        }
+
+    moments = np.linspace(0, 3, 80)
+    write_foreign(tmp_path / "good", length=80, episodes=1, state=rows(moments))
+    assert level_of(tmp_path / "good", "missing_frames", "dataset") == "pass"
+    write_foreign(tmp_path / "gap", length=60, episodes=1, state=rows(np.delete(moments, range(40, 60))))
+    assert level_of(tmp_path / "gap", "missing_frames", "dataset") == "fail"
 
 
 def test_an_arm_that_begins_to_move_has_no_dead_band(tmp_path: Path) -> None:

@@ -89,16 +89,31 @@ def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
     assert _findings(bag, tmp_path) == set()
 
 
-def test_a_gripper_that_opens_after_a_long_rest_does_not_jump(tmp_path: Path) -> None:
-    """It rests for all but four messages; the noise of its encoder is far below the steps of its way."""
+@pytest.mark.parametrize(
+    ("way", "jumps"),
+    [([0.2, 0.4, 0.6, 0.8], False), ([0.2, 0.2, 0.2, 0.03, 0, 0], False), ([0.2, 0.4, 0.6, 0.6, 0, 0], True)],
+)
+def test_a_gripper_that_opens_after_a_long_rest_does_not_jump(way: list[float], jumps: bool, tmp_path: Path) -> None:
+    """It rests for all but a few messages; the noise of its encoder is far below the steps of its way.
+
+    At once it goes no farther than in one step of a longer way.
+    """
 
     def opening(k: int, note: bags.Note) -> bags.Note:
         position = note.body["position"].copy()
-        position[-1] = 1e-5 * (k % 3) + 0.2 * np.clip(k - 50, 0, 4)
+        position[-1] = 1e-5 * (k % 3) + np.interp(k, [50, *range(51, 51 + len(way))], [0, *way], left=0.0)
         return bags.with_body(note, position=position)
 
     notes = bags.changed(bags.so101(2.0), "/follower/joint_states", opening)
-    assert "jump" not in _findings(bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap"), tmp_path)
+    assert ("jump" in _findings(bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap"), tmp_path)) == jumps
+
+
+def test_a_drawn_camera_at_rest_is_not_frozen(notes: bags.Notes, tmp_path: Path) -> None:
+    """Its images have no noise: they are the same wherever all rests, for two images as for six."""
+    images = bags.of_topic(notes, FRONT)
+    same = {11: 10, **dict.fromkeys(range(21, 26), 20)}
+    drawn = bags.changed(notes, FRONT, lambda k, note: replace(note, body=images[same.get(k, k)].body))
+    assert _findings(bags.write_mcap(bags.in_order(drawn), tmp_path / "bag.mcap"), tmp_path) == set()
 
 
 def test_images_that_come_unevenly_are_not_lost(notes: bags.Notes, tmp_path: Path) -> None:

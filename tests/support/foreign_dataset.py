@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,24 @@ EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 _COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
 
 
-def write_foreign(root: Path, *, length: int = 8, episodes: int = 2, size: tuple[int, int] = (64, 48)) -> Path:
-    """Some episodes of `length` rows at 10 Hz, with a state, an action and a camera of `size` (width, height)."""
+def write_foreign(
+    root: Path,
+    *,
+    length: int = 8,
+    episodes: int = 2,
+    size: tuple[int, int] = (64, 48),
+    state: Mapping[str, Sequence[float]] | None = None,
+) -> Path:
+    """Some episodes of `length` rows at 10 Hz, with a state, an action and a camera of `size` (width, height).
+
+    The state has what `state` gives for each element and row, or else noise.
+    """
     for place in (DATA, EPISODES):
         (root / place).parent.mkdir(parents=True)
-    rows, width = length * episodes, 3
+    rows, names = length * episodes, list(state or "abc")
+    width = len(names)
     shapes: dict[str, Any] = {
-        "observation.state": {"dtype": "float32", "shape": [width], "names": ["a", "b", "c"]},
+        "observation.state": {"dtype": "float32", "shape": [width], "names": names},
         "action": {"dtype": "float32", "shape": [width], "names": None},
         "observation.images.top": {"dtype": "image", "shape": [size[1], size[0], 3], "names": None},
         **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _COUNTERS.items()},
@@ -37,7 +49,9 @@ def write_foreign(root: Path, *, length: int = 8, episodes: int = 2, size: tuple
     (root / "meta/info.json").write_text(json.dumps(info))
     shown = io.BytesIO()
     Image.new("RGB", size).save(shown, "PNG")
-    numbers = pa.array(np.random.default_rng(0).normal(size=rows * width).astype(np.float32))
+    noise = np.random.default_rng(0).normal(size=(rows, width))
+    told = noise if state is None else np.column_stack(list(state.values()))
+    numbers = pa.array(told.astype(np.float32).reshape(-1))
     kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     columns: dict[str, Any] = {
         "observation.state": pa.FixedSizeListArray.from_arrays(numbers, width),

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.evidence import Flags, Motion, is_gripper
+from demorec.check.evidence import Flags, Motion
 from demorec.check.rows import finest_lag, longest_run
 from demorec.core.geometry import Array
 
@@ -114,7 +114,7 @@ class Movement:
 
 def movement(motion: Motion, scale: Scale) -> Movement:
     """Measure an episode of three frames or more."""
-    opens = np.array([is_gripper(name) for name in motion.names])
+    opens = motion.grippers
     arm = ~opens if not opens.all() else opens
     state = motion.state[:, arm] / _width(scale.state, arm)
     steps = np.linalg.norm(np.diff(state, axis=0), axis=1)
