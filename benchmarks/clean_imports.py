@@ -78,10 +78,12 @@ class Episode:
     fps: int
 
 
-def read_episode(path: Path) -> Episode:
-    """Of a recording with joint states at the physics rate."""
+def read_episode(path: Path) -> Episode | None:
+    """Of a recording with joint states at the physics rate; None of a robot that is larger than its URDF says."""
     with open_recording(path) as recording:
         info, columns = recording.info, recording.columns()
+        if info.scene.robot.scale != 1:
+            return None
         samples = list(recording.joint_samples())
         moments = [*columns.time_ns.tolist(), *(sample.time_ns for sample in samples)]
         rows = [*columns.joint_position, *(sample.joint_position for sample in samples)]
@@ -300,9 +302,8 @@ def main() -> None:
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "good.mcap"
-            if not record(config, index, path):
+            if not record(config, index, path) or (episode := read_episode(path)) is None:
                 continue
-            episode = read_episode(path)
             for name in wanted:
                 place = Path(folder) / str(len(rows))
                 place.mkdir()

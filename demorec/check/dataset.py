@@ -19,7 +19,7 @@ from demorec.check.dataset_video import EpisodeImages, episode_images
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, draw, frames_to_draw
 from demorec.check.dynamics import Dynamics
 from demorec.check.episode_drawn import drawable_scene
-from demorec.check.evidence import Motion, Named, motions_of_dataset, quaternions
+from demorec.check.evidence import Motion, Named, course_of, motions_of_dataset, quaternions
 from demorec.check.films import Film, Films, likeness_of_films
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices
@@ -179,7 +179,7 @@ class Dataset:
     @cached_property
     def films(self) -> Films:
         """Those of its cameras, beside the states."""
-        known = STATE in self.info.features
+        known = self.info.features.get(STATE)
         return {
             key: [
                 Film(
@@ -188,7 +188,7 @@ class Dataset:
                     cells=images.cells,
                     detail=images.detail,
                     frames=np.arange(images.count),
-                    state=self.rows[number][STATE].astype(np.float64) if known else None,
+                    state=course_of(self.rows[number][STATE], known.names or ()) if known else None,
                 )
                 for number, images in enumerate(self.images(key))
             ]

@@ -34,6 +34,7 @@ _ROLES = ("user", "assistant", "system", "tool")
 _ROLE_OF = {"task_aug": "user", "subtask": "assistant", "plan": "assistant", "memory": "assistant"}
 """As lerobot-annotate writes them; LeRobot's trainings leave wordings of others than the user out."""
 _STEPS, _LONG_WORD = re.compile(r"^\s*2[.)]", re.MULTILINE), re.compile(r"[^\W\d_]{4,}")
+_COLORED = re.compile(rf"\b({'|'.join(COLOR_WORDS)}) (\w+)")
 _GOES_M = 0.02
 """How far a hand goes that is said to move up or down."""
 
@@ -50,7 +51,7 @@ def dataset_language(dataset: Dataset) -> Measurement | None:
         for number, episode in enumerate(dataset.spoken)
         for text in _malformed(dataset, episode)
     ]
-    wrong += [*_wrong_motions(dataset), *_wrong_plans(dataset)]
+    wrong += [*_wrong_motions(dataset), *_wrong_plans(dataset), *_wrong_colors(dataset)]
     entries = sum(len(episode.persistent) + sum(map(len, episode.events.values())) for episode in dataset.spoken)
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{entries} entries")
 
@@ -102,6 +103,20 @@ def _wrong_plans(dataset: Dataset) -> Iterator[str]:
     is_latin = all(text.isascii() for texts in both for said in texts.values() for text in said)
     if is_latin and sum(not plan & subtasks for plan, subtasks in words) > max(len(both) / 2, 2):
         yield "plans have no word in common with the subtasks"
+
+
+def _wrong_colors(dataset: Dataset) -> Iterator[str]:
+    """Wordings that give a thing of the instruction, by its noun, a colour that it has nowhere else."""
+    wrong = []
+    for rows, episode in zip(dataset.rows, dataset.spoken, strict=False):
+        instruction = dataset.tasks[int(rows["task_index"].reshape(-1)[0])]
+        others = " ".join([instruction, *_said(episode, "subtask"), *_said(episode, "plan")]).lower()
+        known = set(_COLORED.findall(others))
+        for text in _said(episode, "task_aug"):
+            strange = [pair for pair in _COLORED.findall(text.lower()) if pair not in known]
+            wrong += [text for _, noun in strange if noun in {named for _, named in known}][:1]
+    if len(wrong) > 2:
+        yield f"wordings name other colours than the instruction ({wrong[0][:60]!r})"
 
 
 def _said(episode: SpokenEpisode, style: str) -> list[str]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.geometry import Array
+from demorec.core.geometry import Array, signs_of_course
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
@@ -50,7 +50,7 @@ class Motion:
         fps: Frames per second.
         steps_s: (T - 1,) time from each frame to the next, seconds.
         names: Of the D elements.
-        state: (T, D) rad or m where the joint is known, else as it came.
+        state: (T, D) rad or m where the joint is known, else as it came; quaternions by `course_of`.
         velocity, action, effort: (T, D) of the same elements and units, NaN where an element has none; None for no
             element.
         lower, upper: (D,) limits; infinite where they are not known.
@@ -117,6 +117,23 @@ def quaternion_places(names: Sequence[str]) -> list[int]:
         for start, four in fours
         if "".join(each[-1:] for each in four) in ("xyzw", "wxyz") and len({each[:-1] for each in four}) == 1
     ]
+
+
+def course_of(state: Array, names: Sequence[str]) -> Array:
+    """(T, D) states whose quaternions are as near as they can be to those before: both signs mean the same rotation."""
+    course = state.astype(np.float64)
+    for place in quaternion_places(names):
+        course[:, place : place + 4] *= signs_of_course(course[:, place : place + 4])[:, None]
+    return course
+
+
+def _near(action: Array | None, state: Array, names: Sequence[str]) -> Array | None:
+    """(T, D) actions whose quaternions are as near as they can be to the state's."""
+    for place in [] if action is None else quaternion_places(names):
+        assert action is not None
+        turn = slice(place, place + 4)
+        action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    return action
 
 
 def quaternions(features: Mapping[str, NDArray[Any]], described: Mapping[str, Sequence[str] | None]) -> Iterator[Named]:
@@ -271,7 +288,7 @@ def _motion(
         """By the feature's own units: a leader may tell degrees of an arm that tells rad."""
         return described[feature].in_si(features[feature])
 
-    state = in_si(STATE)
+    state = course_of(in_si(STATE), elements)
 
     def alike(feature: str) -> Array | None:
         """The elements of another feature that have the names of the state's, or all of as many without names."""
@@ -292,7 +309,7 @@ def _motion(
         names=tuple(elements),
         state=state,
         velocity=alike(VELOCITY),
-        action=alike(ACTION),
+        action=_near(alike(ACTION), state, elements),
         effort=alike(EFFORT),
         lower=lower,
         upper=upper,

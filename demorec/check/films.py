@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from demorec.check.base import NotMeasured
 from demorec.check.cells import correlation
 from demorec.check.dataset_video import detail_of, part_counts
+from demorec.check.evidence import course_of
 from demorec.core.geometry import Array
 from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.features import STATE
@@ -34,7 +35,7 @@ class Film:
         cells: (N, rows, columns, 3) mean colours of the parts of each image, 0 to 255.
         detail: (N,) `detail_of` each image.
         frames: (N,) frame that each image belongs to.
-        state: (N, D) observation.state in these frames, None where there is none.
+        state: (N, D) observation.state in these frames by `course_of`, None where there is none.
     """
 
     where: str
@@ -133,7 +134,8 @@ def turned(view: Array) -> Iterator[Array]:
 
 def films_of_recording(recording: Recording, columns: Columns) -> Films:
     """Of a recording that demorec did not simulate: each image once, beside the first frame that holds it."""
-    state = columns.features[STATE].astype(np.float64) if STATE in columns.features else None
+    names = next((feature.names for feature in recording.info.features if feature.name == STATE), ())
+    state = course_of(columns.features[STATE], names) if STATE in columns.features else None
     found = {}
     for camera in recording.cameras:
         cells, detail = parts_of(decode(recording.video_settings(camera), recording.packets(camera)))

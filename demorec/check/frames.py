@@ -11,38 +11,47 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Measurement
-from demorec.check.evidence import Motion, quaternion_places
-from demorec.check.motion import FEWEST, Moving, motion_check
-from demorec.core.geometry import signs_of_course
+from demorec.check.evidence import Flags, Motion
+from demorec.check.motion import FEWEST, MOVES, Moving, motion_check
 
 _MIDWAY = 1e-6
 """Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
 _SLOWEST = 0.5
 """Share of the usual speed that counts as the speed around a frame where the arm hardly moves."""
+_QUICK, _SLOW = 0.5, 0.01
+"""Share of the usual velocity, and rad/s or m/s, above which a joint moves."""
 _STEPS = 30
 """Finest steps that an element goes in an episode if it moves."""
 
 
 @motion_check(
     measures="share of frames that repeat the one before, number by number, while the arm moves",
-    warn=0.02,
+    warn=0.01,
     fail=math.inf,
     simulated=(0.0, 0.0),
     needs=STATE_ALONE,
 )
 def repeated_frames(subject: Moving) -> Iterator[Found]:
     """Each frame is one of its own: catches gaps that were filled with what came before. Of simulated recordings, of
-    which all numbers are measured anew, in any frame."""
+    which all numbers are measured anew, in any frame; else where the frames around it differ or a velocity says so."""
     for motion in subject.motions.all:
         tables = [motion.state, *motion.sensors.values(), *([] if motion.action is None else [motion.action])]
         rows = np.column_stack([table.reshape(len(table), -1) for table in tables])
         same = ((rows[1:] == rows[:-1]) | np.isnan(rows[1:])).all(axis=1)
-        moves = (motion.state[1:] != motion.state[:-1]).any(axis=1)
-        around = np.zeros_like(same)
-        around[1:-1] = moves[:-2] & moves[2:]
-        wrong = same if motion.contact is not None else same & around
+        changes = (motion.state[1:] != motion.state[:-1]).any(axis=1)
+        moves = _is_quick(motion)[1:]
+        moves[1:-1] |= changes[:-2] & changes[2:]
+        wrong = same if motion.contact is not None else same & moves
         frame = int(np.argmax(wrong)) + 1 if wrong.any() else None
         yield Measurement(value=float(wrong.mean()) if len(wrong) else 0.0, frame=frame, detail=motion.where)
+
+
+def _is_quick(motion: Motion) -> Flags:
+    """(T,) where a joint has a velocity that is not small beside its usual one; nowhere, where none is known."""
+    if motion.velocity is None:
+        return np.zeros(len(motion.state), dtype=np.bool_)
+    speed = np.abs(np.nan_to_num(motion.velocity))
+    return np.asarray((speed > np.maximum(_QUICK * np.sqrt((speed**2).mean(axis=0)), _SLOW)).any(axis=1))
 
 
 @motion_check(
@@ -80,7 +89,7 @@ def missing_frames(subject: Moving) -> Iterator[Found]:
     """An arm is as fast in a frame as in the two before and after, within a few times: catches frames that were lost,
     as the next one then is as far away as several, and angles that wrap.
 
-    Grippers may be that quick, and are left out; a quaternion and its negative are the same place.
+    Grippers may be that quick, and are left out.
     """
     for motion in subject.motions.all:
         if len(motion.state) >= FEWEST:
@@ -88,13 +97,10 @@ def missing_frames(subject: Moving) -> Iterator[Found]:
 
 
 def _farthest(motion: Motion) -> Measurement | None:
-    state = motion.state.copy()
-    for place in quaternion_places(motion.names):
-        state[:, place : place + 4] *= signs_of_course(state[:, place : place + 4])[:, None]
-    state = state[:, ~motion.grippers]
+    state = motion.state[:, ~motion.grippers]
     way = np.abs(np.diff(state, axis=0))
     finest = np.where(way > 0, way, np.inf).min(axis=0)  # of an encoder of coarse steps one is no jump
-    moves = np.ptp(state, axis=0) > _STEPS * finest
+    moves = np.ptp(state, axis=0) > np.maximum(_STEPS * finest, MOVES)
     if not moves.any():
         return None
     speed = np.maximum(way - finest, 0.0)[:, moves] / motion.steps_s[:, None]

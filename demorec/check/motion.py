@@ -41,6 +41,8 @@ _FEW_FPS = 20
 """Frames a second below which exploration noise moves a joint to and fro between two frames."""
 FEWEST = 30
 """Frames below which an episode says nothing of lags and orders."""
+_FEWEST_WAYS = 20
+"""Ways of `_VELOCITY_S` below which an episode's velocities are not judged by themselves."""
 _OWN = 0.5
 """Correlation with its own element above which an action is a target of the state: 0.97 and more in demonstrations of
 Panda and iiwa, where increments and poses have 0.3 and less."""
@@ -225,7 +227,7 @@ def _of_single_episodes(motions: Sequence[Motion], parts: Array, counts: NDArray
     if len(motions) < 2:
         return
     product, square, total = np.nansum(np.where(np.isfinite(parts[:, :1]), parts, 0.0), axis=2).T
-    moves = (total > _LIVELY * counts * total.sum() / counts.sum()) & (counts >= FEWEST)
+    moves = (total > _LIVELY * counts * total.sum() / counts.sum()) & (counts >= _FEWEST_WAYS)
     for row in np.flatnonzero(moves):
         ratio = product[row] / max(square[row], 1e-12)
         yield Measurement(value=abs(ratio - 1) / 2, detail=f"{motions[row].where}: ratio {ratio:.3f}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -20,10 +20,12 @@ from demorec.check.base import (
     check,
     worst_entry,
 )
-from demorec.check.evidence import Motion, quaternion_places
+from demorec.check.dataset import Dataset
+from demorec.check.evidence import Motion, is_gripper, quaternion_places
 from demorec.check.motion import FEWEST, MOVES, Moving, correlations, motion_check
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
+from demorec.episode.features import ACTION
 
 _REACH_S = 1.0
 """How far apart in time an action and the state that follows it are looked for, seconds."""
@@ -46,11 +48,10 @@ _JUMP, _STILL, _BEGUN = 0.3, 0.01, 0.05
 """Shares of a gripper's range: what a command jumps by, what it stays within before that, what shows in the opening."""
 _STAYS, _GOES, _FEWEST_TIMES = 1e-5, 1e-3, 4
 """rad, m: by how much a state that stays changes at most, and an action that goes on at least; how often."""
+_FEWEST_LEVELS = 5
+"""Steps of an action below which it is of keys."""
 _FEWEST_STEPS, _COMES_BACK = 12, 2
 """Steps between a joint's values from which on the least of them tells how fine they are; how often each is gone."""
-_RESOLVED_FPS = 20
-"""Frames a second from which on a joint's steps follow from its velocities: noise on commands starts and stops an arm
-within longer ones."""
 _ANY_OTHER = 2.0
 """Times the second largest difference of a step from its velocities, beyond which the largest is a jump."""
 _NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
@@ -208,9 +209,6 @@ def steps_as_velocities(subject: Moving) -> Iterator[Found]:
             return
         if len(motion.state) < FEWEST:
             continue
-        if motion.fps < _RESOLVED_FPS:
-            yield NotMeasured(why=f"at {motion.fps:g} frames a second an arm starts and stops within a step")
-            return
         expected = (motion.velocity[1:] + motion.velocity[:-1]) / 2 * motion.steps_s[:, None]
         # Within a step a joint may start and stop: only what is more than its fastest could do is a jump.
         fastest = np.abs(motion.velocity).max(axis=0) * motion.steps_s[:, None]
@@ -302,11 +300,39 @@ def encoder_steps(subject: Moving) -> Iterator[Found]:
     if not columns:
         yield Lacking(need=URDF)
     for name, parts in columns.items():
-        steps = np.diff(np.unique(np.concatenate(parts)))
-        steps = steps[steps > _STAYS]
-        changes = sum(int((np.abs(np.diff(part)) > _STAYS).sum()) for part in parts)
-        is_coarse = _FEWEST_STEPS <= len(steps) <= changes / _COMES_BACK
-        yield Measurement(value=float(steps.min()) if is_coarse else 0.0, detail=name)
+        yield Measurement(value=step_of(parts, _FEWEST_STEPS), detail=name)
+
+
+def step_of(parts: Sequence[Array], fewest: int) -> float:
+    """In which the values of all parts come, at least so many of them and each more than once; 0 of continuous ones."""
+    steps = np.diff(np.unique(np.concatenate(parts)))
+    steps = steps[steps > _STAYS]
+    changes = sum(int((np.abs(np.diff(part)) > _STAYS).sum()) for part in parts)
+    return float(steps.min()) if fewest <= len(steps) <= changes / _COMES_BACK else 0.0
+
+
+@check(
+    group="alignment",
+    on=("dataset",),
+    needs="an action",
+    measures="step in which an element of the action comes, as a share of its deviation",
+    warn=0.25,
+    fail=math.inf,
+)
+def action_steps(dataset: Dataset) -> Iterator[Found]:
+    """An action is finer than what it does: catches small increments that were rounded, or stored in a few bits. Keys
+    and grippers, which know a few values, are left out."""
+    feature = dataset.info.features.get(ACTION)
+    if feature is None or not feature.is_numeric:
+        yield Lacking(need="an action")
+        return
+    actions = [rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64) for rows in dataset.rows]
+    for element in range(actions[0].shape[1] if actions else 0):
+        name = feature.names[element] if feature.names and element < len(feature.names) else str(element)
+        parts = [action[:, element] for action in actions]
+        deviation = max(float(np.concatenate(parts).std()), 1e-9)
+        if not is_gripper(name):
+            yield Measurement(value=step_of(parts, _FEWEST_LEVELS) / deviation, detail=name)
 
 
 @check(

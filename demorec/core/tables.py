@@ -133,7 +133,14 @@ CHECKS: Registry[Check] = Registry(
         ("over_time", "images_stay_upright", "image_cuts", "steady_sharpness", "stale_images", "interpolated_images"),
         ("dataset_images", "dataset_image_statistics", "dataset_images_as_drawn", "dataset_image_lag"),
         ("targets", "state_follows_action", "actions_in_order", "state_reaches_action"),
-        ("targets", "action_is_no_observation", "gripper_waits_for_action", "dead_band", "encoder_steps"),
+        (
+            "targets",
+            "action_is_no_observation",
+            "gripper_waits_for_action",
+            "dead_band",
+            "encoder_steps",
+            "action_steps",
+        ),
         (
             "likeness",
             "actions_go_with_states",

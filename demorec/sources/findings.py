@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import signs_of_course
+from demorec.episode.features import ACTION
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.streams import NO_STAMP, Stream
 
@@ -163,7 +164,8 @@ def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     if len(names) > 1 and not any(np.any(element) for element in elements):
         yield "zeros", "all numbers are 0"
         return
-    yield from _still_findings(elements, names, line)
+    # What is sent may hold until the bag ends.
+    yield from _still_findings(elements, names, line, may_rest=stream.label == ACTION)
     for name, change in _changes(elements, names, stream.layout.quaternions):
         steps = np.linalg.norm(change, axis=1)
         usual = float(np.percentile(steps, 90))
@@ -225,14 +227,16 @@ def _number_findings(elements: _Elements, names: tuple[str, ...]) -> Iterator[tu
         yield kind, f"{len(rows)} messages hold no finite number, the first in {names[column]!r}"
 
 
-def _still_findings(elements: _Elements, names: tuple[str, ...], line: Timeline) -> Iterator[tuple[str, str]]:
-    """Elements with noise that suddenly have none."""
+def _still_findings(
+    elements: _Elements, names: tuple[str, ...], line: Timeline, *, may_rest: bool
+) -> Iterator[tuple[str, str]]:
+    """Elements with noise that suddenly have none; `may_rest` in the end."""
     stuck = []
     for name, element in zip(names, elements, strict=True):
         begin, end = _longest_run(element)
         seconds = (line.times_ns[end] - line.times_ns[begin]) / NS
         others = np.concatenate((element[:begin], element[end + 1 :]))
-        if seconds < STILL_S or end - begin < 10 or len(others) < 10:
+        if seconds < STILL_S or end - begin < 10 or len(others) < 10 or (may_rest and end == len(element) - 1):
             continue
         if np.mean(np.diff(others) != 0) > 0.8:
             stuck.append((name, seconds, (line.times_ns[begin] - line.times_ns[0]) / NS))

@@ -13,7 +13,21 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from support import loose
 from support.check import level_of, simulate_run
-from support.dataset_edits import FRONT, WRIST, blurred, both, columns, film, halved, late, numbers, pixels, stats
+from support.dataset_edits import (
+    FRONT,
+    WRIST,
+    alike,
+    blurred,
+    both,
+    columns,
+    film,
+    frozen,
+    halved,
+    late,
+    numbers,
+    pixels,
+    stats,
+)
 from support.dataset_particular import repeats
 from support.export import export
 from support.foreign_dataset import write_foreign
@@ -24,6 +38,7 @@ WORLD = "observation.environment_state"
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
     "mounts_alike", "encoder_steps", "quaternions_keep_sign", "duplicates", "effort_lag", "same_by_name",
+    "action_steps", "repeated_frames", "steps_as_velocities",
 )  # fmt: skip
 
 
@@ -110,12 +125,33 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
     "an episode twice, once without its last row": (twice, "duplicates", "fail"),
     "a piece of an episode twice": (with_a_piece_twice, "duplicates", "fail"),
     "a second that is missing": (without_a_second, "missing_frames", "warn"),
+    "a second that is missing, by velocities": (without_a_second, "steps_as_velocities", "fail"),
+    "rows that were lost and held": (
+        alike(
+            lambda rows: frozen(rows, len(rows) // 6, 8),
+            "action", *(f"observation.{name}" for name in ("state", "velocity", "effort", "ee_pose")), only=(1,),
+        ),
+        "repeated_frames",
+        "warn",
+    ),
+    "increments of a few bits": (
+        numbers("action", lambda rows: np.round(rows * 20) / 20), "action_steps", "warn"
+    ),
     "an episode of half the rate": (at_half_the_rate, "velocity_matches_position", "fail"),
 }  # fmt: skip
 
 
 def test_good_ones_pass(increments: Path) -> None:
     assert [level_of(increments, law, "dataset") for law in LAWS] == ["pass"] * len(LAWS)
+
+
+def test_an_episode_with_an_instruction_of_its_own_that_begins_elsewhere(increments: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
+    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
+    loose.put_rows(dataset, "task_index", loose.rows_of(dataset, "episode_index"))
+    assert level_of(dataset, "whole_episodes", "dataset") == "pass"
+    loose.reframe(dataset, [parts[0], parts[1][len(parts[1]) // 2 :], *parts[2:]])
+    assert level_of(dataset, "whole_episodes", "dataset") == "warn"
 
 
 def test_a_gripper_that_is_not_used_may_tremble(increments: Path, tmp_path: Path) -> None:
@@ -146,11 +182,12 @@ VIEWS = (
     "views_alike",
     "views_stay",
     "stale_images",
+    "frozen_images",
     "interpolated_images",
     "offsets_alike",
     "targets_as_named",
 )
-FAILS = ("images_stay_upright", "exchanged_cameras", "distinct_cameras", "dataset_image_statistics")
+FAILS = ("frozen_images", "images_stay_upright", "exchanged_cameras", "distinct_cameras", "dataset_image_statistics")
 
 
 @pytest.fixture(scope="module")
@@ -193,6 +230,7 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a tenth of the images repeats the one before": (
         film(WRIST, lambda r: repeats(r, 10), only=None), "stale_images"
     ),
+    "a camera that hangs for two seconds": (film(WRIST, lambda r: frozen(r, 30, 40)), "frozen_images"),
     "cameras exchanged in one episode": (both(lambda a, b: (b, a)), "exchanged_cameras"),
     "one camera under both names in one episode": (both(lambda a, b: (a, a)), "distinct_cameras"),
     "a camera that is hit": (

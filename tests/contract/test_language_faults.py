@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -131,6 +132,14 @@ def only_first_subtask(episode: Episode) -> None:
         persistent[:] = [row for row in persistent if row not in subtasks[1:]]
 
 
+def other_colors(episode: Episode) -> None:
+    """No wording has the colours of the instruction."""
+    for persistent, _ in episode:
+        for row in persistent:
+            if row["style"] == "task_aug":
+                row["content"] = re.sub(r"\b(red|blue|yellow|orange|purple|green)\b", "white", row["content"])
+
+
 def of(**values: Any) -> Callable[[Row], None]:
     return lambda row: row.update(values)
 
@@ -161,6 +170,7 @@ FAULTS: dict[str, tuple[str, Callable[[Episode], None]]] = {
     "a camera that is none": ("dataset_language", first_event(of(camera="observation.images.back"))),
     "no camera": ("dataset_language", first_event(of(camera=None), "trace")),
     "motions of the other direction": ("dataset_language", turned_round),
+    "wordings of other colours": ("dataset_language", other_colors),
     "no subtask but the first": ("dataset_language", only_first_subtask),
     "a subtask of the user's": ("dataset_language", everywhere("subtask", of(role="user"))),
     "a wording of the robot's": ("dataset_language", everywhere("task_aug", of(role="assistant"))),
