@@ -30,6 +30,9 @@ _CARRIED = 0.01
 _PRESSED, _PRESSED_BLINDLY, _IN_HAND = 0.002, 0.004, 0.05
 """Metres by which a hand presses what it lowers into a support at most, the same in an attempt that failed (2.6 mm were
 seen), and of what it holds from its TCP."""
+_STILL, _AT_REST = 2e-5, 10.0
+"""Metres in a frame that are no motion, and what a depth counts where nothing moves and fingers touch nothing: of 110
+episodes of all tasks 0.1 mm at most."""
 SOLID = ("box", "sphere", "cylinder", "capsule")
 """Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 
@@ -186,7 +189,8 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
     """Nothing solid is inside anything solid (boxes, spheres, cylinders, capsules).
 
     A hand that lowers something feels the support a frame late, and presses it, and what is below, by what it went down
-    since, or less. One that failed may have pressed on without noticing, and says that it failed.
+    since, or less. One that failed may have pressed on without noticing, and says that it failed. What rests is hardly
+    inside what bears it, and counts ten times.
     """
     scene, c = episode.info.scene, episode.columns
     tcp = episode.world_from_tcp[:, :3, 3]
@@ -212,9 +216,17 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
                 depth = np.maximum(depth, theirs)
             across, above = pose[near, :2, 3] - tcp[near, :2], pose[near, 2, 3] - tcp[near, 2]
             held = (np.linalg.norm(across, axis=1) < _IN_HAND) & (above < _IN_HAND)
-            yield worst_frame(depth - held * pressed[near], f"{body.name} in {other.name}", frames=near)
+            rests = (_rests(pose) & _rests(other_pose) & (c.contact_force == 0))[near]
+            depth = np.where(rests, _AT_REST * depth, depth - held * pressed[near])
+            yield worst_frame(depth, f"{body.name} in {other.name}", frames=near)
     if movable:
         yield Measurement(value=0.0, detail="nothing comes near anything")
+
+
+def _rests(pose: Array) -> NDArray[np.bool_]:
+    """(T,) whether a body (T or 1, 4, 4) is where it was a frame before and is a frame later."""
+    still = np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1) < _STILL
+    return np.asarray(np.append(still, True) & np.append(True, still))
 
 
 def _is_at_surface(centres: Array, body: Body, other: Body) -> bool:

@@ -296,6 +296,7 @@ CASES: list[tuple[str, Fault, str]] = [
     ("a drift while untouched", cube(plus(np.s_[:30, 0], np.linspace(-0.15, 0, 30))), "object_motion"),
     ("a jump in the hand", cube(jump_in_the_hand), "teleports"),
     ("sunk into the table", cube(plus(np.s_[:, 2], -0.012)), "penetration"),
+    ("at rest a millimetre inside the table", cube(plus(np.s_[:, 2], -0.001)), "penetration"),
     ("carried without a grip", column("contact_force", lambda r: r * 0), "carried_by_gripper"),
     ("carried by an open hand", open_hand, "carried_by_gripper"),
     ("fingers in the cube", fingers_in_the_cube, "finger_depth"),
