@@ -330,9 +330,9 @@ def action_steps(dataset: Dataset) -> Iterator[Found]:
     for element in range(actions[0].shape[1] if actions else 0):
         name = feature.names[element] if feature.names and element < len(feature.names) else str(element)
         parts = [action[:, element] for action in actions]
-        deviation = max(float(np.concatenate(parts).std()), 1e-9)
-        if not is_gripper(name):
-            yield Measurement(value=step_of(parts, _FEWEST_LEVELS) / deviation, detail=name)
+        values = np.concatenate(parts)
+        if not is_gripper(name) and np.ptp(values) > MOVES:
+            yield Measurement(value=step_of(parts, _FEWEST_LEVELS) / float(values.std()), detail=name)
 
 
 @check(
