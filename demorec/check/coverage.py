@@ -18,7 +18,7 @@ MIN_VALUES = 10
 """A quantity with fewer distinct values was not drawn from a range."""
 _MAX_SHARE = 1 / 8
 """A value that more of the episodes share was chosen and not drawn."""
-_TWIN_DISTANCE = 1e-4
+TWIN_DISTANCE = 1e-4
 _PIECE, _WAY = 8, 0.25
 """Rows in their order, at least, and how far they go, in deviations, from which on they are a piece of a motion."""
 _UNITS = {"x": "m", "y": "m", "size": "m", "mass": "kg", "yaw": "rad"}
@@ -122,13 +122,13 @@ def twins(rows: Sequence[Array], names: Sequence[str], what: str) -> Measurement
         # Sorted along the widest column, only neighbours within the tolerance have to be compared.
         axis = int(np.argmax(np.ptp(table, axis=0))) if len(table) > 1 else 0
         order = np.argsort(table[:, axis], kind="stable")
-        reach = _TWIN_DISTANCE * math.sqrt(table.shape[1]) if table.size else 0.0
+        reach = TWIN_DISTANCE * math.sqrt(table.shape[1]) if table.size else 0.0
         is_twin = np.zeros(len(group), dtype=bool)
         for place, i in enumerate(order):
             for j in order[place + 1 :]:
                 if table[j, axis] - table[i, axis] > reach:
                     break
-                if math.sqrt(float(((table[i] - table[j]) ** 2).mean())) <= _TWIN_DISTANCE:
+                if math.sqrt(float(((table[i] - table[j]) ** 2).mean())) <= TWIN_DISTANCE:
                     later, earlier = max(i, j), min(i, j)
                     is_twin[later] = True
                     first = first or f"{names[group[later]]} is like {names[group[earlier]]}"

@@ -106,17 +106,20 @@ def _wrong_plans(dataset: Dataset) -> Iterator[str]:
 
 
 def _wrong_colors(dataset: Dataset) -> Iterator[str]:
-    """Wordings that give a thing of the instruction, by its noun, a colour that it has nowhere else."""
+    """Wordings, subtasks and plans that give a thing, by its noun, a colour that it has in none of the others."""
     wrong = []
     for rows, episode in zip(dataset.rows, dataset.spoken, strict=False):
-        instruction = dataset.tasks[int(rows["task_index"].reshape(-1)[0])]
-        others = " ".join([instruction, *_said(episode, "subtask"), *_said(episode, "plan")]).lower()
-        known = set(_COLORED.findall(others))
-        for text in _said(episode, "task_aug"):
-            strange = [pair for pair in _COLORED.findall(text.lower()) if pair not in known]
-            wrong += [text for _, noun in strange if noun in {named for _, named in known}][:1]
+        said = {style: _said(episode, style) for style in ("task_aug", "subtask", "plan")}
+        said["instruction"] = [dataset.tasks[int(rows["task_index"].reshape(-1)[0])]]
+        for style in ("task_aug", "subtask", "plan"):
+            others = " ".join(text for other, texts in said.items() if other != style for text in texts)
+            known = set(_COLORED.findall(others.lower()))
+            nouns = {noun for _, noun in known}
+            for text in said[style]:
+                strange = [pair for pair in _COLORED.findall(text.lower()) if pair not in known and pair[1] in nouns]
+                wrong += [text] if strange else []
     if len(wrong) > 2:
-        yield f"wordings name other colours than the instruction ({wrong[0][:60]!r})"
+        yield f"colours that the thing has nowhere else ({wrong[0][:60]!r})"
 
 
 def _said(episode: SpokenEpisode, style: str) -> list[str]:

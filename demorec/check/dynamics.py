@@ -250,9 +250,7 @@ def dynamics_by_servo(arm: Arm) -> Dynamics | NotMeasured:
     recorded = c.joint_position[:, :n], c.joint_velocity[:, :n], c.command_joint_target
     start, step_s = np.array(info.scene.robot.joint_position), 1 / info.physics_hz
     steps = Steps.of_servo(*recorded, start=start, substeps=max(info.physics_hz // info.fps, 1), step_s=step_s)
-    around = np.pad(np.abs(c.joint_effort[:, :n]), ((1, 1), (0, 0)), mode="edge")
-    usual = np.median([around[:-2], around[1:-1], around[2:]], axis=0)  # a glitch of one frame is not the motor's
-    is_free = np.asarray((usual < _FREE * np.array(info.robot.torque_limit)).all(axis=1))
+    is_free = (np.abs(c.joint_effort[:, :n]) < _FREE * np.array(info.robot.torque_limit)).all(axis=1)
     joints = [np.hstack([positions, c.joint_position[:, n:]]) for positions in (steps.before, steps.first)]
     links = [partial(arm.world_from_link, kinematics=arm.kinematics(positions)) for positions in joints]
     return _dynamics(arm, [arm.world_from_link, *links], is_free & (steps.off < _SERVED), step_s)

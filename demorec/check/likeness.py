@@ -17,14 +17,12 @@ from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeas
 from demorec.check.cells import correlation
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.evidence import Flags, Motion, is_gripper, quaternion_places
-from demorec.check.motion import MOVES
+from demorec.check.motion import FEWEST_TO_COMPARE, MOVES
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE
 
 _FEWEST_EPISODES, _FEWEST_FRAMES = 3, 30
-FEWEST_TO_COMPARE = 4
-"""Episodes from which on one is told to be unlike the others."""
 _AHEAD_S = (0.0, 0.1, 0.3)
 """How far ahead the states are looked at that an action leads to, seconds; the first is one frame."""
 _RIDGE = 1e-3
@@ -32,6 +30,9 @@ _CLEAR = 0.6
 """Correlation of an element of the action with what the states of other episodes make of it, from which it counts."""
 _LIVELY = 0.25
 """Share of an action's usual deviation, as the states tell it, from which on an episode is judged."""
+_ELEMENT, _ELEMENT_COUNTS = 0.25, 0.6
+"""Share of the usual motion of an element, squared, from which an episode's is judged, and what counts of how much less
+it goes with the states."""
 _TARGET = 0.65
 """Share of an action's variance that the states of the same frame tell, in the median of its elements, above which it
 is a target: of targets 0.84 to 0.99, of increments 0.15 to 0.47."""
@@ -176,6 +177,12 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     lively = lively > _LIVELY * np.median(lively)  # of an arm that waits noise decides
     for number, below in zip(found.numbers, (np.median(own) - own) * lively, strict=True):
         yield Measurement(value=max(float(below), 0.0), detail=f"episode {number}")
+    each = common / np.maximum(sizes, 1e-9)
+    below = (np.median(each, axis=0) - each) * clear * (moves > _ELEMENT * np.median(moves, axis=0))
+    row, element = divmod(int(np.argmax(below)), below.shape[1])
+    yield Measurement(
+        value=_ELEMENT_COUNTS * float(below[row, element]), detail=f"episode {found.numbers[row]}, element {element}"
+    )
 
 
 @likeness_check(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Protocol
 
@@ -41,6 +42,8 @@ _FEW_FPS = 20
 """Frames a second below which exploration noise moves a joint to and fro between two frames."""
 FEWEST = 30
 """Frames below which an episode says nothing of lags and orders."""
+FEWEST_TO_COMPARE = 4
+"""Episodes from which on one is told to be unlike the others."""
 _FEWEST_WAYS = 20
 """Ways of `_VELOCITY_S` below which an episode's velocities are not judged by themselves."""
 _OWN = 0.5
@@ -56,6 +59,9 @@ MOVES = 1e-3
 """Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
 """After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
+_STUCK, _INVERTED = 0.01, 0.5
+"""Share of what a gripper can open by, below which one that is told to open and to close never moves; correlation with
+a steady command, below nothing, of one that goes the other way."""
 _LEAST_STROKE = 0.2
 """Share of what a gripper can open by, below which its command only trembles."""
 _STILL_FRAMES = 19
@@ -309,6 +315,11 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     off = np.where(holds, np.maximum(beyond, 0.0), np.abs(gap)) / reach
     where = f", {motion.where}" if motion.where else ""
     detail = f"{int(steady.sum())} frames after the motion{where}"
+    if float(np.ptp(command[steady])) > _LEAST_STROKE * reach:
+        if float(np.ptp(opening)) < _STUCK * reach:
+            return Measurement(value=1.0, detail=f"it never moves{where}")
+        if float(np.corrcoef(opening[steady], command[steady])[0, 1]) < -_INVERTED:
+            return Measurement(value=1.0, detail=f"it opens when told to close, and closes when told to open{where}")
     if motion.contact is None and (rows := steady & is_open).any():  # what is beside them shows in some frames
         off = np.where(is_open, np.median(off[rows]), off)
     return worst_frame(np.where(steady, off, 0.0), detail)
@@ -324,14 +335,21 @@ def effort_matches_dynamics(subject: Moving) -> Iterator[Found]:
     """The motors of the joints that bear the arm give the torques that its weight and motion need.
 
     Catches torques of other joints, of another sign or unit, halved or frozen. Of other robots than simulated ones the
-    load in the hand and the friction are not known, and some drivers leave out the weight: they are only warned of.
+    load in the hand and the friction are not known, and some drivers leave out the weight: they are only warned of. By
+    how much more than usual one of four episodes is off counts twice.
     """
+    found = list[Measurement]()
     for motion in subject.motions.all:
         dynamics = subject.dynamics_of(motion)
         if motion.effort is None or dynamics is None:
             yield Lacking(need=EFFORTS)
             return
-        yield dynamics if isinstance(dynamics, NotMeasured) else dynamics.compare(motion.joints, motion.effort)
+        told = dynamics if isinstance(dynamics, NotMeasured) else dynamics.compare(motion.joints, motion.effort)
+        if isinstance(told, Measurement):
+            found.append(replace(told, detail=f"{told.detail}, {motion.where}".rstrip(", ")))
+        yield told
+    usual = float(np.median([told.value for told in found])) if len(found) >= FEWEST_TO_COMPARE else math.inf
+    yield from (replace(told, value=2 * (told.value - usual)) for told in found if told.value > 2 * usual)
 
 
 @motion_check(

@@ -16,6 +16,8 @@ from demorec.core.geometry import Array
 
 _LARGEST = 2.0
 """How many times as large as its model a robot may be built, or as small."""
+_FAR_BETTER = 2.0
+"""Times what an episode is off by its own mounts, which says how good any can be."""
 _FITTED_FRAMES, _FITTED_EPISODES, _LEVER = 60, 20, 0.1
 """By which fixed mounts are found, and metres at which a turn counts beside a distance."""
 _FEWEST_EPISODES, _OFF = 3, 0.01
@@ -66,7 +68,8 @@ def pose_follows_joints(subject: Moving) -> Iterator[Found]:
 )
 def mounts_alike(subject: Moving) -> Found:
     """The arm stands where it stood and has the tool that it had, and its joints have their zeros, in all episodes:
-    catches an arm that was homed anew, another tool, a base that was moved."""
+    catches an arm that was homed anew, another tool, a base that was moved. What is usual does not count, unless the
+    mounts of an episode alone fit it far better: half of them may be off."""
     motions = [m for m in subject.motions.all if m.ee_pose is not None and m.urdf is not None]
     if not motions:
         return Lacking(need=EE_POSES)
@@ -79,9 +82,18 @@ def mounts_alike(subject: Moving) -> Found:
     links = np.concatenate([_links(motion)[some] for motion, some in zip(chosen, rows, strict=True)])
     poses = np.concatenate([_poses(motion)[some] for motion, some in zip(chosen, rows, strict=True)])
     fit = _fitted(links, poses, loss="soft_l1")
-    off = [float(np.quantile(displacement(_placed(fit, _links(motion)), _poses(motion)), 0.9)) for motion in motions]
+    off = [_off_by(fit, motion) for motion in motions]
     worst = int(np.argmax(off))
-    return Measurement(value=off[worst] - float(np.median(off)), detail=motions[worst].where)
+    chosen_links, chosen_poses = _links(motions[worst]), _poses(motions[worst])
+    some = np.unique(np.linspace(0, len(chosen_links) - 1, _FITTED_FRAMES).astype(int))
+    alone = _off_by(_fitted(chosen_links[some], chosen_poses[some]), motions[worst])
+    usual = min(float(np.median(off)), _FAR_BETTER * alone)
+    return Measurement(value=off[worst] - usual, detail=motions[worst].where)
+
+
+def _off_by(fit: Array, motion: Motion) -> float:
+    """Metres that nine of ten poses are off at most."""
+    return float(np.quantile(displacement(_placed(fit, _links(motion)), _poses(motion)), 0.9))
 
 
 def _links(motion: Motion) -> Array:

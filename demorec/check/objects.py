@@ -31,8 +31,8 @@ _PRESSED, _PRESSED_BLINDLY, _IN_HAND = 0.002, 0.004, 0.05
 """Metres by which a hand presses what it lowers into a support at most, the same in an attempt that failed (2.6 mm were
 seen), and of what it holds from its TCP."""
 _STILL, _AT_REST = 2e-5, 10.0
-"""Metres in a frame that are no motion, and what a depth counts where nothing moves and fingers touch nothing: of 110
-episodes of all tasks 0.1 mm at most."""
+"""Metres in a frame that are no motion, and what a depth counts where nothing moves and fingers touch nothing: of 355
+episodes of all tasks 0.15 mm at most."""
 SOLID = ("box", "sphere", "cylinder", "capsule")
 """Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 

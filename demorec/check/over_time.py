@@ -50,9 +50,12 @@ _FEWEST_OF_SIDE = 10
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
 _STALE, _CHANGES, _CLEARLY = 0.2, 1.5, 2.5
-"""An image repeats the one before that changes by less than this share of what both of its neighbours change, where
+"""An image repeats the one before that changes by less than this share of what the images on both sides change, where
 these change by so many levels of 255. A repeated image that is encoded again changes by 0.6. Predicted images of x264
 at crf 23, every second one, may lack a motion of up to two levels where all are of 64x48 pixels."""
+_COPIES = 3
+"""Images on either side of one that repeats the one before, of which some change: a camera may have a quarter of the
+frames' rate."""
 _FEWEST_CHANGING, _FEWEST_REPEATS = 25, 5
 """Images among changing ones, of all episodes together, and repeats among them, from which on their share tells."""
 
@@ -193,7 +196,7 @@ def stale_images(subject: Filmed) -> Iterator[Found]:
     for camera, films in subject.films.items():
         long = [film for film in films if len(film.cells) >= _FEWEST_IMAGES]
         places, changing = _repeats(long, _CHANGES)
-        if len({place % 2 for place in places}) == 1 and len(places) < changing / 4:  # may be the encoder's
+        if len({place % 2 for place in places}) == 1 and len(places) < changing / 3:  # may be the encoder's
             places, changing = _repeats(long, _CLEARLY)
         if changing < _FEWEST_CHANGING:
             yield NotMeasured(why=f"{camera} hardly changes")
@@ -206,9 +209,11 @@ def _repeats(films: Sequence[Film], least: float) -> tuple[list[int], int]:
     """Numbers of the images that repeat the one before, and how many change where those around them do."""
     places, changing = list[int](), 0
     for film in films:
-        around = np.minimum(film.step[:-2], film.step[2:])
-        changes = (around > least) & np.lib.stride_tricks.sliding_window_view(_moving(film), 3).all(axis=1)
-        places += np.flatnonzero(changes & (film.step[1:-1] < _STALE * around)).tolist()
+        beside = np.lib.stride_tricks.sliding_window_view(film.step, 2 * _COPIES + 1)
+        around = np.minimum(beside[:, :_COPIES].max(axis=1), beside[:, -_COPIES:].max(axis=1))
+        moves = np.lib.stride_tricks.sliding_window_view(_moving(film), 2 * _COPIES + 1).all(axis=1)
+        changes = (around > least) & moves
+        places += np.flatnonzero(changes & (film.step[_COPIES:-_COPIES] < _STALE * around)).tolist()
         changing += int(changes.sum())
     return places, changing
 

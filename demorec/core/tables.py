@@ -150,7 +150,7 @@ CHECKS: Registry[Check] = Registry(
             "targets_as_named",
             "same_by_name",
         ),
-        ("views", "views_upright", "views_alike", "views_stay"),
+        ("views", "views_upright", "views_alike", "views_stay", "films_differ"),
         ("run", "duplicates", "coverage"),
         ("alignment", "dataset_action_lag"),
         ("dataset_files", "dataset_sidecar"),

@@ -28,7 +28,7 @@ from support.dataset_edits import (
     pixels,
     stats,
 )
-from support.dataset_particular import repeats
+from support.dataset_particular import held, repeats
 from support.export import export
 from support.foreign_dataset import write_foreign
 
@@ -38,7 +38,7 @@ WORLD = "observation.environment_state"
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
     "mounts_alike", "encoder_steps", "quaternions_keep_sign", "duplicates", "effort_lag", "same_by_name",
-    "action_steps", "repeated_frames", "steps_as_velocities",
+    "action_steps", "repeated_frames", "steps_as_velocities", "effort_matches_dynamics",
 )  # fmt: skip
 
 
@@ -134,6 +134,17 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
         "repeated_frames",
         "warn",
     ),
+    "torques of half the size in one episode": (
+        numbers("observation.effort", lambda rows: rows / 2, only=(1,)), "effort_matches_dynamics", "warn"
+    ),
+    "no increments of a joint in one episode": (
+        numbers("action", lambda rows: columns(rows, 3, np.zeros_like), only=(1,)), "actions_go_with_states", "warn"
+    ),
+    "another tool in half of the episodes": (
+        numbers("observation.ee_pose", lambda rows: rows + 0.1 * (np.arange(7) == 2), only=(0, 1)),
+        "mounts_alike",
+        "warn",
+    ),
     "increments of a few bits": (
         numbers("action", lambda rows: np.round(rows * 20) / 20), "action_steps", "warn"
     ),
@@ -183,11 +194,21 @@ VIEWS = (
     "views_stay",
     "stale_images",
     "frozen_images",
+    "films_differ",
+    "gripper_follows",
+    "action_is_no_observation",
     "interpolated_images",
     "offsets_alike",
     "targets_as_named",
 )
-FAILS = ("frozen_images", "images_stay_upright", "exchanged_cameras", "distinct_cameras", "dataset_image_statistics")
+FAILS = (
+    "frozen_images",
+    "gripper_follows",
+    "images_stay_upright",
+    "exchanged_cameras",
+    "distinct_cameras",
+    "dataset_image_statistics",
+)
 
 
 @pytest.fixture(scope="module")
@@ -199,6 +220,24 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     export(run, folder / "dataset")
     shutil.rmtree(folder / "dataset" / "demorec")
     return folder / "dataset"
+
+
+def one_film_twice(dataset: Path) -> None:
+    images, parts = loose.images_of(dataset, WRIST), loose.parts_of(dataset)
+    count = min(part.stop - part.start for part in parts[1:3])
+    images[parts[2].start : parts[2].start + count] = images[parts[1].start : parts[1].start + count]
+    loose.put_images(dataset, WRIST, images)
+
+
+def states_for_actions(dataset: Path) -> None:
+    actions, part = loose.rows_of(dataset, "action"), loose.parts_of(dataset)[1]
+    actions[part] = loose.rows_of(dataset, "observation.state")[part]
+    loose.put_rows(dataset, "action", actions)
+
+
+def bars(images: Images) -> Images:
+    images[:, :12] = images[:, -12:] = 0
+    return images
 
 
 def gray(images: Images) -> Images:
@@ -231,6 +270,16 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
         film(WRIST, lambda r: repeats(r, 10), only=None), "stale_images"
     ),
     "a camera that hangs for two seconds": (film(WRIST, lambda r: frozen(r, 30, 40)), "frozen_images"),
+    "a camera of a third of the rate": (film(FRONT, lambda r: held(r, 3), only=None), "stale_images"),
+    "one film in two episodes": (one_film_twice, "films_differ"),
+    "bars of black in one episode": (film(WRIST, bars), "views_upright"),
+    "a gripper that sticks": (
+        numbers("observation.state", lambda r: columns(r, -1, lambda w: 0 * w + w[0]), only=(1,)), "gripper_follows"
+    ),
+    "a gripper that is told the contrary": (
+        numbers("action", lambda r: columns(r, -1, lambda w: w.max() + w.min() - w), only=(1,)), "gripper_follows"
+    ),
+    "actions that are the states of one episode": (states_for_actions, "action_is_no_observation"),
     "cameras exchanged in one episode": (both(lambda a, b: (b, a)), "exchanged_cameras"),
     "one camera under both names in one episode": (both(lambda a, b: (a, a)), "distinct_cameras"),
     "a camera that is hit": (

@@ -132,11 +132,11 @@ def only_first_subtask(episode: Episode) -> None:
         persistent[:] = [row for row in persistent if row not in subtasks[1:]]
 
 
-def other_colors(episode: Episode) -> None:
-    """No wording has the colours of the instruction."""
+def other_colors(episode: Episode, style: str) -> None:
+    """Nothing of a style has the colours of the instruction."""
     for persistent, _ in episode:
         for row in persistent:
-            if row["style"] == "task_aug":
+            if row["style"] == style:
                 row["content"] = re.sub(r"\b(red|blue|yellow|orange|purple|green)\b", "white", row["content"])
 
 
@@ -170,7 +170,8 @@ FAULTS: dict[str, tuple[str, Callable[[Episode], None]]] = {
     "a camera that is none": ("dataset_language", first_event(of(camera="observation.images.back"))),
     "no camera": ("dataset_language", first_event(of(camera=None), "trace")),
     "motions of the other direction": ("dataset_language", turned_round),
-    "wordings of other colours": ("dataset_language", other_colors),
+    "wordings of other colours": ("dataset_language", lambda episode: other_colors(episode, "task_aug")),
+    "subtasks of other colours": ("dataset_language", lambda episode: other_colors(episode, "subtask")),
     "no subtask but the first": ("dataset_language", only_first_subtask),
     "a subtask of the user's": ("dataset_language", everywhere("subtask", of(role="user"))),
     "a wording of the robot's": ("dataset_language", everywhere("task_aug", of(role="assistant"))),

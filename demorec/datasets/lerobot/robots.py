@@ -147,7 +147,9 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
             continue
         if set(robot.arm_joints) <= set(stems):
             urdf = robot_description(robot.urdf, 1.0)
-            joints = tuple(stem if stem in robot.joint_names else "" for stem in stems)
+            # An opening in metres is no angle of the jaw.
+            known = zip(names, stems, strict=True)
+            joints = tuple(stem if stem in robot.joint_names and name != _IN_METRES else "" for name, stem in known)
             record = RobotRecord(name=robot.name, urdf_sha256=_sha256(urdf), joints={STATE: joints})
             return DatasetRobot(record=record, urdf=urdf)
     return None
