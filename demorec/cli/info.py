@@ -25,7 +25,7 @@ _SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 @dataclass(frozen=True, kw_only=True)
 class Info:
-    """Show what recordings, runs, datasets, HDF5 files and bags hold.
+    """Show what each path holds.
 
     Examples:
       demorec info recordings/cubes

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
-from demorec.cli.shared.flags import Allow, MappingFile, allowed_modules
+from demorec.cli.shared.flags import WHAT_IS_READ, Allow, MappingFile, allowed_modules
 from demorec.cli.shared.output import counted, say, size_in_words
 from demorec.cli.shared.paths import places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
@@ -32,8 +33,7 @@ class Report:
       demorec report datasets/cubes --against datasets/sorted --out sorted.html
     """
 
-    path: Positional[Path]
-    """A run, a recording, an evaluation, a LeRobot dataset, an HDF5 file, a bag, or a folder of recordings or bags."""
+    path: Annotated[Positional[Path], arg(help=f"One of: {WHAT_IS_READ}, evaluations.")]
     against: Path | None = None
     """A LeRobot dataset that the dataset is compared with, as by demorec dataset diff."""
     mapping: MappingFile = None

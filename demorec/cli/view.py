@@ -6,11 +6,11 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
-from demorec.cli.shared.flags import Allow, MappingFile, allowed_modules
+from demorec.cli.shared.flags import WHAT_IS_READ, Allow, MappingFile, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
 from demorec.cli.shared.paths import places_read, reading, refuse_inside, tell_unfinished
 from demorec.core.errors import ConfigError, check_option
@@ -42,8 +42,7 @@ class View:
       demorec view original.mcap replayed.mcap --compare
     """
 
-    paths: Positional[tuple[Path, ...]]
-    """Recordings, runs, LeRobot datasets, HDF5 files, bags, folders of recordings or of bags, or .rrd files."""
+    paths: Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}, .rrd files.")]
     mapping: MappingFile = None
     compare: bool = False
     """Overlay two episodes: the same streams in the same views, and the distance between them."""

@@ -194,10 +194,8 @@ Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_b
 """One module or package each time, since paths may follow."""
 
 
-Readable = Annotated[
-    Positional[tuple[Path, ...]],
-    arg(help="Recordings, runs, LeRobot datasets, HDF5 files, bags, or folders of recordings or of bags."),
-]
+WHAT_IS_READ = "recordings, runs, LeRobot datasets, HDF5 files, bags, folders of recordings or of bags"
+Readable = Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}.")]
 MappingFile = Annotated[
     Path | None,
     arg(
