@@ -30,9 +30,6 @@ _CLEAR = 0.6
 """Correlation of an element of the action with what the states of other episodes make of it, from which it counts."""
 _LIVELY = 0.25
 """Share of an action's usual deviation, as the states tell it, from which on an episode is judged."""
-_ELEMENT, _SURELY, _ELEMENT_COUNTS = 0.5, 0.85, 0.54
-"""Of an element by itself: share of its usual motion, squared, from which an episode is judged, the correlation that
-all other episodes have, and what counts of how much less this one has: it is only warned of."""
 _TARGET = 0.65
 """Share of an action's variance that the states of the same frame tell, in the median of its elements, above which it
 is a target: of targets 0.84 to 0.99, of increments 0.15 to 0.47."""
@@ -177,12 +174,6 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     lively = lively > _LIVELY * np.median(lively)  # of an arm that waits noise decides
     for number, below in zip(found.numbers, (np.median(own) - own) * lively, strict=True):
         yield Measurement(value=max(float(below), 0.0), detail=f"episode {number}")
-    each = common / np.maximum(sizes, 1e-9)
-    told = clear & (np.sort(each, axis=0)[1] > _SURELY)  # of poses, joints tell no linear function
-    below = (np.median(each, axis=0) - each) * told * (moves > _ELEMENT * np.median(moves, axis=0))
-    row, element = divmod(int(np.argmax(below)), below.shape[1])
-    value = _ELEMENT_COUNTS * min(float(below[row, element]), 1.0)
-    yield Measurement(value=value, detail=f"episode {found.numbers[row]}, element {element}")
 
 
 @likeness_check(

@@ -317,8 +317,8 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     off = np.where(holds, np.maximum(beyond, 0.0), np.abs(gap)) / reach
     where = f", {motion.where}" if motion.where else ""
     detail = f"{int(steady.sum())} frames after the motion{where}"
-    if float(np.ptp(command[steady])) > _LEAST_STROKE * reach:
-        if float(np.ptp(opening)) < _STUCK * reach:
+    if motion.contact is None and float(np.ptp(command[steady])) > _LEAST_STROKE * reach:
+        if float(np.ptp(opening[steady])) < _STUCK * reach:
             return Measurement(value=1.0, detail=f"it never moves{where}")
         if float(np.corrcoef(opening[steady], command[steady])[0, 1]) < -_INVERTED:
             return Measurement(value=1.0, detail=f"it opens when told to close, and closes when told to open{where}")

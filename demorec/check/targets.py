@@ -238,7 +238,7 @@ def action_is_no_observation(subject: Moving) -> Iterator[Found]:
         state, action = motion.state[:, arm], motion.action[:, arm]
         near = _COPIED * max(float(np.ptp(state, axis=0).max(initial=0.0)), 1e-9)
         moves = np.abs(np.diff(state, axis=0)).max(axis=1, initial=0.0) > 10 * near
-        if moves.any():
+        if moves.sum() >= FEWEST // 2:
             off = [np.abs(seen - action[:-1]).max(axis=1, initial=0.0)[moves] for seen in (state[1:], state[:-1])]
             share = max(float((each < near).mean()) for each in off)
             yield Measurement(value=share, detail=f"of {moves.sum()} frames, {motion.where}".rstrip(", "))

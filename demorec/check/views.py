@@ -144,14 +144,13 @@ def films_differ(dataset: Dataset) -> Iterator[Found]:
     for films in dataset.films.values():
         places = [round(share * float(np.median([len(film.cells) for film in films]))) for share in (0.25, 0.5, 0.75)]
         long = [film for film in films if len(film.cells) > max(places[-1], FEWEST // 2)]
-        if len(long) < 2:
-            yield NotMeasured(why="fewer than two episodes are long enough")
+        shown = [(film.where, film.cells[places].astype(np.float64)) for film in long]
+        shown = [(where, cells) for where, cells in shown if cells.var(axis=0).mean() > _ONE_FILM**2]
+        if len(shown) < 2:
+            yield NotMeasured(why="fewer than two episodes are long enough, and change")
             continue
-        yield twins(
-            [film.cells[places].reshape(-1).astype(np.float64) * (TWIN_DISTANCE / _ONE_FILM) for film in long],
-            [film.where for film in long],
-            "films",
-        )
+        rows = [cells.reshape(-1) * (TWIN_DISTANCE / _ONE_FILM) for _, cells in shown]
+        yield twins(rows, [where for where, _ in shown], "films")
 
 
 @views_check(

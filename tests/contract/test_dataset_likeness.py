@@ -137,9 +137,6 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
     "torques of half the size in one episode": (
         numbers("observation.effort", lambda rows: rows / 2, only=(1,)), "effort_matches_dynamics", "warn"
     ),
-    "no increments of a joint in one episode": (
-        numbers("action", lambda rows: columns(rows, 3, np.zeros_like), only=(1,)), "actions_go_with_states", "warn"
-    ),
     "another tool in half of the episodes": (
         numbers("observation.ee_pose", lambda rows: rows + 0.1 * (np.arange(7) == 2), only=(0, 1)),
         "mounts_alike",
