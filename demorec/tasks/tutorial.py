@@ -15,12 +15,14 @@ from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.render.cameras import FRONT, TOP, WORKSPACE, CameraPreset
 from demorec.robots.robot import RobotSpec
+from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.furniture import COLORS, floor
-from demorec.tasks.grasping import raised
+from demorec.tasks.grasping import grasps_of, hand_yaw, raised
+from demorec.tasks.reach import Reach, within
 from demorec.tasks.sampling import Sampler, wording
-from demorec.tasks.script import Step, lasting, steady_width
+from demorec.tasks.script import Behaviour, Step, lasting, steady_width
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import (
     at_least,
@@ -128,6 +130,16 @@ class Tutorial(Task):
             goals=(goal,),
             hold="constraint",
         )
+
+    def is_in_reach(self, scene: Scene, robot: RobotSpec, behaviour: Behaviour) -> bool:
+        """A grasp of the cube where it falls to, from 25 cm above it."""
+        reach = Reach.of(arm_kinematics(robot, scale=ROBOT_SCALE), scene, robot)
+        start, cube = np.array(scene.robot.joint_position), scene.body(scene.goals[0].object)
+        now = hand_yaw(reach.world_from_base @ reach.arm.forward(start))
+        fallen = raised(cube.world_from_body, CUBE_SIDE / 2 - CUBE_START[2])
+        grasps = grasps_of(cube, fallen, now=now, robot=robot, behaviour=behaviour)
+        found = within(reach.at_all, grasps, up_to=ABOVE_CUBE)
+        return any(reach.descends(grasp, by=ABOVE_CUBE, start=start) for grasp in found)
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
         """What to do, in words."""

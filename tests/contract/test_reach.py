@@ -21,6 +21,7 @@ from demorec.episode.variation import Ranges
         pytest.param("sort_by_color", "panda", "full", 0, 252, id="no straight line leads there"),
         pytest.param("pick_shapes", "iiwa", "mild", 0, 126, id="a duck that is dropped when held over beak and tail"),
         pytest.param("line_up", "iiwa", "full", 77, 177, id="no line leads down, since the elbow gets straight"),
+        pytest.param("tutorial", "iiwa", "none", 82000, 117, id="the cube falls to where no grasp is in reach"),
     ],
 )
 def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed: int, index: int) -> None:
