@@ -330,7 +330,7 @@ def _told_by_states(found: _Scaled) -> Array:
     fail=math.inf,
 )
 def whole_episodes(dataset: Dataset) -> Found:
-    """An episode begins and ends as the others do, if these are alike, and of its own instruction or of three others:
+    """An episode begins and ends as the others do, if these are alike, and some of its own instruction among them:
     catches recordings that were cut off, halves of episodes, two in one, and ends that were filled up."""
     long = [
         (motion, int(rows["task_index"].reshape(-1)[0]))
@@ -351,9 +351,7 @@ def whole_episodes(dataset: Dataset) -> Found:
             told["with another opening"] = np.abs(opening - np.median(opening))
         for words, off in told.items():
             alike = np.quantile(off, _MOST, method="lower") < _ALIKE
-            usual = np.unique(tasks[off <= _OTHER])
-            compared = np.isin(tasks, usual) | (len(usual) >= _FEWEST_EPISODES)
-            strange = np.flatnonzero((off > _OTHER) & alike & compared)
+            strange = np.flatnonzero((off > _OTHER) & alike & np.isin(tasks, tasks[off <= _OTHER]))
             if len(strange) <= max(1, _RARE * len(motions)):
                 wrong += [f"{motions[number].where} {word} {words}, unlike the others" for number in strange]
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))

@@ -153,15 +153,6 @@ def test_good_ones_pass(increments: Path) -> None:
     assert [level_of(increments, law, "dataset") for law in LAWS] == ["pass"] * len(LAWS)
 
 
-def test_an_episode_with_an_instruction_of_its_own_that_begins_elsewhere(increments: Path, tmp_path: Path) -> None:
-    dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
-    parts = [np.arange(part.start, part.stop) for part in loose.parts_of(dataset)]
-    loose.put_rows(dataset, "task_index", loose.rows_of(dataset, "episode_index"))
-    assert level_of(dataset, "whole_episodes", "dataset") == "pass"
-    loose.reframe(dataset, [parts[0], parts[1][len(parts[1]) // 2 :], *parts[2:]])
-    assert level_of(dataset, "whole_episodes", "dataset") == "warn"
-
-
 def test_a_gripper_that_is_not_used_may_tremble(increments: Path, tmp_path: Path) -> None:
     dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
     numbers("action", lambda rows: columns(rows, -1, lambda width: 0 * width + 0.08))(dataset)
