@@ -53,9 +53,9 @@ _STALE, _CHANGES, _CLEARLY = 0.2, 1.5, 2.5
 """An image repeats the one before that changes by less than this share of what the images on both sides change, where
 these change by so many levels of 255. A repeated image that is encoded again changes by 0.6. Predicted images of x264
 at crf 23, every second one, may lack a motion of up to two levels where all are of 64x48 pixels."""
-_COPIES = 3
-"""Images on either side of one that repeats the one before, of which some change: a camera may have a quarter of the
-frames' rate."""
+_COPIES, _SLOWEST_FPS = 3, 10.0
+"""Images on either side of one that repeats the one before, at most, of which some change: a camera may have a quarter
+of the frames' rate, but hardly less than ten images a second."""
 _FEWEST_CHANGING, _FEWEST_REPEATS = 25, 5
 """Images among changing ones, of all episodes together, and repeats among them, from which on their share tells."""
 
@@ -197,8 +197,10 @@ def stale_images(subject: Filmed) -> Iterator[Found]:
         long = [film for film in films if len(film.cells) >= _FEWEST_IMAGES]
         places, changing = _repeats(long, _CHANGES)
         odd = sum(place % 2 for place in places)
-        if min(odd, len(places) - odd) <= len(places) / 8 and len(places) < changing / 3:  # may be the encoder's
-            places, changing = _repeats(long, _CLEARLY)
+        if min(odd, len(places) - odd) <= len(places) / 8 and len(places) < changing / 3:
+            clear, clearly = _repeats(long, _CLEARLY)
+            if len(clear) * changing < len(places) * clearly / 2 or not clear:  # the encoder's
+                places, changing = clear, clearly
         if changing < _FEWEST_CHANGING:
             yield NotMeasured(why=f"{camera} hardly changes")
             continue
@@ -210,11 +212,12 @@ def _repeats(films: Sequence[Film], least: float) -> tuple[list[int], int]:
     """Numbers of the images that repeat the one before, and how many change where those around them do."""
     places, changing = list[int](), 0
     for film in films:
-        beside = np.lib.stride_tricks.sliding_window_view(film.step, 2 * _COPIES + 1)
-        around = np.minimum(beside[:, :_COPIES].max(axis=1), beside[:, -_COPIES:].max(axis=1))
-        moves = np.lib.stride_tricks.sliding_window_view(_moving(film), 2 * _COPIES + 1).all(axis=1)
+        reach = min(max(round(film.fps / _SLOWEST_FPS), 1), _COPIES)
+        beside = np.lib.stride_tricks.sliding_window_view(film.step, 2 * reach + 1)
+        around = np.minimum(beside[:, :reach].max(axis=1), beside[:, -reach:].max(axis=1))
+        moves = np.lib.stride_tricks.sliding_window_view(_moving(film), 2 * reach + 1).all(axis=1)
         changes = (around > least) & moves
-        places += np.flatnonzero(changes & (film.step[_COPIES:-_COPIES] < _STALE * around)).tolist()
+        places += np.flatnonzero(changes & (film.step[reach:-reach] < _STALE * around)).tolist()
         changing += int(changes.sum())
     return places, changing
 
