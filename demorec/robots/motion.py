@@ -21,6 +21,8 @@ PEAK_ACCELERATION = 5.774
 _ROUNDS, _ROUNDS_WITH_FREEDOM = 5, 20
 """How often a motion is slowed down at most. Where a joint of an arm of few joints meets its limit, the others take
 over from one step to the next, and at half the speed the acceleration of such a kink is half, not a quarter."""
+_LONGEST_S = 60.0
+"""Of a motion; a longer one leads through a jump of the joints, which is none the smaller for it, round by round."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,6 +87,7 @@ def plan_straight(
         PEAK_VELOCITY * angle / (limits.angular_velocity * turn_speed),
         math.sqrt(PEAK_ACCELERATION * angle / limits.angular_acceleration),
     )
+    longest = max(_LONGEST_S, 2 * seconds)
     for _ in range(_ROUNDS if arm.freedom == WHOLE_POSE else _ROUNDS_WITH_FREEDOM):
         steps = max(1, math.ceil(seconds / dt))
         path = arm.straight_path(
@@ -100,6 +103,8 @@ def plan_straight(
         if factor <= 1.0:
             return path
         seconds *= 1.02 * factor
+        if seconds > longest:
+            return None
     return None
 
 

@@ -32,6 +32,12 @@ def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed
     assert frames[-1].observation.contact_force == 0
 
 
+def test_a_line_on_which_the_joints_jump_is_given_up() -> None:
+    """Slowed down again and again it took minutes to plan, and more memory each time."""
+    _, outcome = run(episode(230, task="tutorial", robot="iiwa", variation="full", seed=82000))
+    assert (outcome.success, outcome.failure_reason) == (False, "unreachable")
+
+
 def test_a_hand_that_looks_ten_times_a_second_does_not_press_what_it_puts_down(tmp_path: Path) -> None:
     """This cylinder was pushed a millimetre into a finger before it was seen that it stood."""
     path = simulate(
