@@ -197,7 +197,8 @@ def stale_images(subject: Filmed) -> Iterator[Found]:
         long = [film for film in films if len(film.cells) >= _FEWEST_IMAGES]
         places, changing = _repeats(long, _CHANGES)
         odd = sum(place % 2 for place in places)
-        if min(odd, len(places) - odd) <= len(places) / 8 and len(places) < changing / 3:
+        on_one_side = min(odd, len(places) - odd) <= len(places) / 8
+        if on_one_side and _FEWEST_REPEATS <= len(places) < changing / 3:
             clear, clearly = _repeats(long, _CLEARLY)
             if len(clear) * changing < len(places) * clearly / 2 or not clear:  # the encoder's
                 places, changing = clear, clearly
