@@ -14,7 +14,7 @@ from itertools import chain
 
 import numpy as np
 
-from demorec.core.geometry import Pose
+from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, Goal
 from demorec.robots.kinematics import WHOLE_POSE
@@ -182,14 +182,8 @@ class Expert:
             GaveUp: The arm cannot get there so.
         """
         self._free, self._clear_height = free, clear_height
-        path = self.reach.path(
-            world_from_tcp,
-            start=self.joint_target,
-            speed=speed,
-            pace=self.behaviour.speed,
-            dt=1.0 / self.world.fps,
-            may_sink=MOST_BELOW_LINE * self._scale if free and clear_height == -math.inf else None,
-        )
+        may_sink = MOST_BELOW_LINE * self._scale if free and clear_height == -math.inf else None
+        path = self._path(world_from_tcp, speed=speed, may_sink=may_sink)
         if path is None:
             raise GaveUp(self.phase, "unreachable")
         for joint_target in path:
@@ -270,14 +264,15 @@ class Expert:
         raise self._out_of_reach(f"{name} at {place}", self.grasps(name))
 
     def reachable_place(self, position: tuple[float, float, float]) -> Pose:
-        """`world_from_tcp` at a position, the hand pointing down at the reachable yaw nearest to the present one.
+        """`world_from_tcp` at a position, the hand down at the nearest yaw to which a straight line leads from here.
 
         Raises:
             GaveUp: Out of reach at every yaw.
         """
         now = hand_yaw(self.tcp())
         places = [hand_down(position, yaw) for yaw in nearest_first(symmetric_yaws(now, 24), now)]
-        place = next(chain(filter(self.reaches, places), filter(self.reach.at_all, places)), None)
+        found = chain(filter(self.reaches, places), filter(self.reach.at_all, places))
+        place = next((place for place in found if self._path(place, speed=FREE_SPEED) is not None), None)
         if place is None:
             raise self._out_of_reach(f"{np.round(position, 3).tolist()}", places)
         return place
@@ -427,3 +422,13 @@ class Expert:
         if place is None:
             raise self._out_of_reach(f"the goal of {goal.object}", places)
         return place
+
+    def _path(self, world_from_tcp: Pose, *, speed: float, may_sink: float | None = None) -> Array | None:
+        return self.reach.path(
+            world_from_tcp,
+            start=self.joint_target,
+            speed=speed,
+            pace=self.behaviour.speed,
+            dt=1.0 / self.world.fps,
+            may_sink=may_sink,
+        )
