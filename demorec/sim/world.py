@@ -233,10 +233,14 @@ class World:
         """The movable body that a link of the robot presses on harder than a real hand could; "" for none."""
         for body in self.scene.movable:
             forces: dict[int, float] = {}
-            for contact in self.client.getContactPoints(self.arm.body, self._bodies[body.name]):
+            touching = self.client.getContactPoints(self.arm.body, self._bodies[body.name])
+            for contact in touching:
                 forces[contact[3]] = forces.get(contact[3], 0.0) + contact[9]
-                if contact[8] < -MAX_PRESS_DEPTH or forces[contact[3]] > MAX_PRESS_FORCE:
-                    return body.name
+            # Contact points lie where the bodies were before the last step; a blow may have turned one since.
+            nearest = self.client.getClosestPoints(self.arm.body, self._bodies[body.name], 0.0) if touching else ()
+            depth = -min((point[8] for point in (*touching, *nearest)), default=0.0)
+            if depth > MAX_PRESS_DEPTH or max(forces.values(), default=0.0) > MAX_PRESS_FORCE:
+                return body.name
         return ""
 
     def touches_robot(self, name: str) -> bool:

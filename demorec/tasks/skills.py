@@ -354,9 +354,13 @@ class Expert:
         yield from self.open_gripper(max_seconds=max(1.0, self._stroke_seconds))
         self.phase = "retreat"
         here = self.tcp_target()
+        least = raised(here, self._scale * 0.1)
         away = raised(here, self._scale * max(0.1, self.behaviour.approach_height))
         clear_height = float(here.position[2]) + 0.07 * self._scale
-        yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
+        try:
+            yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
+        except GaveUp:
+            yield from self.move(least, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
         if not self._keeps_bytes:
             yield from self._until_at_rest(name)
