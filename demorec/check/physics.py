@@ -7,12 +7,14 @@ from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.base import (
     Found,
     Lacking,
     Measurement,
     NotMeasured,
+    alignment_check,
     physics_check,
     worst,
     worst_entry,
@@ -94,6 +96,8 @@ _SLOW = 0.02
 
 _AT_LIMIT = 0.99
 """Share of its torque from which on a motor does what it can, not what it is told."""
+_MOST_LAG, _CLEAR = 3, 0.5
+"""Frames by which velocities are shifted; below which share of what is off without a shift another fits better."""
 _SCATTER = 0.2
 """By which the scatter of velocities counts beside their ratio to those of the servo."""
 
@@ -264,18 +268,45 @@ def ends_at_rest(episode: CheckedEpisode) -> Found:
     return worst_entry(speed * length, robot.arm_joints, first=c.num_frames - 1)
 
 
+def _by_servo(episode: CheckedEpisode) -> tuple[NDArray[np.bool_], Array]:
+    """(T - 1, n) of frames 1 on: whether a motor is below its limit, and the velocities that the servo gives, rad/s.
+
+    It takes a joint by a fixed share of what is left to its target in each physics step.
+    """
+    c, info, n = episode.columns, episode.info, episode.num_arm
+    is_free = np.abs(c.joint_effort[1:, :n]) < _AT_LIMIT * np.array(info.robot.torque_limit)
+    left = c.command_joint_target[:-1] - c.joint_position[1:, :n]
+    return is_free, left * (info.physics_hz * POSITION_GAIN / (1 - POSITION_GAIN))
+
+
+@alignment_check(
+    measures="frames by which velocities are off those that the servo's distance from its target gives",
+)
+def velocity_lag(episode: CheckedEpisode) -> Found:
+    """Velocities are those of their frames: no shift fits the servo's better, of all joints together."""
+    if episode.num_frames < MIN_FRAMES + 2 * _MOST_LAG:
+        return NotMeasured(why="there are too few frames")
+    is_free, due = episode.shared(_by_servo)
+    velocity, core = episode.columns.joint_velocity[1:, : episode.num_arm], slice(_MOST_LAG, -_MOST_LAG)
+    off = {
+        lag: float((((np.roll(velocity, -lag, axis=0) - due) ** 2) * is_free)[core].sum())
+        for lag in range(-_MOST_LAG, _MOST_LAG + 1)
+    }
+    lag = min(off, key=off.__getitem__)
+    if off[lag] > _CLEAR * off[0]:
+        lag = 0
+    return Measurement(value=abs(lag), detail=f"{lag:+d} frames")
+
+
 @physics_check(
     measures="velocity of a joint against that which the servo's distance from its target gives, ratio off 1, or a "
     "fifth of its scatter",
 )
 def velocity_follows_servo(episode: CheckedEpisode) -> Found:
-    """The servo takes a joint by a fixed share of what is left to its target in each physics step, so that what is left
-    in a frame gives the velocity in it, unless the motor is at its limit: catches velocities a few per cent off, of
-    another joint, or late."""
-    c, info, n = episode.columns, episode.info, episode.num_arm
-    is_free = np.abs(c.joint_effort[1:, :n]) < _AT_LIMIT * np.array(info.robot.torque_limit)
-    left = c.command_joint_target[:-1] - c.joint_position[1:, :n]
-    expected = left * (info.physics_hz * POSITION_GAIN / (1 - POSITION_GAIN))
+    """What is left to the servo's target in a frame gives the velocity in it, unless the motor is at its limit: catches
+    velocities a few per cent off, or of another joint."""
+    c, info = episode.columns, episode.info
+    is_free, expected = episode.shared(_by_servo)
     found: list[Found] = []
     for joint, name in enumerate(info.robot.arm_joints):
         rows = is_free[:, joint] & (np.abs(expected[:, joint]) > _SLOW)

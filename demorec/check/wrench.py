@@ -247,7 +247,7 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     if episode.num_frames < _FEWEST_FRAMES:
         yield NotMeasured(why="no frame has neighbours")
         return
-    yield _peak_of_grip(episode)
+    yield from _peaks_of_grip(episode)
     for name, table in (("wrench", episode.columns.sensed.get("wrench")), ("efforts", episode.columns.joint_effort)):
         if table is not None and (lost := (table == 0).all(axis=1)).mean() < _LOST_SHARE:  # weight is always there
             yield worst_frame(lost.astype(np.float64), f"{name} of zero")
@@ -295,19 +295,26 @@ def _unexplained(measured: Array, needed: Array) -> Array:
     )
 
 
-def _peak_of_grip(episode: CheckedEpisode) -> Found:
+def _peaks_of_grip(episode: CheckedEpisode) -> Iterator[Found]:
     force = episode.columns.contact_force
     carried = [episode.is_carried(body.name, CARRIED_HEIGHT) for body in episode.info.scene.movable]
     rows = np.any([*carried, np.zeros(len(force), dtype=np.bool_)], axis=0)
     if rows.sum() < MIN_FRAMES or not (usual := float(np.median(force[rows]))):
-        return NotMeasured(why="nothing is carried for long")
-    peaks = np.where(rows, _peaks(force[:, None])[:, 0], 0.0)
+        yield NotMeasured(why="nothing is carried for long")
+        return
+    peaks = np.where(rows, _peaks(force[:, None])[:, 0], 0.0) / usual
     motors = np.abs(episode.columns.joint_effort[:, episode.num_arm :]).sum(axis=1)
     if at_work := float(np.median(motors[rows])):  # what pushes the fingers apart takes as much from both
-        peaks = np.maximum(peaks - usual / at_work * _peaks(motors[:, None])[:, 0], 0.0)
-    # An arm that noise shakes has such peaks one after the other.
-    around = np.max([np.roll(peaks, by) for by in (*range(-_AROUND, -1), *range(2, _AROUND + 1))], axis=0)
-    return worst_frame(np.maximum(peaks - around, 0.0) / usual, "contact force")
+        of_motors = np.where(rows, _peaks(motors[:, None])[:, 0], 0.0) / at_work
+        yield worst_frame(_alone(np.maximum(of_motors - peaks, 0.0)), "efforts of the gripper")
+        peaks = np.maximum(peaks - of_motors, 0.0)
+    yield worst_frame(_alone(peaks), "contact force")
+
+
+def _alone(peaks: Array) -> Array:
+    """(T,) less those around: an arm that noise shakes has such peaks one after the other."""
+    around: Array = np.max([np.roll(peaks, by) for by in (*range(-_AROUND, -1), *range(2, _AROUND + 1))], axis=0)
+    return np.asarray(np.maximum(peaks - around, 0.0))
 
 
 def _peaks(table: Array) -> Array:

@@ -113,6 +113,7 @@ CHECKS: Registry[Check] = Registry(
         ("targets", "steps_as_velocities"),
         ("gripper", "joint_effort", "gripper_label", "grip_force", "contact_lag", "touches_nothing"),
         ("physics", "idle_frames", "starts_at_rest", "ends_at_rest", "velocity_follows_servo"),
+        ("physics", "velocity_lag"),
         ("objects", "object_motion", "teleports", "spins", "starts_as_scene_says", "penetration", "carried_by_gripper"),
         ("objects", "slips", "falls_unheld"),
         ("fingers", "finger_depth"),

@@ -210,6 +210,14 @@ def once_while_carried(name: str, factor: float, share: float = 0.5) -> Fault:
     return fault
 
 
+def loose_once(c: Changed) -> Changed:
+    """One frame of carrying in which the fingers' motors give nothing."""
+    effort = c.columns.joint_effort.copy()
+    carried = np.flatnonzero(np.array(c.columns.phase) == "transport")
+    effort[carried[len(carried) // 2], 7:] = 0.0
+    return c.with_columns(joint_effort=effort)
+
+
 def held_on(c: Changed) -> Changed:
     """Where the force on the fingers ends it stays for three frames more."""
     force = c.columns.contact_force.copy()
@@ -242,6 +250,7 @@ CASES: list[tuple[str, Fault, str]] = [
     ("a sample of the contact force lost", once_while_carried("contact_force", 0.0), "force_spikes"),
     ("a sample of the wrench lost", once_while_carried("wrench", 0.0), "force_spikes"),
     ("a sample of the efforts lost", once_while_carried("joint_effort", 0.0), "force_spikes"),
+    ("a sample of the fingers' efforts lost", loose_once, "force_spikes"),
     ("wrench filtered", wrench(filtered), "wrench_lag"),
     ("the cube slips in the hand", slipping, "slips"),
     ("colours exchanged", info(instruction="put the green cube on the red target"), "instruction_fits_scene"),
@@ -280,6 +289,8 @@ CASES: list[tuple[str, Fault, str]] = [
     ("velocities 8 % too small", column("joint_velocity", lambda r: 0.92 * r), "velocity_follows_servo"),
     ("velocity of a joint too small", column("joint_velocity", lambda r: r * [1, 0.92, *[1] * 7]),
      "velocity_follows_servo"),
+    ("velocities two frames late", column("joint_velocity", lambda r: late(late(r))), "velocity_lag"),
+    ("velocities a frame early", column("joint_velocity", early), "velocity_lag"),
     ("three frames cut off at the head", cut(np.s_[3:]), "starts_at_rest"),
     ("five frames cut off at the tail", cut(np.s_[:-5]), "ends_at_rest"),
     ("a rotation that jumps", cube(rotation_jumps), "spins"),
