@@ -26,6 +26,8 @@ SETTLE_SECONDS = 0.1
 """Physics time before the first frame, so that objects rest on their support."""
 MAX_PRESS_FORCE, MAX_PRESS_DEPTH = 100.0, 1e-3
 """N and metres: where a link of the robot presses on an object harder, or sinks in deeper, no real hand would do it."""
+HULL_MARGIN = 1e-3
+"""Metres by which Bullet's hull of a mesh stands out from it; boxes and cylinders have their margin inside."""
 
 
 class World:
@@ -232,16 +234,22 @@ class World:
     def crushed(self) -> str:
         """The movable body that a link of the robot presses on harder than a real hand could; "" for none."""
         for body in self.scene.movable:
-            forces: dict[int, float] = {}
-            touching = self.client.getContactPoints(self.arm.body, self._bodies[body.name])
+            index, forces = self._bodies[body.name], dict[int, float]()
+            touching = self.client.getContactPoints(self.arm.body, index)
             for contact in touching:
                 forces[contact[3]] = forces.get(contact[3], 0.0) + contact[9]
+                if contact[8] < -MAX_PRESS_DEPTH or forces[contact[3]] > MAX_PRESS_FORCE:
+                    return body.name
             # Contact points lie where the bodies were before the last step; a blow may have turned one since.
-            nearest = self.client.getClosestPoints(self.arm.body, self._bodies[body.name], 0.0) if touching else ()
-            depth = -min((point[8] for point in (*touching, *nearest)), default=0.0)
-            if depth > MAX_PRESS_DEPTH or max(forces.values(), default=0.0) > MAX_PRESS_FORCE:
-                return body.name
+            for point in self.client.getClosestPoints(self.arm.body, index, -MAX_PRESS_DEPTH) if touching else ():
+                if -point[8] > MAX_PRESS_DEPTH + self._margin(self.arm.body, point[3]) + self._margin(index, point[4]):
+                    return body.name
         return ""
+
+    def _margin(self, body: int, link: int) -> float:
+        """How far Bullet's shape of a link, -1: the base, is beyond its true one, metres."""
+        shapes = self.client.getCollisionShapeData(body, link)
+        return HULL_MARGIN if any(shape[2] == self.client.GEOM_MESH for shape in shapes) else 0.0
 
     def touches_robot(self, name: str) -> bool:
         """Whether any part of the robot touches a body of the scene."""
