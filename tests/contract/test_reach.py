@@ -22,6 +22,8 @@ from demorec.episode.variation import Ranges
         pytest.param("pick_shapes", "iiwa", "mild", 0, 126, id="a duck that is dropped when held over beak and tail"),
         pytest.param("line_up", "iiwa", "full", 77, 177, id="no line leads down, since the elbow gets straight"),
         pytest.param("tutorial", "iiwa", "none", 82000, 117, id="the cube falls to where no grasp is in reach"),
+        pytest.param("tutorial", "iiwa", "full", 82000, 241, id="the cube lies lower than its size says"),
+        pytest.param("sort_by_color", "panda", "full", 82000, 135, id="it cannot rise as high as it wants"),
     ],
 )
 def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed: int, index: int) -> None:
@@ -32,10 +34,17 @@ def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed
     assert frames[-1].observation.contact_force == 0
 
 
-def test_a_line_on_which_the_joints_jump_is_given_up() -> None:
-    """Slowed down again and again it took minutes to plan, and more memory each time."""
+def test_a_line_on_which_the_joints_jump_is_given_up_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slowed down again and again it took minutes to plan; at another yaw the hand gets there."""
+    monkeypatch.setattr("demorec.tasks.tutorial.SINKS", 0.0)  # or the layout would be drawn anew
     _, outcome = run(episode(230, task="tutorial", robot="iiwa", variation="full", seed=82000))
-    assert (outcome.success, outcome.failure_reason) == (False, "unreachable")
+    assert outcome.success
+
+
+def test_a_blow_that_turns_the_cube_into_a_finger_is_no_success() -> None:
+    """It touches down on an edge: a finger is 1.36 mm in it, though it was not when the contacts were found."""
+    _, outcome = run(episode(235, task="pick_place", robot="iiwa", variation="none", seed=82000))
+    assert (outcome.success, outcome.failure_reason) == (False, "crush")
 
 
 def test_a_hand_that_looks_ten_times_a_second_does_not_press_what_it_puts_down(tmp_path: Path) -> None:
