@@ -284,16 +284,17 @@ def _by_servo(episode: CheckedEpisode) -> tuple[NDArray[np.bool_], Array]:
 )
 def velocity_lag(episode: CheckedEpisode) -> Found:
     """Velocities are those of their frames: no shift fits the servo's better, of all joints together."""
-    if episode.num_frames < MIN_FRAMES + 2 * _MOST_LAG:
-        return NotMeasured(why="there are too few frames")
     is_free, due = episode.shared(_by_servo)
     velocity, core = episode.columns.joint_velocity[1:, : episode.num_arm], slice(_MOST_LAG, -_MOST_LAG)
+    counts = (is_free & (np.abs(due) > _SLOW))[core]
+    if counts.sum() < MIN_FRAMES:
+        return NotMeasured(why="no joint moves for long")
     off = {
-        lag: float((((np.roll(velocity, -lag, axis=0) - due) ** 2) * is_free)[core].sum())
+        lag: float(((np.roll(velocity, -lag, axis=0) - due)[core][counts] ** 2).sum())
         for lag in range(-_MOST_LAG, _MOST_LAG + 1)
     }
     lag = min(off, key=off.__getitem__)
-    if off[lag] > _CLEAR * off[0]:
+    if off[lag] >= _CLEAR * off[0]:
         lag = 0
     return Measurement(value=abs(lag), detail=f"{lag:+d} frames")
 

@@ -359,7 +359,7 @@ class Expert:
         clear_height = float(here.position[2]) + 0.07 * self._scale
         try:
             yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
-        except GaveUp:
+        except GaveUp:  # so much is enough to be clear of what was put down
             yield from self.move(least, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
         if not self._keeps_bytes:
