@@ -21,7 +21,7 @@ from demorec.core.errors import ExportError, MissingDependencyError, ResourceErr
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.layout import TASKS_PATH, VIDEO_PATH
+from demorec.datasets.lerobot.layout import EPISODES_PATH, TASKS_PATH, VIDEO_PATH, FilePosition
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
 
@@ -122,19 +122,34 @@ def _wrong_ends(dataset: Dataset) -> Iterator[str]:
 
 
 @dataset_check(
-    measures="files of images that no episode has",
+    measures="files of images that no episode has, and of episodes that are said to lie elsewhere",
     warn=0,
     fail=math.inf,
 )
 def dataset_strays(dataset: Dataset) -> Measurement | None:
-    """Every mp4 file is of a camera and an episode: catches what merges, deleted episodes and renamed cameras leave."""
+    """Every mp4 file is of a camera and an episode: catches what merges, deleted episodes and renamed cameras leave.
+
+    Where the table of an episode lies, LeRobot takes from the episode's row when it merges or deletes.
+    """
     if dataset.info.is_old:
         return None
     template = dataset.info.video_path or VIDEO_PATH
     used = {position.path(template, key) for place in dataset.places for key, (position, _) in place.videos.items()}
     found = {path.relative_to(dataset.path).as_posix() for path in (dataset.path / "videos").rglob("*.mp4")}
-    strays = sorted(found - used)
-    return Measurement(value=len(strays), detail=", ".join(strays[:3])) if found else None
+    strays = [*sorted(found - used), *_said_elsewhere(dataset)]
+    return Measurement(value=len(strays), detail=", ".join(strays[:3]))
+
+
+def _said_elsewhere(dataset: Dataset) -> Iterator[str]:
+    names = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
+    for file in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
+        if set(names) <= set(open_table(file).schema_arrow.names):
+            there = file.relative_to(dataset.path).as_posix()
+            for chunk, number in {tuple(row.values()) for row in read_table(file, names).to_pylist()}:
+                told = isinstance(chunk, int) and isinstance(number, int)
+                path = FilePosition(chunk=chunk, file=number).path(EPISODES_PATH) if told else "no file"
+                if path != there:
+                    yield f"{there} says of its episodes that they lie in {path}"
 
 
 @dataset_check(

@@ -16,6 +16,7 @@ from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import check_video, open_table, read_json
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX
 from demorec.episode.features import ACTION, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, observation_names
 from demorec.episode.info import EpisodeInfo
 
@@ -79,11 +80,15 @@ def _names(dataset: Dataset) -> Iterator[str]:
         if len(set(feature.names)) != len(feature.names):
             yield f"{name} names a component twice"
     state = dataset.info.features.get(STATE)
-    joints = state.names[:-1] if state is not None and state.names else ()
+    joints = [ELEMENT_SUFFIX.sub("", name) for name in state.names or ()] if state is not None else []
     robot = dataset.info.robot_type
     for other in ROBOTS.names() if joints and robot in ROBOTS.names() else ():
-        if other != robot and all(other in name for name in joints):
+        if other != robot and all(other in name for name in joints[:-1]):
             yield f"robot_type is {robot}, the joints are those of {other}"
+        known = ROBOTS.load(other).arm_joints
+        lacking = [joint for joint in known if joint not in joints]
+        if other == robot and lacking and len(lacking) <= len(known) / 2 and len(joints) >= len(known):
+            yield f"robot_type is {robot}, no joint is its {lacking[0]}"
 
 
 def _videos(dataset: Dataset) -> Iterator[str]:

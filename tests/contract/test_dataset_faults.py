@@ -124,6 +124,9 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "a shape of other length": (of_feature("action", shape=[7]), "dataset_readable"),
     "a counter of another type": (of_feature("index", dtype="float32"), "dataset_schema"),
     "another robot": (of_info(lambda data: data.update(robot_type="iiwa")), "dataset_schema"),
+    "a joint that the robot has not": (
+        of_info(lambda d: d["features"]["observation.state"]["names"].__setitem__(2, "elbow")), "dataset_schema"
+    ),
     "another codec": (of_video(codec="av1"), "dataset_schema"),
     "another height": (of_video(height=128), "dataset_schema"),
     "another width": (of_video(width=32), "dataset_schema"),
@@ -220,6 +223,10 @@ def second_video(dataset: Path) -> None:
 
 WARNED: dict[str, tuple[Fault, str]] = {
     "a file of images that no episode has": (second_video, "dataset_strays"),
+    "a table of episodes said to be elsewhere": (
+        value_of("meta/episodes/file_index", 1, 3, "meta/episodes"),
+        "dataset_strays",
+    ),
     "placeholders for instructions": (of_tasks("task", lambda number: f"task_{number}"), "dataset_instructions"),
     "statistics of what is no feature": (
         lambda dataset: edit_json(dataset / "meta/stats.json", lambda data: data.update(force=data["action"])),
