@@ -27,6 +27,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import POSITION_GAIN
 from demorec.robots.assets import asset_path
 from demorec.robots.inertials import link_masses
+from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf, UrdfJoint
 
 MIN_LOAD, LEAST_LOAD = 3.0, 1.0
@@ -250,10 +251,17 @@ def dynamics_by_servo(arm: Arm) -> Dynamics | NotMeasured:
     recorded = c.joint_position[:, :n], c.joint_velocity[:, :n], c.command_joint_target
     start, step_s = np.array(info.scene.robot.joint_position), 1 / info.physics_hz
     steps = Steps.of_servo(*recorded, start=start, substeps=max(info.physics_hz // info.fps, 1), step_s=step_s)
-    is_free = (np.abs(c.joint_effort[:, :n]) < _FREE * np.array(info.robot.torque_limit)).all(axis=1)
+    hot = near_limit(c.joint_effort[:, :n], info.robot)
+    is_free = ~hot
+    is_free[1:-1] |= ~(hot[:-2] | hot[2:])  # a single frame may be a fault
     joints = [np.hstack([positions, c.joint_position[:, n:]]) for positions in (steps.before, steps.first)]
     links = [partial(arm.world_from_link, kinematics=arm.kinematics(positions)) for positions in joints]
     return _dynamics(arm, [arm.world_from_link, *links], is_free & (steps.off < _SERVED), step_s)
+
+
+def near_limit(effort: Array, robot: RobotSpec) -> NDArray[np.bool_]:
+    """(T,) whether a motor of the arm gives so much, N m (T, n), that it may not have done what the servo asked for."""
+    return np.asarray((np.abs(effort) >= _FREE * np.array(robot.torque_limit)).any(axis=1))
 
 
 def _dynamics(arm: Arm, links: Sequence[Links], is_free: NDArray[np.bool_], step_s: float) -> Dynamics | NotMeasured:

@@ -19,7 +19,7 @@ from demorec.check.base import (
     worst,
     worst_frame,
 )
-from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics, dynamics_by_servo
+from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics, dynamics_by_servo, near_limit
 from demorec.check.episode import CheckedEpisode
 from demorec.check.gripper import CARRIED_HEIGHT
 from demorec.core.geometry import Array
@@ -197,40 +197,53 @@ def wrench_lag(episode: CheckedEpisode) -> Found:
 def effort_in_each_frame(episode: CheckedEpisode) -> Found:
     """The motors give in each frame what the arm's weight and its acceleration in that frame need, also where noise
     shakes it: catches torques that are late, filtered or made up. The links' own inertia is left out."""
-    dynamics, found = episode.shared(dynamics_by_servo), list[Found]()
-    if isinstance(dynamics, NotMeasured):
-        return dynamics
-    rows = dynamics.is_judged
-    if rows.sum() < MIN_FRAMES:
-        return NotMeasured(why=f"the servo alone moves the free hand in {int(rows.sum())} frames")
-    for index, torque in _of_loaded(episode, dynamics):
-        off = np.abs(episode.columns.joint_effort[rows, index] - torque[rows])
-        share = float(np.quantile(off, _OFTEN) / np.sqrt((torque[rows] ** 2).mean()))
+    servo, found = episode.shared(_servo), list[Found]()
+    if isinstance(servo, NotMeasured):
+        return servo
+    rows = servo.dynamics.is_judged
+    for index in np.flatnonzero(servo.is_loaded):
+        off = np.abs(episode.columns.joint_effort[rows, index] - servo.torque[rows, index])
+        share = float(np.quantile(off, _OFTEN) / servo.usual[index])
         found.append(
             Measurement(value=share, detail=f"{episode.info.robot.arm_joints[index]}, {int(rows.sum())} frames")
         )
     return worst(*found) or NotMeasured(why="no joint bears the arm")
 
 
-def _of_loaded(episode: CheckedEpisode, dynamics: Dynamics) -> Iterator[tuple[int, Array]]:
-    """Number of each joint that bears weight, and the torque (T,) that it needs, N m."""
-    for index, torque in _of_joints(episode, dynamics):
-        if _is_loaded(torque, dynamics):
-            yield index, torque
+class _Servo(NamedTuple):
+    """What the arm's n motors need to give, by what the servo did in the steps before each frame.
+
+    Attributes:
+        torque: (T, n) N m.
+        usual: (n,) N m, root mean square over the frames that are judged.
+        is_loaded: (n,) whether the weight that the joint bears is more than noise shakes it.
+        dynamics: Which frames are judged; of the hand.
+    """
+
+    torque: Array
+    usual: Array
+    is_loaded: NDArray[np.bool_]
+    dynamics: Dynamics
 
 
-def _of_joints(episode: CheckedEpisode, dynamics: Dynamics) -> Iterator[tuple[int, Array]]:
+def _servo(episode: CheckedEpisode) -> _Servo | NotMeasured:
+    dynamics = dynamics_by_servo(episode)
+    if isinstance(dynamics, NotMeasured):
+        return dynamics
+    rows = dynamics.is_judged
+    if rows.sum() < MIN_FRAMES:
+        return NotMeasured(why=f"the servo alone moves the free hand in {int(rows.sum())} frames")
     known = {joint.name: joint for joint in episode.urdf.joints}
-    for index, name in enumerate(episode.info.robot.arm_joints):
-        yield index, dynamics.torque(known[name])
-
-
-def _is_loaded(torque: Array, dynamics: Dynamics) -> bool:
-    """Whether the weight that a joint bears is more than noise shakes it, by the torque (T,) that it needs, N m."""
-    padded = np.pad(torque, _STEADY // 2, mode="edge")
-    steady = np.median(np.lib.stride_tricks.sliding_window_view(padded, _STEADY), axis=1)
-    shaken, borne = (values[dynamics.is_judged] for values in (torque - steady, steady))
-    return bool(np.median(np.abs(borne)) >= max(MIN_LOAD, float(np.sqrt((shaken**2).mean()))))
+    torque = np.stack([dynamics.torque(known[name]) for name in episode.info.robot.arm_joints], axis=1)
+    padded = np.pad(torque, ((_STEADY // 2, _STEADY // 2), (0, 0)), mode="edge")
+    steady = np.median(np.lib.stride_tricks.sliding_window_view(padded, _STEADY, axis=0)[rows], axis=2)
+    shaken = np.sqrt(((torque[rows] - steady) ** 2).mean(axis=0))
+    return _Servo(
+        torque=torque,
+        usual=np.sqrt((torque[rows] ** 2).mean(axis=0)),
+        is_loaded=np.median(np.abs(steady), axis=0) >= np.maximum(MIN_LOAD, shaken),
+        dynamics=dynamics,
+    )
 
 
 @physics_check(
@@ -251,48 +264,42 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
     for name, table in (("wrench", episode.columns.sensed.get("wrench")), ("efforts", episode.columns.joint_effort)):
         if table is not None and (lost := (table == 0).all(axis=1)).mean() < _LOST_SHARE:  # weight is always there
             yield worst_frame(lost.astype(np.float64), f"{name} of zero")
-    hand, dynamics = episode.shared(_hand), episode.shared(dynamics_by_servo)
-    if not isinstance(hand, _Hand) or isinstance(dynamics, NotMeasured):
+    hand, servo = episode.shared(_hand), episode.shared(_servo)
+    if not isinstance(hand, _Hand) or isinstance(servo, NotMeasured):
         yield None if isinstance(hand, _Hand) else hand
         return
     robot, width = episode.info.robot, episode.columns.gripper_width
     moving = np.abs(np.gradient(width)) * episode.info.fps > _MOVES * robot.gripper.open_width  # fingers weigh, too
-    free = dynamics.is_judged & ~moving
+    free = servo.dynamics.is_judged & ~moving
     free[1:-1] &= free[:-2] & free[2:]  # a peak is one beside both neighbours
-    of_wrench, (of_motors, of_all) = _peaks_of_wrench(episode, hand, dynamics), _peaks_of_motors(episode, dynamics)
+    of_wrench, (of_motors, of_all) = _peaks_of_wrench(episode, hand, servo), _peaks_of_motors(episode, servo)
     # What accelerates the arm otherwise than the servo, as an impact does, shows in both: in one of them less, as links
     # or hand are accelerated more, and in motors that bear no weight, if it goes sideways.
     yield worst_frame(np.where(free, np.maximum(of_wrench - 2 * of_all, 0.0), 0.0), "wrench")
     yield worst_frame(np.where(free, np.maximum(of_motors - 2 * of_wrench, 0.0), 0.0), "efforts")
 
 
-def _peaks_of_motors(episode: CheckedEpisode, dynamics: Dynamics) -> tuple[Array, Array]:
-    """(T,) of the motors that bear weight, in units of what each bears; of all, in units of the most that one bears."""
-    of_loaded: Array = np.zeros(len(dynamics.is_judged))
-    of_all, most = of_loaded, 1e-12
-    for index, torque in _of_joints(episode, dynamics):
-        peaks = _unexplained(episode.columns.joint_effort[:, index, None], torque[:, None])
-        borne = float(np.sqrt((torque[dynamics.is_judged] ** 2).mean()))
-        of_all, most = np.maximum(of_all, peaks), max(most, borne)
-        if _is_loaded(torque, dynamics):
-            of_loaded = np.maximum(of_loaded, peaks / borne)
-    return of_loaded, np.maximum(of_loaded, of_all / most)
+def _peaks_of_motors(episode: CheckedEpisode, servo: _Servo) -> tuple[Array, Array]:
+    """(T,) of the motors that bear weight, in units of what each bears; of all, in units of the most that one bears.
+
+    A motor near its limit may have been at it in the step before, and says half as much.
+    """
+    effort = episode.columns.joint_effort[:, : episode.num_arm]
+    peaks = _peaks(effort - servo.torque) - _OWN_INERTIA * _peaks(servo.torque)
+    peaks *= np.where(near_limit(effort, episode.info.robot), 0.5, 1.0)[:, None]
+    of_loaded = np.where(servo.is_loaded, peaks / np.maximum(servo.usual, 1e-12), 0.0).max(axis=1)
+    return of_loaded, np.maximum(of_loaded, peaks.max(axis=1) / max(float(servo.usual.max()), 1e-12))
 
 
-def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, dynamics: Dynamics) -> Array:
+def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, servo: _Servo) -> Array:
     """(T,) of force and torque, in units of the hand's weight; what shifts between the fingers shows, too."""
-    force, moment = dynamics.borne(_mount(episode))
+    force, moment = servo.dynamics.borne(_mount(episode))
     weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
     needed = np.hstack([force, (moment - np.cross(hand.origin, force)) / _LEVER]) / weight
-    peaks = _unexplained(np.hstack([hand.force, hand.torque / _LEVER]) / weight, needed)
-    return np.maximum(peaks - _peaks(_left_of_grip(episode)[:, None])[:, 0] / weight, 0.0)
-
-
-def _unexplained(measured: Array, needed: Array) -> Array:
-    """(T,) largest peak of what is measured (T, n) beyond what is needed, less what own inertia may make of it."""
-    return np.asarray(
-        (_peaks(measured - needed) - _OWN_INERTIA * _peaks(needed).max(axis=1, keepdims=True)).max(axis=1)
-    )
+    peaks = _peaks(np.hstack([hand.force, hand.torque / _LEVER]) / weight - needed)
+    peaks -= _OWN_INERTIA * _peaks(needed).max(axis=1, keepdims=True)
+    gripped = _peaks(_left_of_grip(episode)[:, None])[:, 0] / weight
+    return np.asarray(np.maximum(peaks.max(axis=1) - gripped, 0.0))
 
 
 def _peaks_of_grip(episode: CheckedEpisode) -> Iterator[Found]:
