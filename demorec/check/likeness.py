@@ -33,7 +33,7 @@ _LIVELY = 0.25
 _TARGET = 0.65
 """Share of an action's variance that the states of the same frame tell, in the median of its elements, above which it
 is a target: of targets 0.84 to 0.99, of increments 0.15 to 0.47."""
-_CARTESIAN = re.compile(r"(^|[._])d?(x|y|z|[rq]?[xyzw]|roll|pitch|yaw)$")
+CARTESIAN = re.compile(r"(^|[._])d?(x|y|z|[rq]?[xyzw]|roll|pitch|yaw)$")
 """Names of elements whose increments may be told in another frame than the pose."""
 _SAME = 0.5
 """Correlation below which two courses are not of one thing."""
@@ -216,7 +216,7 @@ def motion_follows_action(dataset: Dataset) -> Found:
         return NotMeasured(why="the actions do not go with the states' motion")
     lag = float(np.median([finest_lag(lags, (-told[:, element]).tolist()) for element in clear]))
     soon = slice(reach, reach + max(2, round(_LATEST_S * fps)))
-    for joint, state in _same_joints(dataset):
+    for joint, state in same_joints(dataset):
         size_of = math.sqrt(max(float(square[state, state] * all_of[joint]), 1e-9))
         goes = products[soon, state, joint] / size_of
         if goes.min() < -_CLEAR and goes.max() < _CLEAR / 2:  # noise that is taken back goes both ways
@@ -231,12 +231,12 @@ def _names(dataset: Dataset, feature: str) -> Sequence[str]:
     return names if described is not None and described.shape == (len(names),) else ()
 
 
-def _same_joints(dataset: Dataset) -> Iterator[tuple[int, int]]:
+def same_joints(dataset: Dataset) -> Iterator[tuple[int, int]]:
     """Elements of action and state that are called after the same joint."""
     joints = [name.rpartition(".")[0] or name for name in _names(dataset, STATE)]
     for number, name in enumerate(_names(dataset, ACTION)):
         joint = name.rpartition(".")[0] or name
-        if joints.count(joint) == 1 and not is_gripper(name) and not _CARTESIAN.search(name):
+        if joints.count(joint) == 1 and not is_gripper(name) and not CARTESIAN.search(name):
             yield number, joints.index(joint)
 
 

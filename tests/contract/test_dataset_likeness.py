@@ -38,7 +38,7 @@ WORLD = "observation.environment_state"
 LAWS = (
     "actions_go_with_states", "motion_follows_action", "whole_episodes", "velocity_matches_position", "missing_frames",
     "mounts_alike", "encoder_steps", "quaternions_keep_sign", "duplicates", "effort_lag", "same_by_name",
-    "action_steps", "repeated_frames", "steps_as_velocities", "effort_matches_dynamics",
+    "action_steps", "repeated_frames", "steps_as_velocities", "effort_matches_dynamics", "actions_agree",
 )  # fmt: skip
 
 
@@ -98,6 +98,12 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
     "actions eight frames late": (numbers("action", lambda rows: late(rows, 8)), "motion_follows_action", "fail"),
     "a joint's actions of the other sign": (
         numbers("action", lambda rows: columns(rows, 3, np.negative)), "motion_follows_action", "fail"
+    ),
+    "a joint's actions of the other sign in one episode": (
+        numbers("action", lambda rows: columns(rows, 3, np.negative), only=(2,)), "actions_agree", "fail"
+    ),
+    "a joint's actions left out in one episode": (
+        numbers("action", lambda rows: columns(rows, 1, np.zeros_like), only=(0,)), "actions_agree", "fail"
     ),
     "torques four frames late": (
         numbers("observation.effort", lambda rows: late(rows, 4)), "effort_lag", "warn"

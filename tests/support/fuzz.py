@@ -60,7 +60,11 @@ class LimitedCommands:
     def __enter__(self) -> Self:
         # -P: the modules beside this file (mcap, docs ...) must not stand before the libraries of their names.
         command = [sys.executable, "-P", __file__, *self._modules]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # Each of Rerun's threads would reserve addresses of its own, which count as if they were filled.
+        environment = os.environ | {"MALLOC_ARENA_MAX": "2"}
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
         return self
 
     def __exit__(

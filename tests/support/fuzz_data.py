@@ -22,6 +22,7 @@ from demorec.core.plain import to_plain
 from demorec.core.tables import CHECKS
 from demorec.learn.evaluate.rollouts import Evaluation, Settings
 from demorec.mcap import Recording
+from demorec.render.raster.renderer import warm_up
 from support import hdf5
 from support.export import export, make_run
 from support.external import write_external
@@ -87,6 +88,7 @@ class FuzzedData:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        warm_up()  # no command is to pay for what is compiled once
         self._good = write_episode(folder / "good.mcap", num_frames=12, cameras=("front",))
         self._external = write_external(folder / "collected.mcap")
         make_run(folder / "run", (4, 5), failures=(6,), cameras=())

@@ -1,0 +1,114 @@
+"""Does an action move a state the same way in all episodes of a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.base import Found, Lacking, Measurement, NotMeasured
+from demorec.check.dataset import Dataset, Rows
+from demorec.check.evidence import course_of, quaternion_places
+from demorec.check.likeness import CARTESIAN, likeness_check, same_joints
+from demorec.check.rows import matrices
+from demorec.core.geometry import Array
+from demorec.episode.features import ACTION, EE_POSE, STATE
+
+_FEWEST_EPISODES, _FEWEST_FRAMES = 3, 30
+_AHEAD_S = 0.1
+"""Seconds over which it is looked at how far a state goes."""
+_CLEAR = 0.6
+"""Correlation of action and way, either sign, in the median episode, from which on the action is taken to move it."""
+_POSE, _WAYS_OF_POSE = 7, 12
+"""Elements of an EE pose; of its way and turn along two systems of axes."""
+_LIVELY, _STILL = 0.25, 0.02
+"""Share of the usual deviation from which on an episode is judged, and below which an action is still."""
+
+
+@likeness_check(
+    group="alignment",
+    measures="correlation with which an element of the action moves a state one way in some episodes, and the other "
+    "way, or while it is still, in others",
+    warn=0.45,
+    fail=0.6,
+)
+def actions_agree(dataset: Dataset) -> Iterator[Found]:
+    """Increments, deltas of a pose and velocities move the state the same way in all episodes: catches an axis that was
+    turned round or left out in some of them, and datasets of two conventions put together.
+
+    An element that is called after a joint is compared with the joint, one called x, y, z, roll, pitch or yaw with the
+    EE pose: a delta may be told along the axes of the base or of the tool, and is at odds only if it is with all that
+    goes with it in most episodes.
+    """
+    features = dataset.info.features
+    if not {STATE, ACTION} <= features.keys() or not all(features[name].is_numeric for name in (STATE, ACTION)):
+        yield Lacking(need="actions of three episodes")
+        return
+    ahead = max(1, round(_AHEAD_S * dataset.info.fps))
+    long = [number for number, rows in enumerate(dataset.rows) if len(rows[ACTION]) >= _FEWEST_FRAMES + ahead]
+    names, has_pose = features[ACTION].names or (), EE_POSE in features and features[EE_POSE].shape == (_POSE,)
+    candidates = _candidates(names, dict(same_joints(dataset)), has_pose=has_pose)
+    if len(long) < _FEWEST_EPISODES or not candidates:
+        yield NotMeasured(why=f"no action of {_FEWEST_EPISODES} episodes is called after a joint, or of an EE pose")
+        return
+    together, acts, goes = (np.stack(table) for table in zip(*_by_episode(dataset, long, ahead), strict=True))
+    usual_acts, usual_goes = np.median(acts, axis=0), np.median(goes, axis=0)
+    moved = (goes > _LIVELY * usual_goes) & (usual_goes > 0)
+    found = []
+    for element, ways in candidates.items():
+        lively, still = (
+            acts[:, element] > _LIVELY * usual_acts[element],
+            acts[:, element] < _STILL * usual_acts[element],
+        )
+        odds = [_at_odds(together[:, element, way], lively & moved[:, way], still & moved[:, way]) for way in ways]
+        if told := [one for one in odds if one is not None]:
+            value, row = min(told)
+            found.append(Measurement(value=value, detail=f"{names[element]}, episode {long[row]}"))
+    yield max(found, key=lambda one: one.value, default=NotMeasured(why="the states do not go where the actions tell"))
+
+
+def _candidates(names: Sequence[str], joints: Mapping[int, int], *, has_pose: bool) -> dict[int, Sequence[int]]:
+    """Element of the action -> the ways that it may be told by: its joint's, or all of the EE pose, which are last."""
+    turns = {place + part for place in quaternion_places(names) for part in range(4)}
+    of_pose = [element for element, name in enumerate(names) if CARTESIAN.search(name) and element not in turns]
+    found: dict[int, Sequence[int]] = {element: range(-_WAYS_OF_POSE, 0) for element in of_pose if has_pose}
+    return found | {element: (state,) for element, state in joints.items()}
+
+
+def _at_odds(together: Array, judged: NDArray[np.bool_], still: NDArray[np.bool_]) -> tuple[float, int] | None:
+    """How clearly (E,) episodes differ, and which one does most from the majority; None where nothing is told."""
+    if judged.sum() < _FEWEST_EPISODES or np.median(np.abs(together[judged])) < _CLEAR:
+        return None
+    if still.any():
+        return float(np.median(np.abs(together[judged]))), int(np.flatnonzero(still)[0])
+    signed = np.where(judged, together, 0.0)
+    signed = signed if np.median(together[judged]) >= 0 else -signed
+    return max(float(min(signed.max(), -signed.min())), 0.0), int(signed.argmin())
+
+
+def _by_episode(dataset: Dataset, numbers: Sequence[int], ahead: int) -> Iterator[tuple[Array, Array, Array]]:
+    """Of each episode (K, N) correlation of actions and ways, and the deviations (K,) and (N,) of both."""
+    for number in numbers:
+        rows = dataset.rows[number]
+        ways = _ways(rows, dataset.info.features[STATE].names or (), ahead)
+        action = rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64)[: len(ways)]
+        action, ways = action - action.mean(axis=0), ways - ways.mean(axis=0)
+        acts, goes = (np.sqrt((table**2).mean(axis=0)) for table in (action, ways))
+        shared = np.einsum("tk,tn->kn", action, ways) / len(ways)
+        yield shared / np.maximum(np.outer(acts, goes), 1e-12), acts, goes
+
+
+def _ways(rows: Rows, names: Sequence[str], ahead: int) -> Array:
+    """(T - ahead, N) how far each state goes; where there is an EE pose, also its way and its turn, rad, along the
+    axes of base and tool."""
+    state = course_of(rows[STATE].reshape(len(rows[STATE]), -1), names)
+    ways = [state[ahead:] - state[:-ahead]]
+    if EE_POSE in rows and rows[EE_POSE].shape[1:] == (_POSE,):
+        frames = matrices(rows[EE_POSE].astype(np.float64))
+        rotation, way = frames[:-ahead, :3, :3], frames[ahead:, :3, 3] - frames[:-ahead, :3, 3]
+        turn = frames[ahead:, :3, :3] @ rotation.transpose(0, 2, 1)
+        skew = turn - turn.transpose(0, 2, 1)
+        axes = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1) / 2  # of a small angle
+        ways += [way, axes, *(np.einsum("tji,tj->ti", rotation, each) for each in (way, axes))]
+    return np.concatenate(ways, axis=1)
