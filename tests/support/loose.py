@@ -86,8 +86,10 @@ def put_rows(dataset: Path, name: str, rows: Rows, *, restat: bool = True) -> No
 
 def statistics(rows: Rows) -> dict[str, Rows]:
     """(T, N) -> ten numbers as LeRobot names them, each (N,)."""
-    found = {"min": rows.min(axis=0), "max": rows.max(axis=0), "mean": rows.mean(axis=0), "std": rows.std(axis=0)}
-    return found | {name: np.quantile(rows, q, axis=0) for name, q in QUANTILES.items()}
+    columns = np.ascontiguousarray(rows.T)  # several times faster than down a table of pixels
+    found = {"min": columns.min(axis=1), "max": columns.max(axis=1), "mean": columns.mean(axis=1)}
+    quantiles = np.quantile(columns, list(QUANTILES.values()), axis=1)
+    return found | {"std": columns.std(axis=1)} | dict(zip(QUANTILES, quantiles, strict=True))
 
 
 def put_statistics(dataset: Path, name: str, rows: Rows, count: Sequence[int]) -> None:
