@@ -536,6 +536,9 @@ STRANGE: tuple[tuple[str, Strange], ...] = (
     ("encoder of 7 bits in two joints", state(lambda r: coarse(r, 2 * np.pi / 128, (1, 3)))),
 )  # fmt: skip
 
+_OF_MOTION = ("motion", "frames", "targets", "mounts", "directions")
+"""Modules whose checks of external recordings are about numbers."""
+
 
 class Stranger:
     """An episode of which only arrays, names and the robot by its joints are known."""
@@ -576,7 +579,7 @@ def judge(subject: Any) -> dict[str, Result]:
     found = {}
     for name in CHECKS.names():
         check = CHECKS.load(name)
-        is_motion = check.measure.__module__.rpartition(".")[2] in ("motion", "frames", "targets", "mounts")
+        is_motion = check.measure.__module__.rpartition(".")[2] in _OF_MOTION
         if subject.form not in check.on or check.needs_images or check.group in ("file", "time"):
             continue
         if subject.form == "external" and not is_motion:

@@ -1,7 +1,8 @@
-"""Does an action move a state the same way in all episodes of a dataset."""
+"""Does an action go, or move a state, the way that the state goes, in all episodes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -9,9 +10,11 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Found, Lacking, Measurement, NotMeasured
 from demorec.check.dataset import Dataset, Rows
-from demorec.check.evidence import course_of, quaternion_places
+from demorec.check.evidence import course_of, is_gripper, quaternion_places
 from demorec.check.likeness import CARTESIAN, likeness_check, same_joints
+from demorec.check.motion import Moving
 from demorec.check.rows import matrices
+from demorec.check.targets import NO_TARGETS, target_check
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE
 
@@ -20,10 +23,50 @@ _AHEAD_S = 0.1
 """Seconds over which it is looked at how far a state goes."""
 _CLEAR = 0.6
 """Correlation of action and way, either sign, in the median episode, from which on the action is taken to move it."""
+_BESIDE, _AS_LIVELY, _OTHER = 0.1, 0.25, 0.5
+"""Share of a joint's range by which its targets may be beyond it; of its variance that theirs has at least; correlation
+below which they go another way."""
 _POSE, _WAYS_OF_POSE = 7, 12
 """Elements of an EE pose; of its way and turn along two systems of axes."""
 _LIVELY, _STILL = 0.25, 0.02
 """Share of the usual deviation from which on an episode is judged, and below which an action is still."""
+
+
+@target_check(
+    measures="joints whose action lies where they are, and goes another way",
+    warn=0,
+    fail=math.inf,
+    group="alignment",
+)
+def targets_go_along(subject: Moving) -> Found:
+    """Targets go where their joints do: catches those of another episode, or backwards, which are no targets any more.
+
+    Positions and targets of a joint may all be on one side of 0 and in one range: speeds and increments are on both
+    sides, and a goal is sent but once.
+    """
+    motions = subject.motions
+    if not motions.moving.any():
+        return NotMeasured(why=NO_TARGETS)
+    pairs = [(motion.state, motion.action) for motion in motions.all if motion.action is not None]
+    wrong = [
+        name
+        for element, name in enumerate(motions.all[0].names)
+        if motions.moving[element] and not motions.targets and not is_gripper(name)
+        if _goes_its_own_way([(state[:, element], action[:, element]) for state, action in pairs])
+    ]
+    return Measurement(value=len(wrong), detail=", ".join(wrong[:3]))
+
+
+def _goes_its_own_way(pairs: Sequence[tuple[Array, Array]]) -> bool:
+    """Whether actions lie where the states of a joint do, in all episodes, and do not go with them."""
+    state, action = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    margin = _BESIDE * np.ptp(state)
+    in_range = state.min() - margin < action.min() and action.max() < state.max() + margin
+    if not in_range or not (min(state.min(), action.min()) > 0 or max(state.max(), action.max()) < 0):
+        return False
+    own, sent = (np.concatenate([each - each.mean() for each in part]) for part in zip(*pairs, strict=True))
+    goes, goes_sent, together = float(own @ own), float(sent @ sent), float(own @ sent)
+    return goes_sent > _AS_LIVELY * goes and together < _OTHER * math.sqrt(goes * goes_sent)
 
 
 @likeness_check(

@@ -54,7 +54,7 @@ _FEWEST_STEPS, _COMES_BACK = 12, 2
 """Steps between a joint's values from which on the least of them tells how fine they are; how often each is gone."""
 _ANY_OTHER = 2.0
 """Times the second largest difference of a step from its velocities, beyond which the largest is a jump."""
-_NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
+NO_TARGETS = "the action is no target of the state's elements (by their names and courses)"
 
 target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
 """Of simulated recordings the commands are known, by which `command_tracking` and `command_lag` judge more sharply."""
@@ -70,7 +70,7 @@ def state_follows_action(subject: Moving) -> Found:
     """The state follows the action by about a frame or more, and by less than a third of a second: catches actions that
     were recorded late or early, or that are the state itself, from which a policy learns to stand still."""
     if not (targets := subject.motions.targets):
-        return NotMeasured(why=_NO_TARGETS)
+        return NotMeasured(why=NO_TARGETS)
     reach = max(2, round(_REACH_S * subject.motions.all[0].fps))
     lags = range(-reach, reach + 1)
     long = [(state, action) for state, action in targets if len(state) > 3 * reach]
@@ -100,7 +100,7 @@ def state_follows_action(subject: Moving) -> Found:
 def actions_in_order(subject: Moving) -> Found:
     """Every element of the state follows its own action: catches joints exchanged in one of the two."""
     if not (targets := subject.motions.targets):
-        return NotMeasured(why=_NO_TARGETS)
+        return NotMeasured(why=NO_TARGETS)
     table = correlations(targets)
     count = len(table)
     kept = np.flatnonzero(subject.motions.moving).tolist()
@@ -128,7 +128,7 @@ def state_reaches_action(subject: Moving) -> Found:
     only a false zero does so always. Velocities, increments and shares of a range are no places to be at.
     """
     if not (targets := subject.motions.targets):
-        return NotMeasured(why=_NO_TARGETS)
+        return NotMeasured(why=NO_TARGETS)
     spread = float(np.median([np.nanmedian(action.std(axis=0)) for _, action in targets]))
     if not 1 / _ALIKE < spread < _ALIKE:
         return NotMeasured(why=f"actions move {spread:.3g} times as far as the state, so they are in another unit")
@@ -229,7 +229,7 @@ def action_is_no_observation(subject: Moving) -> Iterator[Found]:
     """Actions are what was sent, not the states that came of it: what is copied from this observation or the next lacks
     what the robot was told beyond what it did. Of a gripper the two may be the same."""
     if not subject.motions.targets:
-        yield NotMeasured(why=_NO_TARGETS)
+        yield NotMeasured(why=NO_TARGETS)
         return
     for motion in subject.motions.all:
         if motion.action is None or len(motion.state) < FEWEST:
@@ -259,7 +259,7 @@ def dead_band(subject: Moving) -> Found:
     blocked, has no dead band, nor has a state of which all elements stay, being measured less often than frames are.
     """
     if not subject.motions.targets:
-        return NotMeasured(why=_NO_TARGETS)
+        return NotMeasured(why=NO_TARGETS)
     ways: dict[str, list[float]] = {}
     for motion in subject.motions.all:
         known = np.isfinite(motion.lower) & (np.arange(len(motion.names)) != motion.gripper)

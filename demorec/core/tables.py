@@ -151,7 +151,7 @@ CHECKS: Registry[Check] = Registry(
             "targets_as_named",
             "same_by_name",
         ),
-        ("directions", "actions_agree"),
+        ("directions", "actions_agree", "targets_go_along"),
         ("views", "views_upright", "views_alike", "views_stay", "films_differ"),
         ("run", "duplicates", "coverage"),
         ("alignment", "dataset_action_lag"),

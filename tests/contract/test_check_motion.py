@@ -91,6 +91,7 @@ FAULTS: dict[str, tuple[str, Callable[[Rows], Rows], str]] = {
     "joints exchanged": (STATE, exchanged, "actions_in_order"),
     "actions exchanged": (ACTION, exchanged, "actions_in_order"),
     "late actions": (ACTION, late, "state_follows_action"),
+    "actions of another course": (ACTION, lambda rows: rows[::-1], "targets_go_along"),
     "degrees": (STATE, np.degrees, "joint_limits"),
     "a dead encoder": (STATE, lambda rows: rows * (np.arange(rows.shape[1]) != 2), "elements_alive"),
     "an encoder that slips": (STATE, slips, "steps_as_velocities"),
