@@ -200,7 +200,7 @@ def stale_images(subject: Filmed) -> Iterator[Found]:
         on_one_side = min(odd, len(places) - odd) <= len(places) / 8
         if on_one_side and _FEWEST_REPEATS <= len(places) < changing / 3:
             clear, clearly = _repeats(long, _CLEARLY)
-            if len(clear) * changing < len(places) * clearly / 2 or not clear:  # the encoder's
+            if len(clear) < _FEWEST_REPEATS or len(clear) * changing < len(places) * clearly / 2:  # the encoder's
                 places, changing = clear, clearly
         if changing < _FEWEST_CHANGING:
             yield NotMeasured(why=f"{camera} hardly changes")
