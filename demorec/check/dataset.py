@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,6 +45,7 @@ from demorec.episode.features import (
     state_names,
 )
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.scene import Body
 from demorec.episode.validity import read_episode_info
 from demorec.render.recorded import RecordedWorld
 from demorec.robots.assets import asset_path
@@ -53,6 +55,8 @@ from demorec.robots.urdf import Urdf
 Rows = Mapping[str, NDArray[Any]]
 
 
+_IN_THE_AIR = 0.01
+"""Metres above all that is below it."""
 _DRAWN_SECONDS = 3.0
 """Of an episode that are drawn, at most."""
 _CLOSING = 1e-3
@@ -357,6 +361,8 @@ def compare_beginning(
         name for name, cells in seen.items() if sizes[name][0] * cells.shape[1] != sizes[name][1] * cells.shape[2]
     ]:
         return NotMeasured(why=f"no square parts cover the images of the camera {uneven[0]}")
+    if falling := [body.name for body in info.scene.movable if _is_in_the_air(body, info.scene.bodies)]:
+        return NotMeasured(why=f"{falling[0]} starts in the air, and where it falls is not in the dataset")
     num_arm = len(info.robot.arm_joints)
     opening = state[:, num_arm]
     closing = np.flatnonzero(np.diff(opening) < -_CLOSING)
@@ -375,3 +381,18 @@ def compare_beginning(
     except NOT_DRAWABLE as error:
         return NotMeasured(why=f"the scene cannot be drawn here: {error}")
     return {name: compare(cells, drawn.cells[name, "color"], drawn.frames) for name, cells in beginning.items()}
+
+
+def _is_in_the_air(body: Body, bodies: Sequence[Body]) -> bool:
+    """Whether nothing is near below it; boxes that do not move stand upright, of other shapes all of a ball counts."""
+    x, y, z = body.world_from_body.position
+    radius = float(np.linalg.norm(body.shape.extents)) / 2
+    tops = [-math.inf]
+    for other in bodies:
+        off = np.abs(other.world_from_body.position - (x, y, z))
+        reach = float(np.linalg.norm(other.shape.extents[:2])) / 2 + radius
+        if other is not body and off[:2].max() < reach:
+            is_upright = other.shape.kind == "box" and not other.movable
+            height = other.shape.extents[2] / 2 if is_upright else float(np.linalg.norm(other.shape.extents))
+            tops.append(float(other.world_from_body.position[2]) + height)
+    return float(z) - radius > max(tops) + _IN_THE_AIR

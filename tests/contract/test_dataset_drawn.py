@@ -51,6 +51,13 @@ def test_good_ones_pass_whatever_their_shape(width: int, height: int, tmp_path: 
     assert ("pass" in levels(tmp_path / "dataset")) == (width != 126)  # 63 by 47 parts of two pixels are too many
 
 
+def test_what_falls_first_is_not_drawn(tmp_path: Path) -> None:
+    """The tutorial's cube starts in the air; a dataset does not say where it comes to lie."""
+    simulate_run(tmp_path / "run", 1, task="tutorial", seed=3, fps=10, cameras=("wrist",), width=64, height=64)
+    export_lerobot([tmp_path / "run"], tmp_path / "dataset", ExportOptions(verify=False))
+    assert levels(tmp_path / "dataset") == ["skip", "skip"]
+
+
 def test_a_dataset_of_somebody_else_has_nothing_to_compare_with(dataset: Path) -> None:
     shutil.rmtree(dataset / "demorec")
     assert levels(dataset) == ["skip", "skip"]
