@@ -5,6 +5,7 @@ Nothing is drawn: laws of images over time hold where neither scene nor calibrat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -67,19 +68,30 @@ class Film:
         The gain of an image is the median over its parts; where half of them do not stay what they are but for that
         gain, the camera moves.
         """
+        found, unrest = self._gains
+        if math.isnan(unrest):
+            return NotMeasured(why=f"most of what {self.where} shows is black or white")
+        return found if unrest <= _STANDS else NotMeasured(why=f"{self.where} moves")
+
+    @property
+    def unrest(self) -> float:
+        """Share by which half of an image's parts change but for the gain of all, in nine of ten images at most; NaN
+        where most of what it shows is black or white."""
+        return self._gains[1]
+
+    @cached_property
+    def _gains(self) -> tuple[Array, float]:
         usual = np.median(self.cells, axis=0)
         lit = (usual > 20) & (usual < 235)  # (rows, columns, 3)
         if (lit.mean(axis=(0, 1)) < 0.3).any():
-            return NotMeasured(why=f"most of what {self.where} shows is black or white")
+            return np.ones((3, len(self.cells))), math.nan
         gains, stays = [], []
         for channel in range(3):
             ratio = self.cells[..., channel][:, lit[..., channel]] / usual[..., channel][lit[..., channel]]
             gain = np.median(ratio, axis=1)
             gains.append(gain)
             stays.append(np.median(np.abs(ratio / np.maximum(gain, 1e-3)[:, None] - 1), axis=1))
-        if np.quantile(np.max(stays, axis=0), 0.9) > _STANDS:
-            return NotMeasured(why=f"{self.where} moves")
-        return np.array(gains)
+        return np.array(gains), float(np.quantile(np.max(stays, axis=0), 0.9))
 
 
 _STANDS = 0.02

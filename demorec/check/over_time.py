@@ -47,6 +47,8 @@ _FEWEST_EPISODES = 3
 _FEWEST_IMAGES = 20
 _FEWEST_OF_SIDE = 10
 """Changing images among every second one of an episode."""
+_LEAST_UNREST = 0.005
+"""Share of change below which a camera is as still as any."""
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
 _STALE, _CHANGES, _CLEARLY = 0.2, 1.5, 2.5
@@ -384,7 +386,10 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
         views = [np.median([film.first_view for film in side], axis=0) for side in zip(*films, strict=True)]
         stand = np.array([(a.stands, b.stands) for a, b in films])
         usually = stand.mean(axis=0) > 0.5
-        moved = (stand == usually[::-1]).all(axis=1) & (usually[0] != usually[1])
+        unrest = np.log(np.fmax([(a.unrest, b.unrest) for a, b in films], _LEAST_UNREST))
+        off = np.abs(unrest[:, :, None] - np.median(unrest, axis=0))  # of each camera from both cameras' usual one
+        nearer = (off[:, 0, 1] < off[:, 0, 0]) & (off[:, 1, 0] < off[:, 1, 1])
+        moved = (stand == usually[::-1]).all(axis=1) & (usually[0] != usually[1]) & nearer
         for (a, b), is_moved in zip(films, moved, strict=True):
             count = min(len(a.cells), len(b.cells))
             one_cells, other_cells = a.cells[:count], b.cells[:count]

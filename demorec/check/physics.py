@@ -55,8 +55,9 @@ def finite_numbers(episode: CheckedEpisode) -> Measurement:
     return Measurement(value=total, frame=first[1], detail=first[0])
 
 
-_STANDS = 1e-6
-"""rad by which a target that stands differs from the one before."""
+_STANDS, _NEARLY_STANDS = 1e-6, 0.1
+"""rad by which a target that stands differs from the one before; share of the speed before and after it at which it
+nearly stands, as between two motions."""
 
 
 @physics_check(
@@ -260,12 +261,15 @@ def ends_at_rest(episode: CheckedEpisode) -> Found:
     if POLICY_PHASE in c.phase:
         return NotMeasured(why="a policy may succeed in mid-motion")
     steps, robot = np.abs(np.diff(c.action_joint_target, axis=0)), episode.info.robot
-    # A motion begins where the last one stood, or where its phase begins.
-    begins = (steps.max(axis=1) < _STANDS) | (np.array(c.phase[1:]) != np.array(c.phase[:-1]))
+    # A motion begins where the last one stood, or nearly did, or where its phase begins.
+    speed = steps.max(axis=1)
+    begins = (speed < _STANDS) | (np.array(c.phase[1:]) != np.array(c.phase[:-1]))
+    around = np.minimum(np.maximum.accumulate(speed), np.maximum.accumulate(speed[::-1])[::-1])
+    begins[1:-1] |= (speed[1:-1] <= np.minimum(speed[:-2], speed[2:])) & (speed[1:-1] < _NEARLY_STANDS * around[1:-1])
     begins[0] = True
     length = (len(steps) - 1 - np.flatnonzero(begins)[-1]) / fps
-    speed = steps[-1:] * fps * (fps / 30) ** 2 / np.array(robot.acceleration_limit)
-    return worst_entry(speed * length, robot.arm_joints, first=c.num_frames - 1)
+    last = steps[-1:] * fps * (fps / 30) ** 2 / np.array(robot.acceleration_limit)
+    return worst_entry(last * length, robot.arm_joints, first=c.num_frames - 1)
 
 
 def _by_servo(episode: CheckedEpisode) -> tuple[NDArray[np.bool_], Array]:
