@@ -51,10 +51,10 @@ _LEAST_UNREST = 0.005
 """Share of change below which a camera is as still as any."""
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
-_STALE, _CHANGES, _CLEARLY = 0.2, 1.5, 2.5
+_STALE, _CHANGES, _CLEARLY = 0.2, 1.5, 3.5
 """An image repeats the one before that changes by less than this share of what the images on both sides change, where
 these change by so many levels of 255. A repeated image that is encoded again changes by 0.6. Predicted images of x264
-at crf 23, every second one, may lack a motion of up to two levels where all are of 64x48 pixels."""
+at crf 23, or of AV1, every second one, may lack a motion of up to three levels where images are small."""
 _COPIES, _SLOWEST_FPS = 3, 10.0
 """Images on either side of one that repeats the one before, at most, of which some change: a camera may have a quarter
 of the frames' rate, but hardly less than ten images a second."""
