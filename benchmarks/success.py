@@ -93,9 +93,10 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     print(
-        "| task | robot | strict success | first try | frames | mm from goal (median / p95 / max) | episodes/min/core |"
+        "| task | robot | variation | strict success | first try | frames | mm from goal (median / p95 / max) "
+        "| episodes/min/core |"
     )
-    print("|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|")
     for task in TASKS.names() if args.tasks == ["all"] else args.tasks:
         for robot in ROBOTS.names() if args.robots == ["all"] else args.robots:
             for variation in args.variations:

@@ -85,10 +85,10 @@ def _names(dataset: Dataset) -> Iterator[str]:
     for other in ROBOTS.names() if joints and robot in ROBOTS.names() else ():
         if other != robot and all(other in name for name in joints[:-1]):
             yield f"robot_type is {robot}, the joints are those of {other}"
-        known = ROBOTS.load(other).arm_joints
-        lacking = [joint for joint in known if joint not in joints]
-        if other == robot and lacking and len(lacking) <= len(known) / 2 and len(joints) >= len(known):
-            yield f"robot_type is {robot}, no joint is its {lacking[0]}"
+    known = ROBOTS.load(robot).arm_joints if robot in ROBOTS.names() else ()
+    lacking = [joint for joint in known if joint not in joints]
+    if lacking and len(lacking) <= len(known) / 2 and len(joints) >= len(known):  # of an arm called otherwise all are
+        yield f"robot_type is {robot}, no joint is its {lacking[0]}"
 
 
 def _videos(dataset: Dataset) -> Iterator[str]:

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Found, Lacking, Measurement, NotMeasured
-from demorec.check.dataset import Dataset, Rows
-from demorec.check.evidence import course_of, is_gripper, quaternion_places
+from demorec.check.dataset import Dataset
+from demorec.check.evidence import Motion, is_gripper, quaternion_places
 from demorec.check.likeness import CARTESIAN, likeness_check, same_joints
 from demorec.check.motion import Moving
 from demorec.check.rows import matrices
 from demorec.check.targets import NO_TARGETS, target_check
 from demorec.core.geometry import Array
-from demorec.episode.features import ACTION, EE_POSE, STATE
+from demorec.episode.features import ACTION
 
 _FEWEST_EPISODES, _FEWEST_FRAMES = 3, 30
 _AHEAD_S = 0.1
@@ -26,8 +26,8 @@ _CLEAR = 0.6
 _BESIDE, _AS_LIVELY, _OTHER = 0.1, 0.25, 0.5
 """Share of a joint's range by which its targets may be beyond it; of its variance that theirs has at least; correlation
 below which they go another way."""
-_POSE, _WAYS_OF_POSE = 7, 12
-"""Elements of an EE pose; of its way and turn along two systems of axes."""
+_WAYS_OF_POSE = 12
+"""Elements of the way and turn of an EE pose along two systems of axes."""
 _LIVELY, _STILL = 0.25, 0.02
 """Share of the usual deviation from which on an episode is judged, and below which an action is still."""
 
@@ -65,7 +65,7 @@ def _goes_its_own_way(pairs: Sequence[tuple[Array, Array]]) -> bool:
     if not in_range or not (min(state.min(), action.min()) > 0 or max(state.max(), action.max()) < 0):
         return False
     own, sent = (np.concatenate([each - each.mean() for each in part]) for part in zip(*pairs, strict=True))
-    goes, goes_sent, together = float(own @ own), float(sent @ sent), float(own @ sent)
+    goes, goes_sent, together = (float((one * other).sum()) for one, other in ((own, own), (sent, sent), (own, sent)))
     return goes_sent > _AS_LIVELY * goes and together < _OTHER * math.sqrt(goes * goes_sent)
 
 
@@ -84,13 +84,13 @@ def actions_agree(dataset: Dataset) -> Iterator[Found]:
     EE pose: a delta may be told along the axes of the base or of the tool, and is at odds only if it is with all that
     goes with it in most episodes.
     """
-    features = dataset.info.features
-    if not {STATE, ACTION} <= features.keys() or not all(features[name].is_numeric for name in (STATE, ACTION)):
+    feature, motions = dataset.info.features.get(ACTION), dataset.motions.all
+    if feature is None or not feature.is_numeric:
         yield Lacking(need="actions of three episodes")
         return
-    ahead = max(1, round(_AHEAD_S * dataset.info.fps))
-    long = [number for number, rows in enumerate(dataset.rows) if len(rows[ACTION]) >= _FEWEST_FRAMES + ahead]
-    names, has_pose = features[ACTION].names or (), EE_POSE in features and features[EE_POSE].shape == (_POSE,)
+    names, ahead = feature.names or (), max(1, round(_AHEAD_S * dataset.info.fps))
+    long = [number for number, motion in enumerate(motions) if len(motion.state) >= _FEWEST_FRAMES + ahead]
+    has_pose = all(motions[number].ee_pose is not None for number in long)
     candidates = _candidates(names, dict(same_joints(dataset)), has_pose=has_pose)
     if len(long) < _FEWEST_EPISODES or not candidates:
         yield NotMeasured(why=f"no action of {_FEWEST_EPISODES} episodes is called after a joint, or of an EE pose")
@@ -100,10 +100,8 @@ def actions_agree(dataset: Dataset) -> Iterator[Found]:
     moved = (goes > _LIVELY * usual_goes) & (usual_goes > 0)
     found = []
     for element, ways in candidates.items():
-        lively, still = (
-            acts[:, element] > _LIVELY * usual_acts[element],
-            acts[:, element] < _STILL * usual_acts[element],
-        )
+        share = acts[:, element] / max(float(usual_acts[element]), 1e-12)
+        lively, still = share > _LIVELY, share < _STILL
         odds = [_at_odds(together[:, element, way], lively & moved[:, way], still & moved[:, way]) for way in ways]
         if told := [one for one in odds if one is not None]:
             value, row = min(told)
@@ -133,22 +131,20 @@ def _at_odds(together: Array, judged: NDArray[np.bool_], still: NDArray[np.bool_
 def _by_episode(dataset: Dataset, numbers: Sequence[int], ahead: int) -> Iterator[tuple[Array, Array, Array]]:
     """Of each episode (K, N) correlation of actions and ways, and the deviations (K,) and (N,) of both."""
     for number in numbers:
-        rows = dataset.rows[number]
-        ways = _ways(rows, dataset.info.features[STATE].names or (), ahead)
-        action = rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64)[: len(ways)]
+        ways, action = _ways(dataset.motions.all[number], ahead), dataset.rows[number][ACTION]
+        action = action.reshape(len(action), -1).astype(np.float64)[: len(ways)]
         action, ways = action - action.mean(axis=0), ways - ways.mean(axis=0)
         acts, goes = (np.sqrt((table**2).mean(axis=0)) for table in (action, ways))
         shared = np.einsum("tk,tn->kn", action, ways) / len(ways)
         yield shared / np.maximum(np.outer(acts, goes), 1e-12), acts, goes
 
 
-def _ways(rows: Rows, names: Sequence[str], ahead: int) -> Array:
+def _ways(motion: Motion, ahead: int) -> Array:
     """(T - ahead, N) how far each state goes; where there is an EE pose, also its way and its turn, rad, along the
     axes of base and tool."""
-    state = course_of(rows[STATE].reshape(len(rows[STATE]), -1), names)
-    ways = [state[ahead:] - state[:-ahead]]
-    if EE_POSE in rows and rows[EE_POSE].shape[1:] == (_POSE,):
-        frames = matrices(rows[EE_POSE].astype(np.float64))
+    ways = [motion.state[ahead:] - motion.state[:-ahead]]
+    if motion.ee_pose is not None:
+        frames = matrices(motion.ee_pose)
         rotation, way = frames[:-ahead, :3, :3], frames[ahead:, :3, 3] - frames[:-ahead, :3, 3]
         turn = frames[ahead:, :3, :3] @ rotation.transpose(0, 2, 1)
         skew = turn - turn.transpose(0, 2, 1)

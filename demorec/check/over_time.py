@@ -23,9 +23,10 @@ _BESIDE = 4
 _SAME_LEVELS, _LEAST_DETAIL = 0.7, 10.0
 """Views whose coarse parts differ by less in the mean, of 255, show the same, however sharp; detail of images that
 hardly have any."""
-_EXPLAINED = 2.0
-"""Times what the camera shows of such a motion at most (in nine of ten moving frames) that no motion explains. Wrist
-cameras that noise shakes at 10 frames a second show up to 3.7, and as much beside it; images of another moment 2."""
+_EXPLAINED, _NEVER_EXPLAINED, _STANDS_OUT = 2.0, 5.0, 2.0
+"""Times what the camera shows of such a motion at most (in nine of ten moving frames) that no motion explains if it is
+so many times the steps beside it, or at all. Wrist cameras that noise shakes at 10 frames a second show up to 3.7, and
+1.3 times what is beside it; images of another moment 2 and more."""
 _MOVING = 0.3
 """Of the root mean square step of the state: more is a moving frame."""
 _NEARLY, _NEARLY_COUNTS = 0.05, 0.25
@@ -100,10 +101,9 @@ def _alien(film: Film) -> Flags:
         return alien
     shown = float(np.quantile(film.step[moves] / speed[moves], 0.9))
     there_and_back = np.linalg.norm(state[1:-1] - (state[2:] + state[:-2]) / 2, axis=1)
-    explained = _EXPLAINED * shown * there_and_back
-    # A shaking arm was seen to show 3.7 times what explains it, but no more than 1.3 times the steps beside it.
+    explained = np.maximum(shown * there_and_back, 1e-9)
     beside = np.maximum(np.pad(film.step[:-2], (1, 0)), np.pad(film.step[2:], (0, 1)))
-    alien[1:-1] &= (least > 2.5 * explained) | ((least > explained) & (least > 2 * beside))
+    alien[1:-1] &= least > explained * np.where(least > _STANDS_OUT * beside, _EXPLAINED, _NEVER_EXPLAINED)
     return alien
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -14,7 +13,7 @@ from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import check_option, resource_error
-from demorec.core.processes import SPAWN
+from demorec.core.processes import process_pool
 from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
 from demorec.episode.info import EpisodeInfo
@@ -158,16 +157,12 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
         for subject in subjects:
             yield check_subject(subject, options)
         return
-    # Spawned: forked children would share decoders and libraries in the middle of something.
-    with ProcessPoolExecutor(max_workers=min(options.workers, len(subjects)), mp_context=SPAWN) as pool:
+    with process_pool(min(options.workers, len(subjects))) as pool:
         # Datasets take longest, since LeRobot has to load for them: they begin first.
         order = sorted(subjects, key=lambda subject: subject.kind != "dataset")
         begun = {subject: pool.submit(check_subject, subject, options) for subject in order}
-        try:
-            for subject in subjects:
-                yield begun[subject].result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        for subject in subjects:
+            yield begun[subject].result()
 
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:

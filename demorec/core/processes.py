@@ -76,6 +76,25 @@ script that calls demorec needs no `if __name__ == "__main__"`, and a worker doe
 """
 
 
+@contextmanager
+def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """So many processes. Ctrl-C, which reaches them, too, ends them; one that comes while they end kills them.
+
+    It must not be raised there: a thread of which the end is waited for counts as ended then, and never ends.
+    """
+    pool = ProcessPoolExecutor(workers, mp_context=SPAWN)
+
+    def kill(number: int, frame: FrameType | None) -> None:
+        for process in list((pool._processes or {}).values()):
+            process.kill()
+
+    try:
+        yield pool
+    finally:
+        with handled(kill, signal.SIGINT):
+            pool.shutdown(cancel_futures=True)
+
+
 def in_turn[Item, Result](
     function: Callable[[Item], Result], items: Sequence[Item], workers: int, *, ahead: int | None = None
 ) -> Iterator[Result]:
@@ -92,17 +111,13 @@ def in_turn[Item, Result](
         yield from map(function, items)
         return
     waiting: deque[Future[Result]] = deque()
-    with ProcessPoolExecutor(workers, mp_context=SPAWN) as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
-                if ahead is not None and len(waiting) >= workers * ahead:
-                    yield waiting.popleft().result()
-            while waiting:
+    with process_pool(workers) as pool:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if ahead is not None and len(waiting) >= workers * ahead:
                 yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def _start_tracker() -> None:

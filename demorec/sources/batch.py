@@ -7,14 +7,14 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
-from demorec.core.processes import SPAWN
+from demorec.core.processes import process_pool
 from demorec.episode.info import EpisodeInfo
 from demorec.runs.external import ExternalFolder, differences
 from demorec.runs.run_file import Attempt
@@ -38,20 +38,12 @@ class _Here(Executor):
 
 @contextmanager
 def processes(workers: int) -> Iterator[Executor]:
-    """So many processes, or this one alone. An interrupt ends them; what they were writing is left unfinished."""
+    """So many processes, or this one alone."""
     if workers == 1:
         yield _Here()
         return
-    with ProcessPoolExecutor(workers, mp_context=SPAWN) as pool:
-        try:
-            yield pool
-        except Exception:
-            pool.shutdown(cancel_futures=True)
-            raise
-        except BaseException:
-            for process in list(pool._processes.values()):
-                process.kill()
-            raise
+    with process_pool(workers) as pool:
+        yield pool
 
 
 _MAX_REASON = 1000

@@ -85,4 +85,4 @@ def main(folder: str, num_episodes: int = 3) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "runs/mine")
+    main(sys.argv[1] if len(sys.argv) > 1 else "runs/gym_wrapper")

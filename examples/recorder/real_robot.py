@@ -1,4 +1,4 @@
-"""Records a real robot's own control loop: python examples/recorder/real_robot.py runs/mine.
+"""Records a real robot's own control loop: python examples/recorder/real_robot.py runs/real_robot.
 
 `MyArm` and `MyCamera` stand in for the drivers of your arm and camera. The loop reads what there is, sends a command
 and hands all of it to the recorder, which never holds it up: another thread encodes the images.
@@ -75,4 +75,4 @@ def main(folder: str, num_episodes: int = 2, seconds: float = 2.0) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "runs/mine")
+    main(sys.argv[1] if len(sys.argv) > 1 else "runs/real_robot")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import psutil
@@ -89,6 +90,39 @@ def test_ctrl_c_in_a_callback_is_heard_and_not_printed(tmp_path: Path) -> None:
         [sys.executable, "-c", "import script"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert (done.stdout.split(), done.stderr) == (["130"], "")
+
+
+SLEEPS = """
+import time
+
+def work(number):
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+WAITS = """
+from demorec.core.processes import in_turn
+from work import work
+
+try:
+    list(in_turn(work, [1, 2], 2))
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_a_second_ctrl_c_ends_what_the_first_waits_for(tmp_path: Path) -> None:
+    """It is of the parent alone, so that nothing but the second one can end the workers."""
+    (tmp_path / "work.py").write_text(SLEEPS)
+    parent = subprocess.Popen(
+        [sys.executable, "-c", WAITS], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert parent.stdout is not None
+    assert [parent.stdout.readline() for _ in range(2)] == ["ready\n"] * 2
+    for _ in range(2):
+        parent.send_signal(signal.SIGINT)
+        time.sleep(1.0)
+    out, errors = parent.communicate(timeout=40)
+    assert (out, errors) == ("interrupted\n", "")
 
 
 STARTS = """
