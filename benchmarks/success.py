@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.core.errors import SceneError
+from demorec.core.errors import ConfigError, SceneError
 from demorec.core.tables import ROBOTS, TASKS
 from demorec.episode.episode import Outcome
 from demorec.loop import ScriptAgent, Session, make_world, prepare
@@ -108,7 +108,10 @@ def main() -> None:
                     cameras=(),
                     objects=tuple(args.objects),
                 )
-                config.validate()
+                try:
+                    config.validate()
+                except ConfigError as error:
+                    parser.error(str(error))
                 row = measure(config, first=args.first, episodes=args.episodes)
                 rows.append(row)
                 print(table_row(row), flush=True)

@@ -34,6 +34,7 @@ from demorec.check.evidence import Flags, Motion
 from demorec.check.rows import LinkMatrices, longest_run
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
+from demorec.episode.sensed import MAY_REST
 from demorec.robots.urdf import Urdf
 
 _LATEST_S = 0.5
@@ -251,7 +252,8 @@ def _of_single_episodes(motions: Sequence[Motion], parts: Array, counts: NDArray
 def stuck_sensors(subject: Moving) -> Iterator[Found]:
     """What is measured changes, if ever so little, while the arm moves, and each of its elements in some frame.
 
-    Of other robots than simulated ones a sensor is reported that never changes in an episode.
+    Of other robots than simulated ones a sensor is reported that never changes in an episode. One that may rest counts
+    only where it is not zero.
     """
     for motion in subject.motions.all:
         moves = np.abs(np.diff(motion.state, axis=0)).max(axis=1, initial=0.0) > 1e-5
@@ -259,6 +261,8 @@ def stuck_sensors(subject: Moving) -> Iterator[Found]:
             moves = np.abs(np.diff(motion.state[:, :-1], axis=0)).max(axis=1, initial=0.0) > 1e-5
         for name, table in motion.sensors.items():
             same, stands = (table[1:] == table[:-1]).all(axis=1) & moves, np.ptp(table, axis=0) == 0
+            if name in MAY_REST:
+                same, stands = same & table[1:].any(axis=1), stands & table.any(axis=0)
             length, start = longest_run(same)
             if motion.contact is None:  # sensors slower than the frames hold a value, and contacts come and go
                 length, start = int(same.sum() * stands.all()), 0

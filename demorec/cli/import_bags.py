@@ -15,6 +15,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
+from demorec.core.registry import nearest_match
 from demorec.robots.motors import Motors, MotorUnits
 from demorec.sources.formats import FORMATS, SourceFormat
 
@@ -82,6 +83,10 @@ class Import:
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
         if form is not None:
             return self._import_frames(word, form, self.bags[1:], motors)
+        if (near := nearest_match(word, FORMATS)) and not self.bags[0].exists():
+            raise ConfigError(
+                f"There is no bag {word!r}.{near} Name bags, or one of {', '.join(FORMATS)} and its files."
+            )
         from demorec.sources.bag import bags_in, open_bag
 
         if self.suggest:

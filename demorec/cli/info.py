@@ -337,4 +337,4 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
             )
         )
     plain = {"kind": "folder", "path": str(path), "recordings": items}
-    return plain, [f"{len(recordings)} recordings in {path}", "", *aligned(rows)]
+    return plain, [f"{counted(len(recordings), 'recording')} in {path}", "", *aligned(rows)]

@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import refuse_inside
-from demorec.core.errors import check_option
+from demorec.core.errors import ConfigError, check_option
 from demorec.learn.evaluate import TakeOver
 
 
@@ -81,6 +81,8 @@ class Pretrain:
         check_option("frames_per_update", self.frames_per_update, 2, 65_536)
         check_option("learning_rate", self.learning_rate, 1e-7, 1.0)
         check_option("frame_cache_mb", self.frame_cache_mb, 0, 1 << 20)
+        if steps := next((flag for flag in self.others if flag.partition("=")[0] == "--steps"), ""):
+            raise ConfigError(f"{steps} is for demorec train: --num-updates says how long the encoder learns.")
         refuse_inside([self.out])
         from demorec.learn.training.command import training_config
 

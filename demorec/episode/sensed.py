@@ -104,6 +104,7 @@ class Sensed:
         names: Of the D elements that datasets have: the first ones of the quantity.
         plots: Of all D elements, in order.
         stream: None where it is part of the messages of /joint_states or /gripper.
+        may_rest: Whether it stays zero as long as nothing happens to it, while the arm moves.
     """
 
     quantity: str
@@ -111,6 +112,7 @@ class Sensed:
     names: Callable[[RobotSpec], tuple[str, ...]]
     plots: tuple[Plot, ...]
     stream: Stream | None = None
+    may_rest: bool = False
 
     def values(self, sensed: Mapping[str, Array], robot: RobotSpec) -> Array | None:
         """(T, D) of quantities (T, ...); None where it was not sensed."""
@@ -130,6 +132,7 @@ SENSED: Mapping[str, Sensed] = {
         meaning="sum of the normal forces on the fingers (N)",
         names=lambda robot: ("gripper.force",),
         plots=(Plot(curves="force", title="contact force (N)", names=("contact force",)),),
+        may_rest=True,
     ),
     # As a force-torque sensor at the hand's mount feels it: about the origin of the hand's link, nothing taken off; the
     # weight and the inertia of hand, fingers and what they hold are in it.
@@ -155,3 +158,6 @@ STREAMS: Mapping[str, tuple[Sensed, Stream]] = {
     row.quantity: (row, row.stream) for row in SENSED.values() if row.stream is not None
 }
 """Quantity -> the row of one that has messages of its own, and these."""
+
+MAY_REST = frozenset(name for feature, row in SENSED.items() if row.may_rest for name in (feature, row.quantity))
+"""Features and quantities that stay zero as long as nothing happens to them."""

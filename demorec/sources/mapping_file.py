@@ -35,6 +35,8 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
         if _DEEP_KEY.search(text):
             raise ValueError("a key has more than 16 parts")
         data = tomllib.loads(text)
+    except FileNotFoundError as error:
+        raise ConfigError(f"There is no mapping (demorec import ... --suggest > FILE writes one): {path}") from error
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (ValueError, RecursionError) as error:

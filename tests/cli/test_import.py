@@ -16,7 +16,8 @@ BAD: dict[str, tuple[int, str]] = {
     "no bag": (2, "No bag is given"),
     "no mapping": (2, "An import needs --mapping and --out"),
     "a bag that is not there": (2, "There is no bag that could be read"),
-    "a mapping that is not there": (2, "The mapping cannot be read"),
+    "a mapping that is not there": (2, "There is no mapping (demorec import ... --suggest > FILE writes one)"),
+    "a word for a format that is misspelt": (2, "There is no bag 'lerobt'. Did you mean 'lerobot'?"),
     "no toml": (2, "The mapping is no valid TOML"),
     "unknown encoding": (1, "the encoding 'cbor' is not read"),
     "two types on a topic": (1, "has messages of several types"),
@@ -75,6 +76,7 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
     words = {
         "no bag": words[1:],
         "no mapping": words[:1],
+        "a word for a format that is misspelt": ["lerobt", bag, "--out", run],
         "a dataset without a mapping": words[:1],
         "codec": [*words, "--gop", "0"],
     }.get(name, words)

@@ -147,3 +147,11 @@ def test_what_its_parser_refuses_is_a_wrong_request(instead: Any, refused: objec
 def test_missing_settings_are_a_wrong_request(capsys: pytest.CaptureFixture[str]) -> None:
     assert ends("--config_path=nothing.json") == 2
     assert "There is no such file of settings: nothing.json" in capsys.readouterr().err
+
+
+def test_steps_are_no_flag_of_pretrain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["pretrain", "--out", str(tmp_path / "eye"), "--steps=60"])
+    assert ended.value.code == 2
+    told = "demorec pretrain: --steps=60 is for demorec train: --num-updates says how long the encoder learns."
+    assert capsys.readouterr().err.splitlines() == [told]

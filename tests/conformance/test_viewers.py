@@ -47,6 +47,19 @@ def test_programs_run_and_are_short(name: str, run_folder: Path, tmp_path: Path)
     assert entity in {chunk.entity_path for chunk in RrdReader(target).stream()}
 
 
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_programs_say_what_they_need(name: str, run_folder: Path, tmp_path: Path) -> None:
+    program = [sys.executable, str(VIEWERS / "rerun" / name)]
+    target = tmp_path / "x.rrd"
+    of_run = subprocess.run([*program, str(run_folder), str(target)], capture_output=True, text=True, check=False)
+    assert (of_run.returncode, target.exists()) == (0, True), of_run.stderr
+    for words in ([], [str(tmp_path / "nothing"), str(tmp_path / "y.rrd")]):
+        done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
+        assert done.returncode != 0
+        assert "Traceback" not in done.stderr
+        assert "nothing" in done.stderr if words else "usage:" in done.stderr
+
+
 @pytest.mark.parametrize("layout", sorted((VIEWERS / "foxglove").glob("*.json")), ids=lambda path: path.stem)
 def test_foxglove_layouts_ask_for_what_a_recording_has(layout: Path, run_folder: Path) -> None:
     content = json.loads(layout.read_text())

@@ -159,7 +159,11 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     [
         ("lerobot v3.0", ["--mapping", "x.toml"], "Only bags and HDF5 files are read by a mapping"),
         ("robomimic", ["--mapping", "BAG.toml"], "This is a mapping of bags, not of HDF5 files"),
-        ("mcap", ["--mapping", "x.toml"], "The mapping cannot be read (No such file or directory): x.toml"),
+        (
+            "mcap",
+            ["--mapping", "x.toml"],
+            "There is no mapping (demorec import ... --suggest > FILE writes one): x.toml",
+        ),
     ],
 )
 def test_a_mapping_that_does_not_belong_there(

@@ -149,6 +149,20 @@ def test_a_good_episode_passes(tmp_path: Path) -> None:
     assert found["penetration"] == "skip"
 
 
+@pytest.mark.parametrize(("force_n", "level"), [(0.0, "pass"), (5.0, "warn")])
+def test_a_contact_sensor_may_stay_at_zero(force_n: float, level: str, tmp_path: Path) -> None:
+    episode = steady()
+    touch = replace(FORCE, name="observation.contact_force", names=("gripper.force",), units=("N",))
+    frames = []
+    for frame in episode.frames:
+        samples = dict(frame.samples)
+        force = samples.pop(FORCE.name)
+        samples[touch.name] = replace(force, vector=np.array([force_n]))
+        frames.append(replace(frame, samples=samples))
+    episode = replace(episode, info=replace(episode.info, features=(*episode.info.features[:2], touch)), frames=frames)
+    assert levels(write_external(tmp_path / "a.mcap", episode))["stuck_sensors"] == level
+
+
 def test_a_label_that_never_changes_is_no_stuck_sensor(tmp_path: Path) -> None:
     """LeRobot's `intervention` is false in most episodes."""
     episode = steady()

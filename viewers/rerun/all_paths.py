@@ -4,21 +4,22 @@ python viewers/rerun/all_paths.py recordings/cubes paths.rrd
 rerun paths.rrd
 """
 
+import argparse
 import sys
 from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
 
+from demorec.core.errors import DemorecError
+from demorec.datasets.sources import find_recordings
 from demorec.mcap import Recording
 
 GREEN, RED = (80, 220, 120), (240, 80, 80)
 
 
 def main(run: Path, target: Path) -> None:
-    files = sorted(run.glob("episodes/*.mcap")) + sorted(run.glob("failed/*.mcap"))
-    if not files:
-        sys.exit(f"The run holds no recordings: {run}")
+    files = find_recordings([run])
     stream = rr.RecordingStream("paths", recording_id=run.resolve().name)
     stream.save(target, default_blueprint=rrb.Blueprint(rrb.Spatial3DView(name="gripper paths"), collapse_panels=True))
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -33,4 +34,10 @@ def main(run: Path, target: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="a run of generate-dataset, or one of its recordings")
+    parser.add_argument("target", type=Path, help="the .rrd file to write")
+    try:
+        main(**vars(parser.parse_args()))
+    except DemorecError as error:
+        sys.exit(str(error))

@@ -4,21 +4,25 @@ python viewers/rerun/one_stream.py recordings/cubes/episodes/episode_000000.mcap
 rerun tracking.rrd
 """
 
+import argparse
 import sys
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
+from demorec.core.errors import DemorecError
+from demorec.datasets.sources import find_recordings
 from demorec.mcap import Recording
 
 
-def main(recording_path: Path, target: Path) -> None:
-    with Recording(recording_path) as recording:
+def main(source: Path, target: Path) -> None:
+    file = find_recordings([source])[0]
+    with Recording(file) as recording:
         columns, joints = recording.columns(), recording.info.robot.arm_joints
     # Action t is reached at t + 1: the target of frame t is compared with the position one frame later.
     error = columns.joint_position[1:, : len(joints)] - columns.action_joint_target[:-1]
-    stream = rr.RecordingStream("tracking", recording_id=recording_path.stem)
+    stream = rr.RecordingStream("tracking", recording_id=file.stem)
     stream.save(target)
     stream.log("tracking_error", rr.SeriesLines(names=list(joints)), static=True)
     stream.send_columns(
@@ -31,4 +35,10 @@ def main(recording_path: Path, target: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path, help="a simulated recording, or a run, of which the first one is taken")
+    parser.add_argument("target", type=Path, help="the .rrd file to write")
+    try:
+        main(**vars(parser.parse_args()))
+    except DemorecError as error:
+        sys.exit(str(error))

@@ -4,17 +4,19 @@ python viewers/rerun/own_layout.py recordings/cubes/episodes/episode_000000.mcap
 rerun wrist.rrd
 """
 
+import argparse
 import sys
 from pathlib import Path
 
 import rerun.blueprint as rrb
 
+from demorec.core.errors import DemorecError
 from demorec.view.paths import Paths
 from demorec.view.scene import log_episode, new_recording
 from demorec.view.sources import find_episodes
 
 
-def main(path: Path, target: Path, camera: str = "wrist") -> None:
+def main(source: Path, target: Path, camera: str) -> None:
     paths = Paths()
     layout = rrb.Blueprint(
         rrb.Vertical(
@@ -27,7 +29,7 @@ def main(path: Path, target: Path, camera: str = "wrist") -> None:
         ),
         collapse_panels=True,
     )
-    with find_episodes([path])[0].open() as episode:
+    with find_episodes([source])[0].open() as episode:
         stream = new_recording(episode)
         stream.save(target, default_blueprint=layout)
         log_episode(stream, episode)
@@ -36,4 +38,11 @@ def main(path: Path, target: Path, camera: str = "wrist") -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path, help="a recording, or a run, of which the first one is taken")
+    parser.add_argument("target", type=Path, help="the .rrd file to write")
+    parser.add_argument("--camera", default="wrist")
+    try:
+        main(**vars(parser.parse_args()))
+    except DemorecError as error:
+        sys.exit(str(error))
