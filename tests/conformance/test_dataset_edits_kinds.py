@@ -18,6 +18,7 @@ from support.datasets import TOP, items, same, write_with_lerobot
 from support.training import DEPTH, write_by_lerobot
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.usefixtures("hf_datasets_cache"),
     pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning"),
 ]
@@ -98,7 +99,6 @@ def test_in_another_order_and_in_parts(made: tuple[Path, Any], tmp_path: Path) -
     assert all(same(found[len(was)], was) for was in before if len(was) != 14)
 
 
-@pytest.mark.slow
 def test_with_torchcodec(made: tuple[Path, Any], tmp_path: Path) -> None:
     try:
         import torchcodec.decoders  # noqa: F401

@@ -69,6 +69,7 @@ def test_what_is_kept_of_messages(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_the_peak_of_an_import_is_little_more_than_what_is_kept(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(MAPPING)

@@ -152,11 +152,28 @@ def told_rounds(told: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
+def test_it_goes_from_demonstrations_to_a_corrected_policy(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = place / "whole"
+    assert ends(words_for(place, out)) == 0
+    rounds = told_rounds(capsys.readouterr().out)
+    assert [row.split()[:3] for row in rounds] == [["0", "2", "0"], ["1", "2", "2"]]
+    # The same command again has nothing left to do, and another policy in its place is noticed.
+    assert ends(words_for(place, out)) == 0
+    assert told_rounds(capsys.readouterr().out) == rounds
+    config = out / "round_00" / "train" / "checkpoints" / "last" / "pretrained_model" / "config.json"
+    was = config.read_text()
+    config.write_text(was + "\n")
+    assert ends(words_for(place, out)) == 1
+    assert "The policy is not the one that was trained here" in capsys.readouterr().err
+    config.write_text(was)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.timeout(1800)
 def test_killed_anywhere_it_goes_on_to_the_end(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert ends(words_for(place, place / "whole")) == 0
     rounds = told_rounds(capsys.readouterr().out)
-    assert [row.split()[:3] for row in rounds] == [["0", "2", "0"], ["1", "2", "2"]]
-
     out = place / "killed"
     moments = {
         out / "round_00" / "train": signal.SIGKILL,
@@ -172,9 +189,3 @@ def test_killed_anywhere_it_goes_on_to_the_end(place: Path, capsys: pytest.Captu
     for number in ("00", "01"):
         parts = (f"round_{number}", "train", "checkpoints", "last", "pretrained_model", "model.safetensors")
         assert place.joinpath("whole", *parts).read_bytes() == out.joinpath(*parts).read_bytes()
-    # The same command again has nothing left to do, and another policy in its place is noticed.
-    assert ends(words_for(place, out)) == 0
-    weights = out / "round_00" / "train" / "checkpoints" / "last" / "pretrained_model" / "config.json"
-    weights.write_text(weights.read_text() + "\n")
-    assert ends(words_for(place, out)) == 1
-    assert "The policy is not the one that was trained here" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from support.training import SMALL_ACT
 
 from demorec.cli import generate_dataset_main, main
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("hf_datasets_cache")]
 
 POLICY: dict[str, Any] = {**SMALL_ACT, "type": "act_keypoints"}
 
@@ -331,7 +331,6 @@ def train(settings: Path, out: Path, *more: str, program: str = "demorec train")
     )
 
 
-@pytest.mark.slow
 def test_the_encoder_stays_as_it_was_pretrained(settings: Path, pretrained: Path, tmp_path: Path) -> None:
     """Each frame is encoded once, and the losses are those of a training by LeRobot's own command, which does not."""
     path = f"--policy.path={pretrained}"

@@ -113,6 +113,7 @@ def test_what_is_to_be_told_follows_from_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_it_learns_to_see_where_another_robot_will_grasp(tmp_path: Path) -> None:
     """To a centimetre, which is a pixel, where the mean of all is a decimetre off."""
     found = pretrained(tmp_path, episodes=120, updates=600)

@@ -24,6 +24,8 @@ from demorec.mcap import Recording
 from demorec.mcap.description import robot_description
 from demorec.robots.panda import PANDA
 
+pytestmark = pytest.mark.slow
+
 EE_POSE = "observation.ee_pose"
 STATE, ACTION, VELOCITY, FRONT = "observation.state", "action", "observation.velocity", "observation.images.front"
 Rows = NDArray[Any]
@@ -255,7 +257,6 @@ def make_by_lerobot(run: Path, root: Path, *, frozen: range = range(0)) -> Path:
     return root
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_faults_in_a_dataset_that_lerobot_wrote(run: Path, tmp_path: Path) -> None:
     """An offset, a lag, exchanged joints, a wrong rate and a frozen camera, without any file of ours beside it."""

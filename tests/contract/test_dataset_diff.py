@@ -21,7 +21,7 @@ from support.commands import exit_code
 from support.datasets import TOP, items, write_with_lerobot
 from support.export import data_table, export, files_of, make_run, recode
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("hf_datasets_cache")]
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 TASKS, INFO, STATS = "meta/tasks.parquet", "meta/info.json", "meta/stats.json"
 TASK_COLUMN = "task"

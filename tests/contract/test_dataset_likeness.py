@@ -32,6 +32,8 @@ from support.dataset_particular import held, repeats
 from support.export import export
 from support.foreign_dataset import write_foreign
 
+pytestmark = pytest.mark.slow
+
 Fault = Callable[[Path], None]
 Images = NDArray[Any]
 WORLD = "observation.environment_state"

@@ -19,6 +19,8 @@ from demorec.datasets.editing.operations import rename, reorder, shuffle, split,
 from demorec.datasets.editing.plan import Plan, Source
 from demorec.datasets.editing.write import write_plan
 
+pytestmark = pytest.mark.slow
+
 LENGTHS = (9, 7, 8, 6, 10)
 BOXES = "demorec/boxes/observation.images.front.json"
 
@@ -74,7 +76,7 @@ def test_one_round_trip(dataset: Path, tmp_path: Path) -> None:
     round_trips(dataset, tmp_path, [3, 0, 4, 2, 1], seed=1, share=0.4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=4, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.permutations(range(len(LENGTHS))), st.integers(0, 99), st.floats(0.1, 0.9))
 def test_round_trips(

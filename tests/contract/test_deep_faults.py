@@ -28,6 +28,8 @@ from demorec.mcap.streams import frame_streams
 from demorec.replay.deep import deep_check
 from demorec.robots.panda import PANDA
 
+pytestmark = pytest.mark.slow
+
 Edit = Callable[[Message], list[Message]]
 INFO = channels.camera_topic("front", "camera_info")
 VIDEO, H264 = channels.camera_topic("front", "video"), channels.camera_topic("front", "h264")

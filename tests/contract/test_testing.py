@@ -51,7 +51,7 @@ def test_the_documented_three_lines_test_the_documented_task(tmp_path: Path, mon
     (tmp_path / "my_tested_tasks.py").write_text(blocks[0])
     monkeypatch.syspath_prepend(str(tmp_path))
     found: dict[str, type[TaskContract]] = {}
-    exec(compile(blocks[-1].replace("my_tasks:", "my_tested_tasks:"), "test_my_tasks.py", "exec"), found)
+    exec(compile(blocks[-1].replace("left_tasks:", "my_tested_tasks:"), "test_left_tasks.py", "exec"), found)
     contract = found["TestToTheLeft"]
     contract.num_episodes = 2
     tests = [name for name in dir(contract) if name.startswith("test_")]

@@ -24,6 +24,8 @@ from support.commands import exit_code
 from support.fuzz import LimitedCommands, problem_of
 from support.fuzz_bags import MAPPING
 
+pytestmark = pytest.mark.slow
+
 _SEPARATOR = "=" * 80 + "\n"
 
 

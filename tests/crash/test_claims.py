@@ -24,6 +24,8 @@ from demorec.datasets.hdf5.foreign import ForeignFile
 from demorec.datasets.lerobot.files import check_video, read_table
 from demorec.datasets.lerobot.pages import longest_row, pages_of
 
+pytestmark = pytest.mark.slow
+
 _MODULES = (
     "demorec.check.run",
     "demorec.sources.dataset_import",
@@ -123,7 +125,6 @@ def test_a_dataset_claims_very_much(claim: Callable[[Path], None], commands: Lim
     assert len(said.splitlines()) == 1
 
 
-@pytest.mark.slow
 def test_large_images_in_a_small_table(commands: LimitedCommands, tmp_path: Path) -> None:
     root = write_foreign(tmp_path / "large", length=200, size=(4000, 4000))
     assert (root / DATA).stat().st_size < 100_000

@@ -77,6 +77,7 @@ def test_killed_at_a_few_moments(source: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_killed_at_any_moment(source: Path, tmp_path: Path) -> None:
     killed(source, tmp_path / "d", KILLS)
 

@@ -19,17 +19,15 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> FuzzedData:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_few_hundred_inputs(fuzzed: FuzzedData) -> None:
-    results = results_here(fuzzed, range(190))
-    assert min(results["done"], results["refused"]) > 30, results
+def test_a_hundred_inputs(fuzzed: FuzzedData) -> None:
+    results = results_here(fuzzed, range(100))
+    assert min(results["done"], results["refused"]) > 15, results
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize(
-    "numbers",
-    [range(1000, 1200), *(pytest.param(range(k, k + 460), marks=pytest.mark.long) for k in range(1200, 3500, 460))],
-)
+@pytest.mark.parametrize("numbers", [range(1000, 1200), *(range(k, k + 460) for k in range(1200, 3500, 460))])
 def test_two_and_a_half_thousand_inputs(fuzzed: FuzzedData, numbers: range) -> None:
     found = problems_within_limits(fuzzed, numbers, _MODULES)
     assert not found, "\n".join(found)

@@ -13,6 +13,8 @@ import pytest
 from support.commands import workers_of
 from support.export import make_run
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:

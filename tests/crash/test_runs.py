@@ -22,6 +22,8 @@ from demorec.generate.options import RunResult
 from demorec.generate.run import GRACE_S
 from demorec.runs.run_file import load_run_file
 
+pytestmark = pytest.mark.slow
+
 PATIENCE_S = 120.0
 """No measure of anything: after so long, what a test waits for will not happen on the busiest machine."""
 
@@ -353,7 +355,6 @@ def test_a_killed_driver_leaves_no_orphans(tmp_path: Path) -> None:
     assert_gone(workers)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kills", [4, pytest.param(40, marks=pytest.mark.long)])
 def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path: Path, kills: int) -> None:
     """SIGKILL to the driver or to a worker, at moments spread over the run."""

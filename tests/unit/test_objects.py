@@ -33,6 +33,8 @@ from demorec.sim.parts import with_parts
 from demorec.sim.resting import at_rest
 from demorec.tasks.grasping import hand_down, hand_yaw, places_of
 
+pytestmark = pytest.mark.slow
+
 PANDA_HAND = Hand(max_width=0.08, finger_depth=0.007, palm_clearance=0.035)
 UP = (0.0, 0.0, 1.0)
 KINDS = {kind.noun: kind for name in ("household", "blocks") for kind in OBJECTS.load(name).kinds}
@@ -393,7 +395,6 @@ def test_random_shapes_are_closed_and_lie_flat() -> None:
         assert float(shape.extents[2]) < 0.07
 
 
-@pytest.mark.slow
 def test_the_random_shelf_has_those_of_pybullet_that_a_hand_gets_around() -> None:
     """About every third of a thousand; which ones, by trimesh's boxes, whichever side they lie on."""
     (kind,) = OBJECTS.load("random").kinds

@@ -18,6 +18,8 @@ from PIL import Image
 from support.commands import exit_code
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 
+pytestmark = pytest.mark.slow
+
 LENGTH, EPISODES_IN_ALL, BAD, SIZE = 60, 24, 5, (32, 24)
 CLOSES, OPENS = 20, 42
 COLORS = {"red": (220, 20, 20), "blue": (20, 20, 220)}
