@@ -32,6 +32,8 @@ from demorec.sources.bag_files import BagError
 from demorec.sources.import_file import BagReport
 from demorec.sources.import_run import import_bags
 
+pytestmark = pytest.mark.slow
+
 FRONT = "/follower/cam_front/image_raw/compressed"
 DROPPING = bag_mappings.SO101.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
 """A bad bag is no reason to drop an episode: it has none."""

@@ -34,7 +34,7 @@ HISTORY = [-2 / 30, 0.0]
 CHUNK = [k / 30 for k in range(16)]
 
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("hf_datasets_cache")]
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,6 @@ def test_every_item_is_equal(kind: str, roots: dict[str, Path]) -> None:
     assert_same_item(fast[-1], slow[-1])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_window_is_equal(kind: str, roots: dict[str, Path]) -> None:
     _, plain = pair(roots[kind])
@@ -109,7 +108,6 @@ def test_every_window_is_equal(kind: str, roots: dict[str, Path]) -> None:
     assert_same(fast, slow)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ours", "lerobot"])
 def test_torchcodec_gives_equal_items_too(kind: str, roots: dict[str, Path]) -> None:
     try:

@@ -16,6 +16,8 @@ from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 
+pytestmark = pytest.mark.slow
+
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 CHECKS = ("dataset_images_as_drawn", "dataset_image_lag")
 Images = list[Any]

@@ -13,6 +13,8 @@ from demorec.core.tables import ROBOTS
 from demorec.episode.scene import Shape
 from demorec.loop import Episode, ScriptAgent, Session, make_world
 
+pytestmark = pytest.mark.slow
+
 SINKING = 1e-3
 """Of each finger, metres, that is too much."""
 

@@ -12,6 +12,8 @@ from support.sim import episode, run
 
 from demorec.episode.variation import Ranges
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("task", "robot", "variation", "seed", "index"),

@@ -257,6 +257,7 @@ def test_what_is_no_number_is_not_sent(recorded: Path) -> None:
     assert np.isfinite(report.joint_error)
 
 
+@pytest.mark.slow
 def test_increments_of_a_jaw_arm_are_judged_by_the_arm_alone(tmp_path: Path) -> None:
     """Without demorec's own files only the jaw's action is a target; it stops at what it holds, so it has no lag."""
     run = simulate_run(tmp_path / "run", 4, seed=61, robot="so101", cameras=())
