@@ -118,13 +118,15 @@ def _moves(speed: Array) -> Flags:
 )
 def image_cuts(subject: Filmed) -> Iterator[Found]:
     """What a camera sees goes on from frame to frame: catches one that is hit, light that is switched, films that were
-    put together."""
+    put together. What falls away before it takes several frames."""
     for film in _all(subject):
         if len(film.cells) < _FEWEST_IMAGES or is_blank(film):
             continue
         row = int(np.argmax(film.step))
         others = np.delete(film.step, slice(max(row - 1, 0), row + 2))
-        times = float(film.step[row] / max(float(others.max()), _CHANGES)) if film.step[row] > _ALIEN_LEVELS else 1.0
+        beside = float(film.step[max(row - 1, 0) : row + 2].min())  # of a cut, one at least is as usual
+        usual = max(float(others.max()), beside, _CHANGES)
+        times = float(film.step[row] / usual) if film.step[row] > _ALIEN_LEVELS else 1.0
         yield Measurement(value=times, frame=int(film.frames[row + 1]), detail=film.where)
 
 

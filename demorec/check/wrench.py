@@ -46,7 +46,7 @@ _MOVES = 0.3
 _FEWEST_FRAMES = 3
 _LOST_SHARE = 0.5
 """Of the frames in which nothing is measured: more is a sensor that is not there, or an arm without weight."""
-_FRAMES_A_SECOND = 15
+_FRAMES_A_SECOND = 20
 """Below which only the last motor tells a lag: what noise does to the links before it is over between two frames."""
 _MOST_LAG, _CLEAR, _UNCLEAR = 3, 0.25, 0.5
 """Frames up to which wrench and motors are shifted against each other; below which share of the usual shift's squares

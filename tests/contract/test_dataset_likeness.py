@@ -317,6 +317,20 @@ def test_a_fixed_camera_that_turned_by_five_degrees_before_one_episode(tmp_path:
     assert level_of(tmp_path / "dataset", "views_alike", "dataset") == "warn"
 
 
+def falls_away(images: Images) -> Images:
+    """Something that covers half of the image, and is gone within three frames."""
+    width, images = images.shape[2], images.copy()
+    for rows, share in ((slice(0, 30), 0.5), (slice(30, 31), 0.3), (slice(31, 32), 0.1)):
+        images[rows, :, : int(share * width)] = (200, 20, 20)
+    return images
+
+
+def test_what_falls_away_before_a_camera_is_no_cut(filmed: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
+    film(FRONT, falls_away)(dataset)
+    assert level_of(dataset, "image_cuts", "dataset") == "pass"
+
+
 def test_views_of_different_instructions_are_not_compared(filmed: Path, tmp_path: Path) -> None:
     dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
     loose.put_rows(dataset, "task_index", loose.rows_of(dataset, "episode_index"))
