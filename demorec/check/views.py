@@ -27,9 +27,9 @@ _GRAY_LEVELS, _COLOURED_LEVELS = 1.0, 5.0
 """Of 255, mean difference of red, green and blue in gray images, and in coloured ones at least."""
 _BLACK, _BARS = 6, 0.05
 """Levels of 255 below which a part is black in all of an episode's images, and the share of such parts in bars."""
-_ONE_FILM = 1.6
+_ONE_FILM = 1.15
 """Root mean square levels by which a film and its copy, encoded again, differ at most: by 1.0 with 96 pixels, and films
-of 420 clean episodes by 2.7 and more."""
+of 900 clean episodes by 1.26 and more."""
 _FEWEST_OF_SESSION, _SESSION = 5, 0.05
 """Episodes of a session at least, and share of all."""
 
