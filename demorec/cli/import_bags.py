@@ -17,6 +17,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.registry import nearest_match
 from demorec.robots.motors import Motors, MotorUnits
+from demorec.runs.find import find
 from demorec.sources.formats import FORMATS, SourceFormat
 
 MAX_WORKERS = 1000
@@ -92,6 +93,8 @@ class Import:
         if self.suggest:
             from demorec.sources.suggest import suggested_mapping
 
+            if find(self.bags[0]).kind == "recording":
+                tell(f"Note: demorec made this recording, and reads it as it is, without an import: {self.bags[0]}")
             say(*suggested_mapping(bags_in(self.bags[0])[0], tell))
             return 0
         if self.mapping is None or self.out is None:

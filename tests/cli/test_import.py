@@ -9,6 +9,7 @@ import h5py
 import pytest
 from support import bag_mappings, bags
 from support.commands import exit_code
+from support.recording import write_episode
 
 from demorec.datasets.lerobot.paths import INFO_PATH
 
@@ -116,3 +117,11 @@ def _two_types(notes: bags.Notes, tmp_path: Path) -> Path:
     (folder / "metadata.yaml").write_text(text.replace("  - bag.mcap\n", "  - bag.mcap\n  - second.mcap\n", 1))
     assert "second.mcap" in (folder / "metadata.yaml").read_text()
     return folder
+
+
+def test_a_recording_of_demorec_needs_no_import(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_episode(tmp_path / "a.mcap", num_frames=5)
+    assert exit_code("import", "--suggest", path) == 0
+    out, err = capsys.readouterr()
+    assert err == f"Note: demorec made this recording, and reads it as it is, without an import: {path}\n"
+    assert out.startswith("# A mapping for a.mcap")
