@@ -28,7 +28,7 @@ STARTS = Region(x=(0.40, 0.48), y=(-0.12, 0.12))
 """Where the cube may start: metres in front of the robot's base and to its left."""
 CLEARANCE = 0.05
 """Between the cube and the hand before the push, metres."""
-PUSH_SPEED = 0.08
+PUSH_SPEED = 0.06
 """Of the hand, m/s: slow enough that the cube stops with it."""
 
 
@@ -93,7 +93,7 @@ class PushToMark(Task):
         )
         expert.phase = "retreat"
         away = hand_down(expert.tcp().position - CLEARANCE * ahead, hand_yaw(hand))
-        yield from expert.move(away, speed=0.2)
+        yield from expert.move(away, speed=0.15)
         yield from expert.move(raised(away, 0.1), speed=0.3)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
