@@ -74,13 +74,14 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
     if name == "a mapping that is not there":
         mapping = tmp_path / "none.toml"
     words: list[str | Path] = [bag, "--mapping", mapping, "--out", run]
-    words = {
+    others: dict[str, list[str | Path]] = {
         "no bag": words[1:],
         "no mapping": words[:1],
         "a word for a format that is misspelt": ["lerobt", bag, "--out", run],
         "a dataset without a mapping": words[:1],
         "codec": [*words, "--gop", "0"],
-    }.get(name, words)
+    }
+    words = others.get(name, words)
     before = sorted(path for path in tmp_path.rglob("*"))
     assert exit_code("import", *words) == code
     out, err = capsys.readouterr()
