@@ -317,6 +317,15 @@ def test_a_fixed_camera_that_turned_by_five_degrees_before_one_episode(tmp_path:
     assert level_of(tmp_path / "dataset", "views_alike", "dataset") == "warn"
 
 
+def test_noise_moves_the_course_of_increments_by_more_than_a_frame_or_two(tmp_path: Path) -> None:
+    """At 48 frames a second by four; what is two frames early is by six."""
+    run = simulate_run(tmp_path / "run", 8, task="tutorial", variation="full", seed=84301, fps=48, cameras=())
+    export(run, tmp_path / "dataset", action="ee_delta", features=("observation.ee_pose",))
+    assert level_of(tmp_path / "dataset", "dataset_action_lag", "dataset") == "pass"
+    numbers("action", lambda r: late(r, -2), only=None)(tmp_path / "dataset")
+    assert level_of(tmp_path / "dataset", "dataset_action_lag", "dataset") == "fail"
+
+
 def falls_away(images: Images) -> Images:
     """Something that covers half of the image, and is gone within three frames."""
     width, images = images.shape[2], images.copy()
