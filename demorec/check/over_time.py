@@ -29,9 +29,10 @@ so many times the steps beside it, or at all. Wrist cameras that noise shakes at
 1.3 times what is beside it; images of another moment 2 and more."""
 _MOVING = 0.3
 """Of the root mean square step of the state: more is a moving frame."""
-_NEARLY, _NEARLY_COUNTS = 0.05, 0.25
-"""Share of the usual change at a speed below which an image is nearly the same, and what counts of such a time: of
-clean films the longest is 1.1 s, of 1.5 s of one image, encoded again, 1.5 s."""
+_NEARLY, _NEARLY_COUNTS, _CATCHES_UP = 0.05, 0.25, 2.0
+"""Share of the usual change at a speed below which an image is nearly the same; what counts of such a time: of clean
+films the longest is 1.1 s, of 1.5 s of one image, encoded again, 1.5 s; and times the later changes by which the first
+new image of a camera that hung differs: a wrist above a plain floor sees nothing for 1.8 s, then a little more each."""
 _REACH_S = 0.7
 """How far apart in time motions of images and state are compared, seconds."""
 _SHOWN = 0.35
@@ -158,7 +159,8 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
 
     A camera that shows the same in more than a fifth of the other moving frames does not see the robot, and tells
     nothing. An image that was encoded again changes a little: one that changes by a twentieth of what the robot's
-    speed makes of it counts a quarter, since robots also move where a camera hardly sees it.
+    speed makes of it counts a quarter, since robots also move where a camera hardly sees it. A camera that did not hang
+    shows little by little what it sees next.
     """
     for camera, films in subject.films.items():
         known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
@@ -176,9 +178,11 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
             length, start = longest_run(same | ~moves)
             run = np.zeros(len(same), dtype=np.bool_)
             run[start : start + length] = True
-            frames = np.diff(film.frames)[same & moves & run].sum()
+            frames = np.diff(film.frames)[same & moves & run].sum() * _catches_up(film, moves, start, start + length)
             length, begin = longest_run((film.step <= _NEARLY * usual * step) | ~moves)
-            nearly = _NEARLY_COUNTS * moves[begin : begin + length].sum()
+            nearly = (
+                _NEARLY_COUNTS * moves[begin : begin + length].sum() * _catches_up(film, moves, begin, begin + length)
+            )
             seconds, first = max((frames / film.fps, start), (nearly / film.fps, begin))
             found.append(Measurement(value=seconds, frame=int(film.frames[first]) + 1, detail=film.where))
             hidden, others = hidden + int((same & moves & ~run).sum()), others + int((moves & ~run).sum())
@@ -186,6 +190,13 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
             yield NotMeasured(why=f"{camera} hardly sees the robot move")
         else:
             yield from found
+
+
+def _catches_up(film: Film, moves: Flags, begin: int, end: int) -> bool:
+    """Whether the image after some that are the same shows at once what happened meanwhile; or the film is over."""
+    last = max(np.flatnonzero(moves[begin:end]), default=0)
+    later = film.step[end + 2 : end + 5]  # the encoder may tell a little of the new image before
+    return not len(later) or float(film.step[begin + last + 1 : end + 2].max()) > _CATCHES_UP * float(np.median(later))
 
 
 @film_check(

@@ -334,6 +334,19 @@ def falls_away(images: Images) -> Images:
     return images
 
 
+def plain_for_a_while(images: Images) -> Images:
+    """A view that fades into nothing, and little by little shows something again."""
+    shown = np.interp(np.arange(len(images)), [20, 30, 55, 75], [1, 0, 0, 1])[:, None, None, None]
+    noise = np.random.default_rng(1).normal(0, 1.0, images.shape)
+    return shown * images + (1 - shown) * (120 + noise)
+
+
+def test_a_camera_that_sees_nothing_for_a_while_does_not_hang(filmed: Path, tmp_path: Path) -> None:
+    dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
+    film(WRIST, plain_for_a_while)(dataset)
+    assert level_of(dataset, "frozen_images", "dataset") == "pass"
+
+
 def test_what_falls_away_before_a_camera_is_no_cut(filmed: Path, tmp_path: Path) -> None:
     dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))
     film(FRONT, falls_away)(dataset)
