@@ -22,6 +22,8 @@ from demorec.core.geometry import Array
 from demorec.core.tables import CHECKS
 from demorec.render.recorded import RecordedWorld
 
+pytestmark = pytest.mark.slow
+
 Fault = Callable[[Rows], Rows]
 RANDOM = np.random.default_rng(1)
 ONE = 100

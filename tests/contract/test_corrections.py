@@ -33,6 +33,8 @@ from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
 
+pytestmark = pytest.mark.slow
+
 FPS = 30
 UNSEEN = Action(joint_target=np.zeros(7), gripper_target=0.0, base_from_tcp_target=Pose())
 """A command that no rule but straying looks at."""

@@ -16,6 +16,8 @@ from demorec.mcap import Recording
 from demorec.render.painter import WarmRenderer
 from demorec.replay.rerender import RerenderOptions, rerender
 
+pytestmark = pytest.mark.slow
+
 SIDE = """
 import math
 from demorec.render.cameras import CameraPreset
@@ -54,7 +56,6 @@ def test_own_cameras_and_looks_give_the_recorded_images_again(filmed: Path, tmp_
         assert b.info.origin == f"render of {a.digest()[:16]}"
 
 
-@pytest.mark.slow
 def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
     """What was drawn anew does not follow from a seed; the error that it tells leads to where the camera was."""
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
@@ -70,7 +71,6 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
     assert max(off) <= 2  # poses may differ in their last bit
 
 
-@pytest.mark.slow
 def test_other_cameras_sizes_and_looks_pass_the_checks(
     filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,7 +137,6 @@ def test_a_camera_of_ones_own_stands_where_it_is_said(
     assert seen[2] == pytest.approx(np.hypot(0.9, 0.4))
 
 
-@pytest.mark.slow
 def test_several_processes_give_the_same(filmed: Path, tmp_path: Path) -> None:
     for index in range(2):
         simulate(

@@ -25,6 +25,8 @@ from demorec.datasets.lerobot.files import check_video
 from demorec.mcap import Recording
 from demorec.robots.urdf import check_primitives
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def commands() -> Iterator[LimitedCommands]:
@@ -80,7 +82,6 @@ def test_a_small_recording_never_becomes_large(
     assert "DEMOREC_UNPACKED_MB" in said or "another size" in said
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("bomb", BOMBS)
 def test_recovering_a_bomb_is_bounded(
     bomb: Callable[[Path, Path], None], good: Path, commands: LimitedCommands, tmp_path: Path
@@ -140,7 +141,6 @@ def test_images_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
             limits.check_chunk(place.uncompressed_size, place.length)
 
 
-@pytest.mark.slow
 def test_metadata_of_two_hundred_megabytes_are_not_read(good: Path, commands: LimitedCommands, tmp_path: Path) -> None:
     path = tmp_path / "large.mcap"
     values = {"info": "x" * (200 << 20)}

@@ -14,7 +14,10 @@ from support.export import count_calls, export, export_in_child, files_of, make_
 
 KILLS = 10  # of each of three kinds
 
-pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +103,6 @@ def test_a_full_disk_where_processes_leave_images(context: Any, run: Path, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_hdf5_killed_at_any_moment(context: Any, run: Path, tmp_path: Path) -> None:
     place = tmp_path / "place"
     out = place / "d.hdf5"
