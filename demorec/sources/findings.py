@@ -230,13 +230,14 @@ def _number_findings(elements: _Elements, names: tuple[str, ...]) -> Iterator[tu
 def _still_findings(
     elements: _Elements, names: tuple[str, ...], line: Timeline, *, may_rest: bool
 ) -> Iterator[tuple[str, str]]:
-    """Elements with noise that suddenly have none; `may_rest` in the end."""
+    """Elements with noise that suddenly have none; those that `may_rest` do so in the end, and at a joint's limit."""
     stuck = []
     for name, element in zip(names, elements, strict=True):
         begin, end = _longest_run(element)
         seconds = (line.times_ns[end] - line.times_ns[begin]) / NS
         others = np.concatenate((element[:begin], element[end + 1 :]))
-        if seconds < STILL_S or end - begin < 10 or len(others) < 10 or (may_rest and end == len(element) - 1):
+        rests = may_rest and (end == len(element) - 1 or element[begin] in (element.min(), element.max()))
+        if seconds < STILL_S or end - begin < 10 or len(others) < 10 or rests:
             continue
         if np.mean(np.diff(others) != 0) > 0.8:
             stuck.append((name, seconds, (line.times_ns[begin] - line.times_ns[0]) / NS))

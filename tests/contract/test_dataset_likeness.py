@@ -338,7 +338,7 @@ def plain_for_a_while(images: Images) -> Images:
     """A view that fades into nothing, and little by little shows something again."""
     shown = np.interp(np.arange(len(images)), [20, 30, 55, 75], [1, 0, 0, 1])[:, None, None, None]
     noise = np.random.default_rng(1).normal(0, 1.0, images.shape)
-    return shown * images + (1 - shown) * (120 + noise)
+    return np.asarray(shown * images + (1 - shown) * (120 + noise))
 
 
 def test_a_camera_that_sees_nothing_for_a_while_does_not_hang(filmed: Path, tmp_path: Path) -> None:
