@@ -241,7 +241,8 @@ def _still_findings(
             continue
         if np.mean(np.diff(others) != 0) > 0.8:
             stuck.append((name, seconds, (line.times_ns[begin] - line.times_ns[0]) / NS))
-    if stuck:
+    waits = may_rest and len(stuck) >= max(len(names) - 1, 2)  # an arm, while its gripper moves
+    if stuck and not waits:
         name, seconds, at = stuck[0]
         more = f" and {len(stuck) - 1} more elements" if len(stuck) > 1 else ""
         yield "stuck", f"{name!r}{more} gives the very same number for {seconds:.2f} s from {at:.2f} s on"
