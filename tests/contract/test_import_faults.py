@@ -108,6 +108,26 @@ def test_a_gripper_that_opens_after_a_long_rest_does_not_jump(way: list[float], 
     assert ("jump" in _findings(bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap"), tmp_path)) == jumps
 
 
+@pytest.mark.parametrize(
+    ("elements", "share", "is_stuck"), [((1,), 0.5, True), ((1,), 1.0, False), ((0, 1, 2, 3, 4), 0.5, False)]
+)
+def test_commands_wait_at_a_limit_or_for_the_gripper(
+    elements: tuple[int, ...], share: float, is_stuck: bool, notes: bags.Notes, tmp_path: Path
+) -> None:
+    """One that stands anywhere else while the others move is stuck."""
+    positions = np.array([note.body["position"] for note in notes if note.topic == ACTION])
+    stand, count = positions.min(axis=0) + share * np.ptp(positions, axis=0), len(positions)
+
+    def waiting(k: int, note: bags.Note) -> bags.Note:
+        position = (note.body["position"] + 1e-4 * np.sin(7.0 * k)).clip(positions.min(axis=0), positions.max(axis=0))
+        if 40 <= k < 40 + count // 2:
+            position[list(elements)] = stand[list(elements)]
+        return bags.with_body(note, position=position)
+
+    bag = bags.write_mcap(bags.in_order(bags.changed(notes, ACTION, waiting)), tmp_path / "bag.mcap")
+    assert ("stuck" in _findings(bag, tmp_path)) == is_stuck
+
+
 def test_a_drawn_camera_at_rest_is_not_frozen(notes: bags.Notes, tmp_path: Path) -> None:
     """Its images have no noise: they are the same wherever all rests, for two images as for six."""
     images = bags.of_topic(notes, FRONT)
