@@ -218,10 +218,8 @@ def _course_lag(wishes: list[Array], changes: list[Array], *, allowed: int, wind
     best = int(np.argmax(products))
     likeness = products[best] / max(math.sqrt(sizes[0] * sizes[1]), 1e-12)
     lag = best - reach
-    if products[reach - allowed : reach + allowed + 1].max() > _AS_ALIKE * products[best]:
-        lag = int(np.clip(lag, -allowed, allowed))
     if likeness < 0.5:
         return Measurement(value=math.inf, detail=f"actions and changes of state are unrelated ({likeness:.2f})")
-    return Measurement(
-        value=max(abs(lag) - allowed, 0), detail=f"all episodes: {lag:+d} frames, likeness {likeness:.2f}"
-    )
+    fits = products[reach - allowed : reach + allowed + 1].max() >= _AS_ALIKE * products[best]
+    value = 0 if fits else abs(lag) - allowed
+    return Measurement(value=value, detail=f"all episodes: {lag:+d} frames, likeness {likeness:.2f}")

@@ -84,7 +84,7 @@ class Import:
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
         if form is not None:
             return self._import_frames(word, form, self.bags[1:], motors)
-        if (near := nearest_match(word, FORMATS)) and not self.bags[0].exists():
+        if not self.bags[0].exists() and (near := nearest_match(word, FORMATS)):
             raise ConfigError(
                 f"There is no bag {word!r}.{near} Name bags, or one of {', '.join(FORMATS)} and its files."
             )
