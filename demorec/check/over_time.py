@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from itertools import combinations
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
 from demorec.check.evidence import Flags
 from demorec.check.films import Film, Filmed, difference, flat_images, is_blank, turned
-from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
 
 _ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
@@ -27,12 +26,8 @@ _EXPLAINED, _NEVER_EXPLAINED, _STANDS_OUT = 2.0, 5.0, 2.0
 """Times what the camera shows of such a motion at most (in nine of ten moving frames) that no motion explains if it is
 so many times the steps beside it, or at all. Wrist cameras that noise shakes at 10 frames a second show up to 3.7, and
 1.3 times what is beside it; images of another moment 2 and more."""
-_MOVING = 0.3
+MOVING = 0.3
 """Of the root mean square step of the state: more is a moving frame."""
-_NEARLY, _NEARLY_COUNTS, _CATCHES_UP = 0.05, 0.25, 2.0
-"""Share of the usual change at a speed below which an image is nearly the same; what counts of such a time: of clean
-films the longest is 1.1 s, of 1.5 s of one image, encoded again, 1.5 s; and times the later changes by which the first
-new image of a camera that hung differs: a wrist above a plain floor sees nothing for 1.8 s, then a little more each."""
 _REACH_S = 0.7
 """How far apart in time motions of images and state are compared, seconds."""
 _SHOWN = 0.35
@@ -46,22 +41,13 @@ chance moves both alike."""
 _SMOOTH = 3
 """Frames over which courses are averaged."""
 _FEWEST_EPISODES = 3
-_FEWEST_IMAGES = 20
-_FEWEST_OF_SIDE = 10
-"""Changing images among every second one of an episode."""
+FEWEST_IMAGES = 20
 _LEAST_UNREST = 0.005
 """Share of change below which a camera is as still as any."""
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
-_STALE, _CHANGES, _CLEARLY = 0.2, 1.5, 3.5
-"""An image repeats the one before that changes by less than this share of what the images on both sides change, where
-these change by so many levels of 255. A repeated image that is encoded again changes by 0.6. Predicted images of x264
-at crf 23, or of AV1, every second one, may lack a motion of up to three levels where images are small."""
-_COPIES, _SLOWEST_FPS = 3, 10.0
-"""Images on either side of one that repeats the one before, at most, of which some change: a camera may have a quarter
-of the frames' rate, but hardly less than ten images a second."""
-_FEWEST_CHANGING, _FEWEST_REPEATS = 25, 5
-"""Images among changing ones, of all episodes together, and repeats among them, from which on their share tells."""
+CHANGES = 1.5
+"""Levels of 255 by which an image differs clearly from the one before."""
 
 film_check = partial(image_check, on=("external", "dataset"), needs=IMAGES)
 
@@ -98,7 +84,7 @@ def _alien(film: Film) -> Flags:
         return alien
     state = film.state / (film.state.std(axis=0) + 1e-3)
     speed = np.linalg.norm(np.diff(state, axis=0), axis=1)
-    if not (moves := _moves(speed)).any():
+    if not (moves := moving(speed)).any():
         return alien
     shown = float(np.quantile(film.step[moves] / speed[moves], 0.9))
     there_and_back = np.linalg.norm(state[1:-1] - (state[2:] + state[:-2]) / 2, axis=1)
@@ -108,8 +94,9 @@ def _alien(film: Film) -> Flags:
     return alien
 
 
-def _moves(speed: Array) -> Flags:
-    return np.asarray(speed > _MOVING * float(np.sqrt((speed**2).sum() / max(len(speed), 1))))
+def moving(speed: Array) -> Flags:
+    """(N - 1,) steps in which the robot moves, by how far its state goes in each."""
+    return np.asarray(speed > MOVING * float(np.sqrt((speed**2).sum() / max(len(speed), 1))))
 
 
 @film_check(
@@ -121,12 +108,12 @@ def image_cuts(subject: Filmed) -> Iterator[Found]:
     """What a camera sees goes on from frame to frame: catches one that is hit, light that is switched, films that were
     put together. What falls away before it takes several frames."""
     for film in _all(subject):
-        if len(film.cells) < _FEWEST_IMAGES or is_blank(film):
+        if len(film.cells) < FEWEST_IMAGES or is_blank(film):
             continue
         row = int(np.argmax(film.step))
         others = np.delete(film.step, slice(max(row - 1, 0), row + 2))
         beside = float(film.step[max(row - 1, 0) : row + 2].min())  # of a cut, one at least is as usual
-        usual = max(float(others.max()), beside, _CHANGES)
+        usual = max(float(others.max()), beside, CHANGES)
         times = float(film.step[row] / usual) if film.step[row] > _ALIEN_LEVELS else 1.0
         yield Measurement(value=times, frame=int(film.frames[row + 1]), detail=film.where)
 
@@ -146,129 +133,6 @@ def images_stay_upright(subject: Filmed) -> Iterator[Found]:
         as_is, *otherwise = (float(np.abs(after - view).mean()) for view in (before, *turned(before)))
         times = as_is / max(min(otherwise), 1.0) if as_is > _ALIEN_LEVELS else 1.0
         yield Measurement(value=times, frame=int(film.frames[row]), detail=film.where)
-
-
-@film_check(
-    measures="longest time for which a camera gives one and the same image while the robot moves",
-    unit="s",
-    warn=0.33,
-    fail=1.0,
-)
-def frozen_images(subject: Filmed) -> Iterator[Found]:
-    """A camera that sees the robot move shows it: catches a stream that hangs.
-
-    A camera that shows the same in more than a fifth of the other moving frames does not see the robot, and tells
-    nothing. An image that was encoded again changes a little: one that changes by a twentieth of what the robot's
-    speed makes of it counts a quarter, since robots also move where a camera hardly sees it. A camera that did not hang
-    shows little by little what it sees next.
-    """
-    for camera, films in subject.films.items():
-        known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
-        known = [pair for pair in known if not is_blank(pair[0])]  # left to `images_show_something`
-        steps = [np.linalg.norm(np.diff(state, axis=0), axis=1) for _, state in known]
-        if not known:
-            continue
-        limit = _MOVING * float(np.sqrt((np.concatenate(steps) ** 2).mean()))
-        found, hidden, others = [], 0, 0
-        shown = [film.step[step > limit] / step[step > limit] for (film, _), step in zip(known, steps, strict=True)]
-        usual = float(np.median(np.concatenate(shown))) if any(map(len, shown)) else 0.0
-        for (film, _), step in zip(known, steps, strict=True):
-            same, moves = (film.cells[1:] == film.cells[:-1]).all(axis=(1, 2, 3)), step > limit
-            # Where nothing moves, the same image again says nothing, and ends no run.
-            length, start = longest_run(same | ~moves)
-            run = np.zeros(len(same), dtype=np.bool_)
-            run[start : start + length] = True
-            frames = np.diff(film.frames)[same & moves & run].sum() * _catches_up(film, moves, start, start + length)
-            length, begin = longest_run((film.step <= _NEARLY * usual * step) | ~moves)
-            nearly = (
-                _NEARLY_COUNTS * moves[begin : begin + length].sum() * _catches_up(film, moves, begin, begin + length)
-            )
-            seconds, first = max((frames / film.fps, start), (nearly / film.fps, begin))
-            found.append(Measurement(value=seconds, frame=int(film.frames[first]) + 1, detail=film.where))
-            hidden, others = hidden + int((same & moves & ~run).sum()), others + int((moves & ~run).sum())
-        if hidden > 0.2 * others:
-            yield NotMeasured(why=f"{camera} hardly sees the robot move")
-        else:
-            yield from found
-
-
-def _catches_up(film: Film, moves: Flags, begin: int, end: int) -> bool:
-    """Whether the image after some that are the same shows at once what happened meanwhile; or the film is over."""
-    last = max(np.flatnonzero(moves[begin:end]), default=0)
-    later = film.step[end + 2 : end + 5]  # the encoder may tell a little of the new image before
-    return not len(later) or float(film.step[begin + last + 1 : end + 2].max()) > _CATCHES_UP * float(np.median(later))
-
-
-@film_check(
-    measures="share of a camera's images that repeat the one before while those around them change",
-    warn=0.05,
-    fail=float("inf"),
-)
-def stale_images(subject: Filmed) -> Iterator[Found]:
-    """A camera gives a new image for each frame: catches one that is slower than the frames, and images that were lost
-    and replaced.
-    """
-    for camera, films in subject.films.items():
-        long = [film for film in films if len(film.cells) >= _FEWEST_IMAGES]
-        places, changing = _repeats(long, _CHANGES)
-        odd = sum(place % 2 for place in places)
-        on_one_side = min(odd, len(places) - odd) <= len(places) / 8
-        if on_one_side and _FEWEST_REPEATS <= len(places) < changing / 3:
-            clear, clearly = _repeats(long, _CLEARLY)
-            if len(clear) < _FEWEST_REPEATS or len(clear) * changing < len(places) * clearly / 2:  # the encoder's
-                places, changing = clear, clearly
-        if changing < _FEWEST_CHANGING:
-            yield NotMeasured(why=f"{camera} hardly changes")
-            continue
-        share = len(places) / changing if len(places) >= _FEWEST_REPEATS else 0.0
-        yield Measurement(value=share, detail=f"{camera}, {len(places)} of {changing} images")
-
-
-def _repeats(films: Sequence[Film], least: float) -> tuple[list[int], int]:
-    """Numbers of the images that repeat the one before, and how many change where those around them do."""
-    places, changing = list[int](), 0
-    for film in films:
-        reach = min(max(round(film.fps / _SLOWEST_FPS), 1), _COPIES)
-        beside = np.lib.stride_tricks.sliding_window_view(film.step, 2 * reach + 1)
-        around = np.minimum(beside[:, :reach].max(axis=1), beside[:, -reach:].max(axis=1))
-        moves = np.lib.stride_tricks.sliding_window_view(_moving(film), 2 * reach + 1).all(axis=1)
-        changes = (around > least) & moves
-        places += np.flatnonzero(changes & (film.step[reach:-reach] < _STALE * around)).tolist()
-        changing += int(changes.sum())
-    return places, changing
-
-
-def _moving(film: Film) -> Flags:
-    """(N - 1,) from which image to the next the robot moves; all, where its state is not known."""
-    if film.state is None:
-        return np.ones(len(film.step), dtype=np.bool_)
-    return _moves(np.linalg.norm(np.diff(film.state / (film.state.std(axis=0) + 1e-3), axis=0), axis=1))
-
-
-@film_check(
-    measures="by what share every second image is nearer to the mean of its neighbours than the others are",
-    warn=0.46,
-    fail=float("inf"),
-)
-def interpolated_images(subject: Filmed) -> Iterator[Found]:
-    """No image is a mixture of the two around it: catches a video that was brought to twice its rate.
-
-    In the median of the episodes. Predicted images of a video whose every second one is a keyframe are nearer, too, by
-    a quarter.
-    """
-    for camera, films in subject.films.items():
-        nearer = []
-        for film in (film for film in films if len(film.cells) >= _FEWEST_IMAGES):
-            off = difference(film.cells[1:-1], (film.cells[2:].astype(np.float32) + film.cells[:-2]) / 2)
-            changes = (film.step[1:] > _CHANGES / 2) & _moving(film)[1:]
-            sides = [off[first::2][changes[first::2]] for first in (0, 1)]
-            if min(map(len, sides)) >= _FEWEST_OF_SIDE:
-                means = [float(side.mean()) for side in sides]
-                nearer.append(1.0 - min(means) / max(*means, 1e-9))
-        if nearer:
-            yield Measurement(value=float(np.median(nearer)), detail=camera)
-        else:
-            yield NotMeasured(why=f"{camera} hardly changes")
 
 
 @film_check(
@@ -340,7 +204,7 @@ def _near(table: Array) -> float:
 )
 def steady_exposure(subject: Filmed) -> Iterator[Found]:
     """What stands still before a fixed camera keeps its colours: catches drifting exposure, white balance."""
-    for film in (film for film in _all(subject) if len(film.cells) >= _FEWEST_IMAGES):
+    for film in (film for film in _all(subject) if len(film.cells) >= FEWEST_IMAGES):
         gains = film.gains
         if isinstance(gains, NotMeasured):
             yield gains
@@ -362,7 +226,7 @@ def _coarse(cells: NDArray[np.uint8]) -> NDArray[np.float32]:
 )
 def steady_sharpness(subject: Filmed) -> Iterator[Found]:
     """What stands still before a fixed camera stays as sharp: catches lost focus, drops on the lens, noise."""
-    for film in (film for film in _all(subject) if len(film.cells) >= _FEWEST_IMAGES):
+    for film in (film for film in _all(subject) if len(film.cells) >= FEWEST_IMAGES):
         if isinstance(film.gains, NotMeasured):
             yield film.gains
             continue
@@ -393,7 +257,7 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
         yield Lacking(need="two cameras")
     for one, other in pairs:
         films = list(zip(subject.films[one], subject.films[other], strict=False))
-        films = [(a, b) for a, b in films if len(a.cells) >= _FEWEST_IMAGES <= len(b.cells)]
+        films = [(a, b) for a, b in films if len(a.cells) >= FEWEST_IMAGES <= len(b.cells)]
         if not films or films[0][0].cells.shape[1:] != films[0][1].cells.shape[1:]:
             continue
         views = [np.median([film.first_view for film in side], axis=0) for side in zip(*films, strict=True)]

@@ -130,8 +130,9 @@ CHECKS: Registry[Check] = Registry(
         ("dataset_files", "dataset_readable", "dataset_counts", "dataset_videos", "dataset_strays"),
         ("dataset_schema", "dataset_schema", "dataset_description"),
         ("dataset_statistics", "dataset_statistics", "dataset_episode_statistics"),
-        ("over_time", "stray_images", "frozen_images", "images_follow_state", "steady_exposure", "exchanged_cameras"),
-        ("over_time", "images_stay_upright", "image_cuts", "steady_sharpness", "stale_images", "interpolated_images"),
+        ("over_time", "stray_images", "images_follow_state", "steady_exposure", "exchanged_cameras"),
+        ("over_time", "images_stay_upright", "image_cuts", "steady_sharpness"),
+        ("repeats", "frozen_images", "stale_images", "interpolated_images"),
         ("dataset_images", "dataset_image_statistics", "dataset_images_as_drawn", "dataset_image_lag"),
         ("targets", "state_follows_action", "actions_in_order", "state_reaches_action"),
         (
