@@ -62,17 +62,21 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         watched = sys.stderr.isatty() if is_terminal is None else is_terminal
         self._bar: tqdm[Any] | None = None
         self._closed = threading.Event()
+        self._writer: threading.Thread | None = None
         if watched:
             self._bar = tqdm(desc=title, total=total, initial=done, unit=unit, dynamic_ncols=True)
         else:
-            threading.Thread(target=self._write_lines, daemon=True).start()
+            self._writer = threading.Thread(target=self._write_lines, daemon=True)
+            self._writer.start()
 
     def __exit__(self, *exc: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """Take the bar off the terminal's last line; harmless when called twice."""
+        """Take the bar off the terminal's last line, let no line follow; harmless when called twice."""
         self._closed.set()
+        if self._writer is not None:
+            self._writer.join()
         if self._bar is not None:
             self._bar.close()
 
