@@ -12,9 +12,11 @@ import numpy as np
 from demorec.check.base import Found, Measurement, physics_check
 from demorec.check.episode import CheckedEpisode
 from demorec.core.geometry import Array
-from demorec.episode.scene import Shape
+from demorec.episode.scene import Body, Shape
 from demorec.robots.urdf import UrdfShape, read_links
 
+SOLID = ("box", "sphere", "cylinder", "capsule")
+"""Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 NEAR = 0.002
 """Gap between a finger and an object, metres, from which on there is something to measure."""
 _PARALLEL = 1e-3
@@ -123,21 +125,24 @@ def finger_depth(episode: CheckedEpisode) -> Iterator[Found]:
     comes within two millimetres of an object.
     """
     for name in episode.info.robot.gripper.finger_links:
-        finger, parts = episode.world_from_link(name), _parts(episode.description, name)
-        for body in episode.info.scene.movable:
-            if body.shape.kind not in ("box", "sphere", "cylinder", "capsule"):
-                continue
-            solid, pose = Convex.of_shape(body.shape), episode.world_from_object(body.name)
-            depth = np.full(len(finger), -np.inf)
-            for part in parts:
-                centre = finger[:, :3, :3] @ part.centre + finger[:, :3, 3]
-                distance = np.linalg.norm(pose[:, :3, 3] - centre, axis=1)
-                near = np.flatnonzero(distance < part.reach + solid.reach + NEAR)
-                if len(near):
-                    depth[near] = np.maximum(depth[near], depth_in(part, finger[near], solid, pose[near]))
+        for body in (body for body in episode.info.scene.movable if body.shape.kind in SOLID):
+            depth = depth_of_link(episode, name, body)
             row = int(np.argmax(depth))
             if depth[row] > -NEAR:
                 yield Measurement(value=max(float(depth[row]), 0.0), frame=row, detail=f"{name} in {body.name}")
+
+
+def depth_of_link(episode: CheckedEpisode, link: str, body: Body) -> Array:
+    """(T,) metres by which a link is inside a body of a `SOLID` shape; negative: apart, -inf where far apart."""
+    frame, pose, solid = episode.world_from_link(link), episode.world_from_object(body.name), Convex.of_shape(body.shape)
+    depth = np.full(len(frame), -np.inf)
+    for part in _parts(episode.description, link):
+        centre = frame[:, :3, :3] @ part.centre + frame[:, :3, 3]
+        distance = np.linalg.norm(pose[:, :3, 3] - centre, axis=1)
+        near = np.flatnonzero(distance < part.reach + solid.reach + NEAR)
+        if len(near):
+            depth[near] = np.maximum(depth[near], depth_in(part, frame[near], solid, pose[near]))
+    return depth
 
 
 @lru_cache(maxsize=8)  # all recordings of a robot have the same

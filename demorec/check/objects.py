@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
+from demorec.check.fingers import NEAR, SOLID, depth_of_link
 from demorec.check.rows import angle_between, displacement, inverse, longest_run, matrices
 from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Shape
@@ -33,8 +34,6 @@ seen), and of what it holds from its TCP."""
 _STILL, _AT_REST = 2e-5, 10.0
 """Metres in a frame that are no motion, and what a depth counts where nothing moves and fingers touch nothing: of 355
 episodes of all tasks 0.15 mm at most."""
-SOLID = ("box", "sphere", "cylinder", "capsule")
-"""Shapes that fill what their size says; a mesh's or URDF's bounding box may be hollow."""
 
 
 def _speeds(episode: CheckedEpisode, name: str) -> Array:
@@ -101,7 +100,8 @@ def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
 )
 def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
     """An object moves or turns only when touched, or for a moment after it (falling, rolling, tipping). What lies still
-    is woken by a force on the fingers, also in the hand's reach, or by another object.
+    is woken by a force on the fingers, also in the hand's reach, by another object, or by a hand that comes within 2 mm
+    of it (boxes, spheres, cylinders, capsules).
 
     0.1 m/s are counted for each rad/s. Of meshes over a thirtieth of a second at least: at rest they twitch.
     """
@@ -113,16 +113,27 @@ def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
     quiet = np.zeros(max(len(force) - 1, 0), dtype=np.bool_)  # in the frames before and after a step and around these
     quiet[1:-1] = np.max([force[:-3], force[1:-2], force[2:-1], force[3:]], axis=0) == 0 if len(force) > 3 else False
     moving = {name: speed > _LIES for name, speed in speeds.items()}
-    lain, shapes = max(3, round(_LAIN_SECONDS * fps)), {b.name: b.shape.kind for b in episode.info.scene.movable}
+    lain, bodies = max(3, round(_LAIN_SECONDS * fps)), {body.name: body for body in episode.info.scene.movable}
     for name, touched in _touched(episode).items():
         lies = np.zeros_like(quiet)
         lies[lain:] = ~held_for(moving[name], lain - 1)[lain - 1 : -1]
         asleep = lies & quiet & ~np.any([rows for other, rows in moving.items() if other != name] or [~quiet], axis=0)
-        span = 1 if shapes[name] in SOLID else max(1, round(fps / 30))
+        is_solid = bodies[name].shape.kind in SOLID
+        if is_solid and (asleep & moving[name]).any():
+            asleep &= ~_at_hand(episode, bodies[name])
+        span = 1 if is_solid else max(1, round(fps / 30))
         free, count = ~touched | asleep, max(len(touched) - span + 1, 0)
         pose = episode.world_from_object(name)
         speed = displacement(pose[span:], pose[:-span]) * fps / span
         yield worst_frame(speed * np.all([free[k : k + count] for k in range(span)], axis=0), name, first=1)
+
+
+def _at_hand(episode: CheckedEpisode, body: Body) -> NDArray[np.bool_]:
+    """(T - 1,) whether hand or fingers are at a body in the frame before a step or after it."""
+    robot = episode.info.robot
+    links = (robot.hand_link, *robot.gripper.finger_links)
+    near = np.max([depth_of_link(episode, link, body) for link in links], axis=0) > -NEAR
+    return np.asarray(near[:-1] | near[1:])
 
 
 @physics_check(

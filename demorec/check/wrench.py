@@ -292,9 +292,9 @@ def _peaks_of_motors(episode: CheckedEpisode, servo: _Servo) -> tuple[Array, Arr
 
 
 def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, servo: _Servo) -> Array:
-    """(T,) of force and torque, in units of the hand's weight; what shifts between the fingers shows, too."""
+    """(T,) of force and torque, in units of what the hand bears; what shifts between the fingers shows, too."""
     force, moment = servo.dynamics.borne(_mount(episode))
-    weight = float(np.median(np.linalg.norm(hand.loads_force, axis=1)))
+    weight = float(np.sqrt((force[servo.dynamics.is_judged] ** 2).sum(axis=1).mean()))  # noise adds to it
     needed = np.hstack([force, (moment - np.cross(hand.origin, force)) / _LEVER]) / weight
     peaks = _peaks(np.hstack([hand.force, hand.torque / _LEVER]) / weight - needed)
     peaks -= _OWN_INERTIA * _peaks(needed).max(axis=1, keepdims=True)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.check import checked, simulate
 from support.commands import exit_code
@@ -45,12 +46,23 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
         {"task": "line_up", "robot": "so101", "variation": "none", "fps": 60, "seed": 4100, "episode_index": 9},
         {"task": "stack", "robot": "iiwa", "variation": "full", "fps": 15, "seed": 3602},
         {"task": "pick_anything", "variation": "full", "fps": 60, "seed": 61000},
+        {"task": "sort_by_color", "robot": "iiwa", "variation": "full", "fps": 60, "seed": 92000, "episode_index": 4},
     ],
     ids=str,
 )
 def test_an_arm_that_noise_shakes(config: dict[str, Any], tmp_path: Path) -> None:
     """Differences between frames say little of forces then, turned hands press askew, things slip, meshes twitch."""
     path = simulate(tmp_path / "e.mcap", **config)
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+
+
+def test_a_palm_that_presses_on_what_stands_beside(tmp_path: Path) -> None:
+    """A large cube moves by a millimetre that no finger touches."""
+    path = simulate(tmp_path / "e.mcap", task="stack", variation="none", fps=20, seed=92000, episode_index=4)
+    with Recording(path) as recording:
+        numbers = recording.columns()
+    lowered = int(np.flatnonzero(numbers.contact_force)[0])
+    assert np.ptp(numbers.object_poses["blue_cube"][:lowered, 1]) > 0.001
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 
