@@ -11,7 +11,7 @@ import numpy as np
 
 from demorec.check.base import IMAGES, Found, Measurement, NotMeasured, check, external_check, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.films import Filmed, is_blank
+from demorec.check.films import Filmed
 from demorec.episode.episode import NO_IMAGE
 
 _NANOSECONDS = 1_000_000_000
@@ -115,7 +115,7 @@ def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
 )
 def images_show_something(subject: Filmed) -> Found:
     """No camera is covered, and none of depth sees nothing."""
-    blank = [camera for camera, films in subject.films.items() if any(is_blank(film) for film in films)]
+    blank = [camera for camera, films in subject.films.items() if any(film.is_blank for film in films)]
     for camera, images in subject.distances():
         shares = [float(np.mean(np.isfinite(values) & (values > 0))) for values in images]
         if shares and float(np.median(shares)) == 0:

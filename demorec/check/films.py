@@ -52,6 +52,16 @@ class Film:
         return difference(self.cells[1:], self.cells[:-1])
 
     @cached_property
+    def flat(self) -> NDArray[np.bool_]:
+        """(N,) images of one colour."""
+        return np.asarray(self.cells.std(axis=(1, 2)).max(axis=1, initial=0.0) < _BLANK_LEVELS)
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether most of the images are of one colour."""
+        return bool(np.mean(self.flat) > 0.5) if len(self.cells) else False
+
+    @cached_property
     def first_view(self) -> Array:
         """(rows, columns, 3) median of the first fifth of the images, 0 to 255."""
         return np.asarray(np.median(self.cells[: max(len(self.cells) // 5, 1)], axis=0))
@@ -100,16 +110,6 @@ _DIFFERENT, _ALIKE = 0.9, 0.98
 """Correlations of two cameras that show different things, and of one whose images were encoded twice."""
 _BLANK_LEVELS = 1.0
 """Of 255, standard deviation over an image's parts below which it is of one colour: black, green or otherwise empty."""
-
-
-def flat_images(film: Film) -> NDArray[np.bool_]:
-    """(N,) images of one colour."""
-    return np.asarray(film.cells.std(axis=(1, 2)).max(axis=1, initial=0.0) < _BLANK_LEVELS)
-
-
-def is_blank(film: Film) -> bool:
-    """Whether most of its images are of one colour."""
-    return bool(np.mean(flat_images(film)) > 0.5) if len(film.cells) else False
 
 
 Films = Mapping[str, Sequence[Film]]

@@ -134,7 +134,8 @@ def finger_depth(episode: CheckedEpisode) -> Iterator[Found]:
 
 def depth_of_link(episode: CheckedEpisode, link: str, body: Body) -> Array:
     """(T,) metres by which a link is inside a body of a `SOLID` shape; negative: apart, -inf where far apart."""
-    frame, pose, solid = episode.world_from_link(link), episode.world_from_object(body.name), Convex.of_shape(body.shape)
+    frame, pose = episode.world_from_link(link), episode.world_from_object(body.name)
+    solid = Convex.of_shape(body.shape)
     depth = np.full(len(frame), -np.inf)
     for part in _parts(episode.description, link):
         centre = frame[:, :3, :3] @ part.centre + frame[:, :3, 3]

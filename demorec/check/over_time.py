@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
 from demorec.check.evidence import Flags
-from demorec.check.films import Film, Filmed, difference, flat_images, is_blank, turned
+from demorec.check.films import Film, Filmed, difference, turned
 from demorec.core.geometry import Array
 
 _ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
@@ -64,7 +64,7 @@ def stray_images(subject: Filmed) -> Iterator[Found]:
     """No image is empty (where most are, `images_show_something` says so), and none is from another moment or place."""
     wrong, count = [], 0
     for film in _all(subject):
-        odd = _alien(film) if is_blank(film) else _alien(film) | flat_images(film)
+        odd = _alien(film) if film.is_blank else _alien(film) | film.flat
         wrong += [(film, row) for row in np.flatnonzero(odd).tolist()]
         count += len(film.cells)
     if count:
@@ -108,7 +108,7 @@ def image_cuts(subject: Filmed) -> Iterator[Found]:
     """What a camera sees goes on from frame to frame: catches one that is hit, light that is switched, films that were
     put together. What falls away before it takes several frames."""
     for film in _all(subject):
-        if len(film.cells) < FEWEST_IMAGES or is_blank(film):
+        if len(film.cells) < FEWEST_IMAGES or film.is_blank:
             continue
         row = int(np.argmax(film.step))
         others = np.delete(film.step, slice(max(row - 1, 0), row + 2))

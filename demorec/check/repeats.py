@@ -8,7 +8,7 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured
 from demorec.check.evidence import Flags
-from demorec.check.films import Film, Filmed, difference, is_blank
+from demorec.check.films import Film, Filmed, difference
 from demorec.check.over_time import CHANGES, FEWEST_IMAGES, MOVING, film_check, moving
 from demorec.check.rows import longest_run
 
@@ -46,7 +46,7 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
     """
     for camera, films in subject.films.items():
         known = [(film, film.state) for film in films if film.state is not None and len(film.cells) > 1]
-        known = [pair for pair in known if not is_blank(pair[0])]  # left to `images_show_something`
+        known = [pair for pair in known if not pair[0].is_blank]  # left to `images_show_something`
         steps = [np.linalg.norm(np.diff(state, axis=0), axis=1) for _, state in known]
         if not known:
             continue
