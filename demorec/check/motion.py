@@ -166,7 +166,7 @@ def joint_limits(subject: Moving) -> Iterator[Found]:
     measures="largest speed of a joint in units of its limit",
     warn=1.2,
     fail=2.5,
-    simulated=(1.15, 1.5),
+    simulated=(1.5, 1.7),  # 1.245 where noise shakes an arm most, of 4,000 of seed 92000
     needs=URDF,
 )
 def joint_speed(subject: Moving) -> Iterator[Found]:

@@ -47,6 +47,7 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
         {"task": "stack", "robot": "iiwa", "variation": "full", "fps": 15, "seed": 3602},
         {"task": "pick_anything", "variation": "full", "fps": 60, "seed": 61000},
         {"task": "sort_by_color", "robot": "iiwa", "variation": "full", "fps": 60, "seed": 92000, "episode_index": 4},
+        {"task": "place_in_tray", "variation": "full", "fps": 60, "seed": 92000, "episode_index": 19},
     ],
     ids=str,
 )

@@ -184,7 +184,7 @@ def test_no_frames_at_all(tmp_path: Path) -> None:
 
 
 def test_numbers_are_read_without_touching_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_episode(tmp_path / "a.mcap", num_frames=90, width=160, height=120, video=VideoConfig(codec="jpeg"))
+    path = write_episode(tmp_path / "a.mcap", num_frames=90, width=240, height=180, video=VideoConfig(codec="jpeg"))
     read: list[int] = []
     original = Container._read_at
 
