@@ -15,6 +15,7 @@ from demorec.mcap import Recording
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_all_tasks_go_into_one_dataset(tmp_path: Path) -> None:
     runs = [
         simulate_run(tmp_path / task, 1, task=task, seed=31, cameras=("front",), width=128, height=128)

@@ -331,6 +331,7 @@ def train(settings: Path, out: Path, *more: str, program: str = "demorec train")
     )
 
 
+@pytest.mark.long
 def test_the_encoder_stays_as_it_was_pretrained(settings: Path, pretrained: Path, tmp_path: Path) -> None:
     """Each frame is encoded once, and the losses are those of a training by LeRobot's own command, which does not."""
     path = f"--policy.path={pretrained}"
