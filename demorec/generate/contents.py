@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, describe_error, resource_error, without_path
+from demorec.core.files import free_name, sha256_of, sync_folder
 from demorec.core.own_versions import differences
 from demorec.core.plain import to_plain
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
@@ -26,10 +27,7 @@ from demorec.runs.run_file import (
     UNFINISHED,
     Attempt,
     RunFile,
-    free_name,
     recording_name,
-    sha256_of,
-    sync_folder,
 )
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)

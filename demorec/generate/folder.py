@@ -13,7 +13,7 @@ from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, GenerationError, resource_error
-from demorec.core.files import LOCK_NAME, make_folder, run_lock
+from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.processes import available_cores
@@ -39,7 +39,6 @@ from demorec.runs.run_file import (
     Generation,
     RunFile,
     RunSession,
-    free_name,
     load_run_file,
     refuse_strangers,
     save_run_file,

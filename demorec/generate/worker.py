@@ -19,19 +19,11 @@ from typing import Any
 
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, SceneError
+from demorec.core.files import sync_folder
 from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter
-from demorec.runs.run_file import (
-    EPISODES,
-    FAILED,
-    STARTING,
-    UNFINISHED,
-    Attempt,
-    inspect_recording,
-    recording_name,
-    sync_folder,
-)
+from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, inspect_recording, recording_name
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)

@@ -14,7 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error
-from demorec.core.files import LOCK_NAME, make_folder, run_lock
+from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.replacing import json_object
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, recover
@@ -27,7 +27,6 @@ from demorec.runs.run_file import (
     DamagedRunFileError,
     RunFile,
     RunSession,
-    free_name,
     is_external_run,
     load_any_run_file,
     recorded_line,

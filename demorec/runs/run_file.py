@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
@@ -25,7 +24,7 @@ from demorec.core.errors import (
     describe_error,
     resource_error,
 )
-from demorec.core.files import MAX_JSON_BYTES, open_regular, read_json_limited, replace_text
+from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sha256_of, sync_folder
 from demorec.core.plain import PartValue, digest, from_plain, to_plain
 from demorec.core.replacing import json_object, shown
 from demorec.episode.info import EpisodeInfo
@@ -293,8 +292,7 @@ def load_any_run_file(folder: Path) -> RunFile:
                 raise ValueError("robot or fps is missing")
             return external
         attempts = [line for line in lines if line.pop("state") != "planned"]
-        for derived in ("config_digest", "complete"):
-            plain.pop(derived)
+        del plain["config_digest"], plain["complete"]
         run = from_plain({"generation": plain, "attempts": attempts, "sessions": sessions}, RunFile)
         _refuse_impossible(run)
         return run.with_attempts(run.attempts)
@@ -311,21 +309,6 @@ def recording_name(episode_index: int, attempt: int, *, success: bool | None) ->
     return f"episode_{episode_index:06d}{middle}.mcap"
 
 
-def free_name(path: Path) -> Path:
-    """The path itself, or with the first number behind it that nothing is called."""
-    free, number = path, 0
-    while os.path.lexists(free):
-        number += 1
-        free = path.with_name(f"{path.name}.{number}")
-    return free
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 (hex) of a file's bytes."""
-    with open_regular(path) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def utc_now() -> str:
     """In ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
@@ -336,15 +319,6 @@ def refuse_strangers(folder: Path, own: Collection[str]) -> None:
     strangers = sorted(p.name for p in folder.iterdir() if p.name not in own and not p.name.startswith(RUN_NAME))
     if strangers:
         raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {folder}")
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames in `folder` last through a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _refuse_impossible(run: RunFile) -> None:
@@ -359,9 +333,8 @@ def _refuse_impossible(run: RunFile) -> None:
         if (line.episode_index, line.attempt) in seen:
             raise ValueError(f"two lines are of {which}")
         seen.add((line.episode_index, line.attempt))
-        place = f"{EPISODES if line.success else FAILED}/" + recording_name(
-            line.episode_index, line.attempt, success=line.success
-        )
+        name = recording_name(line.episode_index, line.attempt, success=line.success)
+        place = f"{EPISODES if line.success else FAILED}/{name}"
         if line.file != place and (line.file or line.success):
             raise ValueError(f"the line of {which} names the file {line.file!r} instead of {place}")
 

@@ -18,12 +18,11 @@ from typing import Any
 import zstandard
 
 from demorec.core.errors import ConfigError, resource_error
-from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited
+from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.scan import ScannedMessage
 from demorec.runs.find import BAG_SUFFIXES, ROSBAG2
-from demorec.runs.run_file import sha256_of
 from demorec.sources.bag_files import MAX_TIME_NS, SQLITE_MAGIC, BagError, read_mcap, read_sqlite
 from demorec.sources.words import in_natural_order
 

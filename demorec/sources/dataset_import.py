@@ -13,6 +13,7 @@ from pathlib import Path
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
+from demorec.core.files import sha256_of
 from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.recording import DatasetRecording
@@ -22,7 +23,6 @@ from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.robots.motors import Motors
 from demorec.runs.external import open_external_run
 from demorec.runs.find import expect
-from demorec.runs.run_file import sha256_of
 from demorec.sources.frames_writer import FramesImport, Image, importing_versions, write_frames
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
+from demorec.core.files import sha256_of
 from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.episode.episode import Outcome, Vector
@@ -27,7 +28,6 @@ from demorec.episode.info import EpisodeInfo, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
-from demorec.runs.run_file import sha256_of
 from demorec.sources.episode_writer import urdf_text
 from demorec.sources.frames_writer import FramesImport, imported_info, joints_of, write_frames
 from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, image_lengths, is_camera

@@ -16,8 +16,9 @@ from pathlib import Path
 
 from demorec.core.config import EpisodePlan, deciding_versions
 from demorec.core.errors import RenderError
+from demorec.core.files import sha256_of
 from demorec.core.plain import digest, to_plain
-from demorec.runs.run_file import Attempt, recording_name, sha256_of
+from demorec.runs.run_file import Attempt, recording_name
 
 
 def succeeds(seed: int, episode: int, attempt: int) -> bool:

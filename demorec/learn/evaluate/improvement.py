@@ -22,7 +22,7 @@ from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, describe_error
-from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
+from demorec.core.files import LOCK_NAME, free_name, read_json_object, replace_text, run_lock
 from demorec.core.own_versions import plain_differences
 from demorec.core.plain import to_plain
 from demorec.core.processes import start_program
@@ -34,7 +34,7 @@ from demorec.learn.evaluate.policy import TRAIN_CONFIG_NAME, find_checkpoint, po
 from demorec.learn.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
 from demorec.learn.evaluate.statistics import Rate
 from demorec.learn.evaluate.turns import read_takeover
-from demorec.runs.run_file import free_name, load_run_file
+from demorec.runs.run_file import load_run_file
 
 SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"
 
