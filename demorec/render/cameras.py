@@ -19,8 +19,9 @@ class CameraPreset:
         summary: One line for `demorec list cameras`.
         mount: "world", or "tcp" for a camera that the hand carries.
         eye, target: Where it is and what it looks at, in the mount's frame, metres; in the world for an arm of
-            task_scale 1, nearer to a small one. A robot may have its own mount for a camera on the hand.
+            task_scale 1, nearer to a small one.
         up: Direction that is up in the image, in the mount's frame.
+        usual_mount: Whether it is where an arm has its usual camera on the hand (`RobotSpec.wrist_camera`), if it has.
         fov_y: Vertical field of view, rad.
         fov_x: Horizontal field that it has at least, rad: of an image that is too narrow for it the vertical field
             becomes wider than `fov_y`.
@@ -33,13 +34,14 @@ class CameraPreset:
     up: Vector3 = (0.0, 0.0, 1.0)
     fov_y: float = math.radians(45.0)
     fov_x: float = 0.0
+    usual_mount: bool = False
 
     def camera(self, name: str, robot: RobotSpec, *, width: int, height: int) -> SceneCamera:
         """The camera for an image size and a robot."""
         eye, target, up = self.eye, self.target, self.up
-        if self.mount == "tcp":
-            eye, target, up = robot.wrist_camera or (eye, target, up)
-        else:
+        if self.usual_mount and robot.wrist_camera:
+            eye, target, up = robot.wrist_camera
+        if self.mount == "world":
             eye, target = _scaled(eye, robot.task_scale), _scaled(target, robot.task_scale)
         return SceneCamera(
             name=name,
@@ -89,4 +91,5 @@ WRIST = CameraPreset(
     target=(0.03, 0.0, 0.02),
     up=(-1.0, 0.0, 0.0),
     fov_y=math.radians(72.0),
+    usual_mount=True,
 )

@@ -13,6 +13,7 @@ from demorec.core.geometry import Pose
 from demorec.core.tables import CAMERAS, ROBOTS
 from demorec.episode.scene import SceneCamera
 from demorec.loop import make_world
+from demorec.render.cameras import CameraPreset
 from demorec.sim.world import World
 from demorec.tasks.sampling import WORKSPACE
 
@@ -92,3 +93,14 @@ def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
     # looks from there.
     ahead, behind = (pixel(camera, pose, tuple(tcp.apply(np.array([x, 0, 0.05]))))[1] for x in (0.02, -0.02))
     assert turned * (ahead - behind) > 0
+
+
+@pytest.mark.parametrize("robot", ROBOTS.names())
+def test_a_camera_of_ones_own_on_the_hand_is_where_it_says(robot: str) -> None:
+    """Whatever mount for a camera the arm has."""
+    preset = CameraPreset(
+        summary="", mount="tcp", eye=(0.05, 0.01, -0.06), target=(0.0, 0.0, 0.02), up=(-1.0, 0.0, 0.0)
+    )
+    camera = preset.camera("mine", ROBOTS.load(robot), width=64, height=64)
+    assert camera.mount_from_camera.position.tolist() == [0.05, 0.01, -0.06]
+    assert inside(camera, pixel(camera, camera.mount_from_camera, (0.0, 0.0, 0.02)), margin=0.49)
