@@ -263,6 +263,8 @@ def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Insp
         try:
             _, made_with, versions = inspect(file)
             config = from_plain(dict(made_with), GenerateConfig)
+        except ConfigError:
+            raise
         except (DemorecError, OSError, ValueError, MemoryError) as error:
             if (lack := resource_error(error, file)) is not None:
                 raise lack from error

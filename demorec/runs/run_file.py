@@ -391,10 +391,15 @@ def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[s
 
     Raises:
         RecordingError: It is no complete recording of an episode that demorec simulated.
+        ConfigError: It was rendered or replayed, or a policy made it.
     """
     attempt, info = recorded_line(path)
     if info.simulation is None:
         raise NotSimulatedError("scene", path)
+    if info.origin:
+        raise ConfigError(
+            f"The folder holds a {info.origin}, which generate-dataset did not make: choose another --out: {path}"
+        )
     if attempt.success is None:
         raise RecordingError(f"The recording was cut off by a crash: {path}")
     return attempt, info.config, info.versions

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from support.check import edit_json, simulate_run
+from support.commands import exit_code
 from support.mcap import rewritten
 
 from demorec.cli import main
@@ -66,3 +67,14 @@ def test_another_digest_in_run_json(run: Path, tmp_path: Path) -> None:
     edit_json(spoilt / "run.json", lambda data: data["episodes"][0].update(digest="0" * 64))
     (fault,) = read_original(spoilt).faults
     assert "is not the one that run.json lists" in fault
+
+
+def test_renderings_of_a_run_are_no_copy_of_it(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "renderings"
+    assert exit_code("render", run, "--out", out, "--cameras", "front", "--width", 16, "--height", 16) == 0
+    there = {path.name: path.read_bytes() for path in out.rglob("*.mcap")}
+    assert len(there) == 5
+    for command in (("reproduce", run), ("generate", "--num-episodes", 5, "--seed", 3, "--fps", 10)):
+        assert exit_code(*command, "--out", out) == 2
+        assert "which generate-dataset did not make: choose another --out" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in out.rglob("*") if path.is_file()} == there
