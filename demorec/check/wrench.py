@@ -280,13 +280,10 @@ def force_spikes(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 def _peaks_of_motors(episode: CheckedEpisode, servo: _Servo) -> tuple[Array, Array]:
-    """(T,) of the motors that bear weight, in units of what each bears; of all, in units of the most that one bears.
-
-    A motor near its limit may have been at it in the step before, and says half as much.
-    """
+    """(T,) of the motors that bear weight, in units of what each bears; of all, in units of the most that one bears."""
     effort = episode.columns.joint_effort[:, : episode.num_arm]
     peaks = _peaks(effort - servo.torque) - _OWN_INERTIA * _peaks(servo.torque)
-    peaks *= np.where(near_limit(effort, episode.info.robot), 0.5, 1.0)[:, None]
+    peaks *= _weight_near_limit(episode)[:, None]
     of_loaded = np.where(servo.is_loaded, peaks / np.maximum(servo.usual, 1e-12), 0.0).max(axis=1)
     return of_loaded, np.maximum(of_loaded, peaks.max(axis=1) / max(float(servo.usual.max()), 1e-12))
 
@@ -299,7 +296,14 @@ def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, servo: _Servo) -> Arr
     peaks = _peaks(np.hstack([hand.force, hand.torque / _LEVER]) / weight - needed)
     peaks -= _OWN_INERTIA * _peaks(needed).max(axis=1, keepdims=True)
     gripped = _peaks(_left_of_grip(episode)[:, None])[:, 0] / weight
-    return np.asarray(np.maximum(peaks.max(axis=1) - gripped, 0.0))
+    return np.asarray(np.maximum(peaks.max(axis=1) * _weight_near_limit(episode) - gripped, 0.0))
+
+
+def _weight_near_limit(episode: CheckedEpisode) -> Array:
+    """(T,) a half where a motor is near its limit, else 1: in the step before it may have been at it, and have moved
+    otherwise than the servo wanted."""
+    effort = episode.columns.joint_effort[:, : episode.num_arm]
+    return np.where(near_limit(effort, episode.info.robot), 0.5, 1.0)
 
 
 def _peaks_of_grip(episode: CheckedEpisode) -> Iterator[Found]:

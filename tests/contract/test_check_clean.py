@@ -48,6 +48,7 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
         {"task": "pick_anything", "variation": "full", "fps": 60, "seed": 61000},
         {"task": "sort_by_color", "robot": "iiwa", "variation": "full", "fps": 60, "seed": 92000, "episode_index": 4},
         {"task": "place_in_tray", "variation": "full", "fps": 60, "seed": 92000, "episode_index": 19},
+        {"task": "tutorial", "variation": "mild", "fps": 48, "seed": 92000, "episode_index": 44},
     ],
     ids=str,
 )
