@@ -9,11 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.geometry import signs_of_course
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import DEPTH_UNITS
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.fields import frame_id_of
-from demorec.sources.findings import FROZEN, GAP, LOST, NOTE, STILL_S, Finding, of_stream, stream_findings
+from demorec.sources.findings import (
+    FROZEN,
+    GAP,
+    LOST,
+    NOTE,
+    STILL_S,
+    Finding,
+    frozen_images,
+    of_stream,
+    stream_findings,
+)
 from demorec.sources.mapping import SourceMapping
 from demorec.sources.rows import RATE, EpisodeRows, Timelines
 from demorec.sources.streams import BagStreams
@@ -24,6 +35,8 @@ _DEGREES = (40.0, 80.0)
 """Times the range of the same joints, of which one is in degrees: 57, and a leader does not reach as far as its arm."""
 _FULL_TURNS = 4 * np.pi
 """Beyond which no joint angle is in rad."""
+_RESTS = 0.02
+"""Of the range of all elements, within which they stay while a robot stands still."""
 _SLOW = 1.15
 """Periods of the rows, from which on a stream is called slower than they are."""
 
@@ -47,6 +60,7 @@ def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
     yield from _offset_findings(lines)
     yield from _mixed_findings(bag, lines)
     yield from _camera_findings(bag.streams)
+    yield from _frozen_findings(lines)
     yield from _slow_findings(lines, bag.mapping.clock.fps)
     yield from _unit_findings(bag.streams, bag.mapping)
     yield from _action_findings(bag.streams, bag.mapping)
@@ -137,6 +151,35 @@ def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
         if shared >= FROZEN and np.mean(np.isin(stream.image_sums, other_stream.image_sums)) > 0.9:
             text = f"{stream.topic} and {other_stream.topic} show the same images"
             yield Finding(kind="same_pictures", stream=f"camera {name}, camera {other_name}", text=text)
+
+
+def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+    """Cameras that hang. A drawn one gives the same images, for a moment, where the robot rests but once."""
+    for line in lines:
+        if (run := frozen_images(line)) is None:
+            continue
+        begin_ns, end_ns = (int(line.times_ns[index]) for index in run)
+        if (end_ns - begin_ns) / NS >= STILL_S or not _rests(lines, begin_ns, end_ns):
+            at = (begin_ns - line.times_ns[0]) / NS
+            text = f"{run[1] - run[0] + 1} images from {at:.2f} s on have the very same bytes"
+            yield of_stream(line.stream, "frozen", text)
+
+
+def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
+    """Whether all that is measured of the robot stands still in a time; False where nothing is."""
+    moves = []
+    for line in lines:
+        if line.stream.values is None or line.stream.label == ACTION:
+            continue
+        values = line.stream.values[line.order].astype(np.float64)
+        for start in line.stream.layout.quaternions if line.stream.layout else ():
+            values[:, start : start + 4] *= signs_of_course(values[:, start : start + 4])[:, None]
+        within = values[(line.times_ns >= begin_ns) & (line.times_ns <= end_ns)]
+        if len(within) < 2:
+            return False
+        way, whole = (float(np.linalg.norm(np.ptp(rows, axis=0))) for rows in (within, values))
+        moves.append(not way <= _RESTS * whole)  # nor where a number is none
+    return bool(moves) and not any(moves)
 
 
 def _claimed_by(name: str, streams: BagStreams) -> str:

@@ -256,6 +256,17 @@ def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
     return int(edges[longest]), int(edges[longest + 1]) - 1
 
 
+def frozen_images(line: Timeline) -> tuple[int, int] | None:
+    """First and last index of images in a row with the very same bytes, of a camera that has noise."""
+    if not line.stream.heads:
+        return None
+    sums = np.asarray(line.stream.image_sums)[line.order].astype(np.int64)
+    begin, end = _longest_run(sums)
+    runs = np.diff(_run_edges(sums))
+    has_noise = not ((runs > 1) & (runs < FROZEN)).any()  # a drawn camera gives the same again wherever all rests
+    return (begin, end) if end - begin + 1 >= FROZEN and has_noise else None
+
+
 def _run_edges(numbers: NDArray[Any]) -> Int:
     """First index of each run of equal numbers, and their count."""
     return np.concatenate(([0], np.flatnonzero(np.diff(numbers) != 0) + 1, [len(numbers)]))
@@ -272,13 +283,6 @@ def _image_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     sizes = {(head.width, head.height) for head in stream.heads.kinds() if head.width}
     if len(sizes) > 1:
         yield "size", f"its images change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
-    sums = np.asarray(stream.image_sums)[line.order].astype(np.int64)
-    begin, end = _longest_run(sums)
-    runs = np.diff(_run_edges(sums))
-    has_noise = not ((runs > 1) & (runs < FROZEN)).any()  # a drawn camera gives the same again wherever all rests
-    if end - begin + 1 >= FROZEN and has_noise:
-        at = (line.times_ns[begin] - line.times_ns[0]) / NS
-        yield "frozen", f"{end - begin + 1} images from {at:.2f} s on have the very same bytes"
     if stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:
         keyframes = np.flatnonzero(stream.heads.are_keyframes)
         first = int(keyframes[0]) if len(keyframes) else len(stream.heads)

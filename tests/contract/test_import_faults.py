@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import bag_mappings, bags
-from support.bag_faults import ACTION, FAULTS, FRONT, hurt
+from support.bag_faults import ACTION, FAULTS, FRONT, STATE, hurt
 
 from demorec.check.run import CheckedRun
 from demorec.core.tables import CHECKS
@@ -140,6 +140,27 @@ def test_a_drawn_camera_at_rest_is_not_frozen(notes: bags.Notes, tmp_path: Path)
     same = {11: 10, **dict.fromkeys(range(21, 26), 20)}
     drawn = bags.changed(notes, FRONT, lambda k, note: replace(note, body=images[same.get(k, k)].body))
     assert _findings(bags.write_mcap(bags.in_order(drawn), tmp_path / "bag.mcap"), tmp_path) == set()
+
+
+@pytest.mark.parametrize(("rests", "count", "is_frozen"), [(True, 6, False), (False, 6, True), (True, 17, True)])
+def test_a_drawn_camera_that_sees_a_robot_rest_once(
+    notes: bags.Notes, rests: bool, count: int, is_frozen: bool, tmp_path: Path
+) -> None:
+    """For a moment; what is longer, or while the robot moves, is a camera that hangs."""
+    images, states = bags.of_topic(notes, FRONT), bags.of_topic(notes, STATE)
+    begin, end = (images[k].header_ns for k in (20, 20 + count))
+    stands = min(states, key=lambda note: abs(note.header_ns - begin)).body["position"]
+
+    def standing(k: int, note: bags.Note) -> bags.Note:
+        if not (rests and begin - bags.NS // 20 <= note.header_ns <= end):
+            return note
+        return bags.with_body(note, position=stands + 1e-5 * (k % 3))
+
+    hung = bags.changed(
+        notes, FRONT, lambda k, note: replace(note, body=images[20].body) if 20 <= k < 20 + count else note
+    )
+    bag = bags.write_mcap(bags.in_order(bags.changed(hung, STATE, standing)), tmp_path / "bag.mcap")
+    assert ("frozen" in _findings(bag, tmp_path)) == is_frozen
 
 
 def test_images_that_come_unevenly_are_not_lost(notes: bags.Notes, tmp_path: Path) -> None:
