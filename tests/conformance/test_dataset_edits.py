@@ -68,7 +68,7 @@ def test_what_is_kept_is_kept_bit_for_bit(dataset: Path, tmp_path: Path) -> None
         statistics_are_exact(out)
 
 
-@pytest.mark.parametrize("images", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("images", [False, pytest.param(True, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_the_results_are_clean(small: Path, tmp_path: Path, images: bool) -> None:
     assert edit("trim", small, "--head", 3, "--out", tmp_path / "trimmed", "--decode") == 0
     assert edit("shuffle", small, "--seed", 3, "--out", tmp_path / "shuffled") == 0

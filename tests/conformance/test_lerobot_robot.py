@@ -165,6 +165,7 @@ slow = pytest.mark.slow
 
 
 @slow
+@pytest.mark.long  # in real time
 def test_lerobot_replay_plays_our_dataset_in_the_simulator(ran: Path, dataset: Path) -> None:
     with Recording(ran / "replayed" / "episode_000000.mcap") as recording:
         assert recording.success

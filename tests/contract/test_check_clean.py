@@ -16,12 +16,15 @@ from demorec.core.config import VideoConfig
 from demorec.core.tables import ROBOTS, TASKS
 from demorec.mcap import Recording
 
+SLOW = [pytest.mark.slow]
+
 
 @pytest.mark.parametrize(
     ("task", "cameras"),
     [
         *((task, ()) for task in QUICK_TASKS),
-        *(pytest.param(task, ("front", "wrist"), marks=pytest.mark.slow) for task in TASKS.names()),
+        *(pytest.param(task, ("front", "wrist"), marks=SLOW) for task in TASKS.names()[::2]),
+        *(pytest.param(task, ("front", "wrist"), marks=[*SLOW, pytest.mark.long]) for task in TASKS.names()[1::2]),
     ],
 )
 def test_every_task(task: str, cameras: tuple[str, ...], tmp_path: Path) -> None:

@@ -37,6 +37,9 @@ def test_repeats_and_replays_to_the_bit(task: str, robot: str, variation: str) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "robot", "variation"), [case for case in CASES if case not in FAST])
+@pytest.mark.parametrize(
+    ("task", "robot", "variation"),
+    [pytest.param(*case, marks=() if case[1] == "panda" else pytest.mark.long) for case in CASES if case not in FAST],
+)
 def test_every_row_repeats_and_replays_to_the_bit(task: str, robot: str, variation: str) -> None:
     check(task, robot, variation)

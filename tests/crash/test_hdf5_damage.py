@@ -51,6 +51,7 @@ def test_a_text_that_claims_gigabytes(file: Path, tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(400)
 def test_a_file_with_which_the_library_never_ends(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = bytearray(file.read_bytes())
