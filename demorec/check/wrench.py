@@ -26,10 +26,10 @@ from demorec.core.geometry import Array
 
 _LEVER = 0.2
 """Metres at which a torque counts as much as a force."""
-_GRIP = {"prismatic": 0.25, "revolute": 0.5}
+_GRIP = {"prismatic": 0.25, "revolute": 1.5}
 """Of the force with which fingers of a kind of joint hold something, which counts beside the weight: the wrench is what
 is left of forces that cancel. After a turn of the hand PyBullet tells up to a fortieth of them as force (0.95 N of
-40 N), of a jaw that turns a 26th (0.21 N of 5.5 N)."""
+40 N), of a jaw that turns a seventh (0.71 N of 5.3 N)."""
 _LEAST_TORQUE = 0.018
 """N m below which nothing is said: motors of wrists that bear less differ from the wrench by up to 0.0089 N m (of 1,680
 clean episodes of seed 51000, all tasks, two arms, 10 to 60 frames a second), half of this."""
