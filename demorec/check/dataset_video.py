@@ -20,6 +20,7 @@ from demorec.datasets.lerobot.reader import EpisodePlace
 
 if TYPE_CHECKING:
     import av
+    from av.video.reformatter import VideoReformatter
 
 _PARTS = 16
 """Parts along the shorter side, about, whose mean colours stand for an image."""
@@ -99,10 +100,17 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
             for number, frame in enumerate(container.decode(video=0)):
                 small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
                 cells = cast("NDArray[np.uint8]", small.to_ndarray())
-                gray = cast("NDArray[np.uint8]", in_gray.reformat(frame, format="gray").to_ndarray())
-                yield cells, detail_of(gray), None if number % _EVERY else _moments(frame)
+                yield cells, detail_of(_brightness(frame, in_gray)), None if number % _EVERY else _moments(frame)
     except (OSError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error
+
+
+def _brightness(frame: av.VideoFrame, reformatter: VideoReformatter) -> NDArray[np.uint8]:
+    """(H, W), as the video has it where that is a plane of its own."""
+    if frame.format.name in ("yuv420p", "yuvj420p"):
+        plane = frame.planes[0]
+        return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[:, : frame.width]
+    return cast("NDArray[np.uint8]", reformatter.reformat(frame, format="gray").to_ndarray())
 
 
 def _moments(frame: av.VideoFrame) -> Array:
