@@ -232,7 +232,7 @@ def images_with_slow_ones() -> Iterator[Any]:
         yield pytest.param(fault, check, id=f"{fault.__name__}-{check}", marks=marks)
 
 
-@pytest.mark.parametrize(("fault", "check"), images_with_slow_ones())
+@pytest.mark.parametrize(("fault", "check"), list(images_with_slow_ones()))
 def test_spoilt_images(fault: Fault, check: str, filmed: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(filmed)
     fault(spoilt)
