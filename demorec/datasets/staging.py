@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import IO
 
 from demorec.core.errors import ConfigError, ExportError
+from demorec.core.files import sync_path
 from demorec.core.replacing import ReplaceableKind, check_replaceable
 
 _RENAME_EXCHANGE = 2
@@ -68,10 +69,10 @@ def staged_folder(target: Path, kind: ReplaceableKind, *, replace: bool, sources
                 new.mkdir()
                 yield new
                 for folder, _, _ in os.walk(new, topdown=False):
-                    sync_file(Path(folder))
+                    sync_path(Path(folder))
                 check()  # much may have been put there meanwhile
                 _take_place(new, target)
-                sync_file(target.parent)
+                sync_path(target.parent)
             finally:
                 if target.exists() or not (workshop / OLD).exists():
                     shutil.rmtree(workshop, ignore_errors=True)
@@ -142,15 +143,6 @@ def _exchange(a: Path, b: Path) -> None:
     if result != 0:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code), str(b))
-
-
-def sync_file(path: Path) -> None:
-    """Make a file or a folder's entries durable."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def copy_bytes(source: IO[bytes], begin: int, count: int, target: IO[bytes]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, describe_error, resource_error, without_path
-from demorec.core.files import free_name, sha256_of, sync_folder
+from demorec.core.files import free_name, sha256_of, sync_path
 from demorec.core.own_versions import differences
 from demorec.core.plain import to_plain
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
@@ -185,7 +185,7 @@ def survey(
                 raise lack from error
             set_aside[file] = without_path(error, path) if isinstance(error, DemorecError) else describe_error(error)
             path.rename(free_name(folder / UNFINISHED / path.name))
-            sync_folder(path.parent)
+            sync_path(path.parent)
         progress(number + 1, len(files))
     return kept, set_aside
 

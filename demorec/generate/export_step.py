@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.errors import DemorecError, resource_error
-from demorec.core.files import free_name, run_lock, sync_folder
+from demorec.core.files import free_name, run_lock, sync_path
 from demorec.core.replacing import obstacle
 from demorec.datasets.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
 from demorec.datasets.lerobot.card import has_own_card
@@ -103,5 +103,5 @@ def _move_aside(path: Path, folder: Path) -> str:
     aside = free_name(folder / UNFINISHED / path.name)
     aside.parent.mkdir(exist_ok=True)
     shutil.move(path, aside)  # a dataset/ that is a link may lead to another disk
-    sync_folder(folder)
+    sync_path(folder)
     return aside.relative_to(folder).as_posix()

@@ -19,7 +19,7 @@ from typing import Any
 
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, SceneError
-from demorec.core.files import sync_folder
+from demorec.core.files import sync_path
 from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter
@@ -54,7 +54,7 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
                 plan.episode_index, plan.attempt, success=attempt.success
             )
             path.replace(folder / file)
-            sync_folder((folder / file).parent)
+            sync_path((folder / file).parent)
     return replace(attempt, file=file, seconds=_with_rest(seconds, began))
 
 

@@ -24,7 +24,7 @@ from demorec.core.errors import (
     describe_error,
     resource_error,
 )
-from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sha256_of, sync_folder
+from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sha256_of, sync_path
 from demorec.core.plain import PartValue, digest, from_plain, to_plain
 from demorec.core.replacing import json_object, shown
 from demorec.episode.info import EpisodeInfo
@@ -252,7 +252,7 @@ def save_run_file(run: RunFile, folder: Path) -> None:
     text += ',\n  "episodes": [\n' + ",\n".join("    " + json.dumps(line, allow_nan=False) for line in lines)
     text += "\n  ]\n}\n"
     replace_text(folder / RUN_NAME, text)
-    sync_folder(folder)
+    sync_path(folder)
 
 
 def is_external_run(folder: Path) -> bool:

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from demorec.core.errors import ExportError, describe_error
+from demorec.core.files import sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import Cut, Plan, Source
@@ -28,7 +29,6 @@ from demorec.datasets.lerobot.sidecar import (
     SidecarWriter,
 )
 from demorec.datasets.lerobot.writer import WrittenEpisode
-from demorec.datasets.staging import sync_file
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "goals", "episode_info")
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
@@ -107,7 +107,7 @@ def write_kept_progress(plan: Plan, folder: Path) -> None:
             if sum(rows.num_rows for rows in waiting) >= _ROWS_AT_ONCE or cut is plan.cuts[-1]:
                 writer.write_table(pa.concat_tables([schema.empty_table(), *waiting]))
                 waiting.clear()
-    sync_file(path)
+    sync_path(path)
 
 
 def _counted(rows: pa.Table, cut: Cut, episode: int, index: int) -> pa.Table:

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import open_regular
+from demorec.core.files import open_regular, sync_path
 from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.staging import sync_file
 
 if TYPE_CHECKING:
     from demorec.annotate.grounding import SeenObject
@@ -220,7 +219,7 @@ class _CameraFile:
         self._annotations.write(f'\n],\n"categories": {json.dumps(categories)}}}\n')
         self.close()
         self._path.with_suffix(".images").unlink()
-        sync_file(self._path)
+        sync_path(self._path)
 
     def close(self) -> None:
         self._annotations.close()

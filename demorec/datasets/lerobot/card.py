@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from demorec.core.config import GenerateConfig, parse_config
 from demorec.core.errors import ConfigError
+from demorec.core.files import sync_path
 from demorec.core.text import markdown, printable
 from demorec.datasets.lerobot.files import read_table
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
@@ -30,7 +31,6 @@ from demorec.datasets.lerobot.robots import ROBOTS_DIR
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import write_text
-from demorec.datasets.staging import sync_file
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -302,7 +302,7 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     sheet.save(path, quality=85)
-    sync_file(path)
+    sync_path(path)
     return True
 
 

@@ -35,8 +35,8 @@ from demorec.annotate.progress import (
     sparse_stages,
 )
 from demorec.core.errors import ExportError, describe_error
+from demorec.core.files import sync_path
 from demorec.datasets.lerobot.files import open_table, read_table
-from demorec.datasets.staging import sync_file
 
 if TYPE_CHECKING:
     from demorec.episode.episode import Columns, SuccessCheck
@@ -139,13 +139,13 @@ def write_progress(root: Path, episodes: Sequence[EpisodeProgress]) -> None:
     """Write the files of the whole dataset, durably."""
     path = root / PROGRESS_PATH
     pq.write_table(progress_table(episodes), path, use_dictionary=["episode_index"])
-    sync_file(path)
+    sync_path(path)
     for head in _HEADS:
         stages = _all_stages(episodes, head)
         share = proportions([episode.runs(head) for episode in episodes], stages)
         file = root / PROPORTIONS_PATH.format(head=head)
         file.write_text(json.dumps(share, indent=2) + "\n")
-        sync_file(file)
+        sync_path(file)
 
 
 def _all_stages(episodes: Sequence[EpisodeProgress], head: Head) -> tuple[str, ...]:

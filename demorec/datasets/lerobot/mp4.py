@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
+from demorec.core.files import sync_path
 from demorec.datasets.lerobot.mp4_index import mp4_head
-from demorec.datasets.staging import copy_bytes, sync_file
+from demorec.datasets.staging import copy_bytes
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
@@ -192,7 +193,7 @@ class Mp4Writer:
                 with path.open("rb", buffering=0) as source:
                     for _, begin, count in spans:
                         copy_bytes(source, begin, count, file)
-        sync_file(self._unfinished)
+        sync_path(self._unfinished)
         self._unfinished.rename(self._path)
         self._waiting.unlink()
         self._own = None

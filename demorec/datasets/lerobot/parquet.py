@@ -11,9 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from demorec.core.files import sync_path
 from demorec.datasets.lerobot.files import plain_column
 from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition
-from demorec.datasets.staging import sync_file
 
 _ROWS_PER_TABLE = 100
 _ROWS_PER_GROUP = 4096
@@ -133,7 +133,7 @@ class RollingParquet:
         finally:
             self._writer = None
             self._sink.close()
-        sync_file(self._path)
+        sync_path(self._path)
 
     def abort(self) -> None:
         """Let go of the file after an error, whatever state it is in."""

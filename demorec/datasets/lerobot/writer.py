@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
+from demorec.core.files import sync_path
 from demorec.datasets.lerobot.language import (
     REPEATING,
     EpisodeLanguage,
@@ -52,7 +53,6 @@ from demorec.datasets.lerobot.stats import (
     merge_statistics,
     vector_statistics,
 )
-from demorec.datasets.staging import sync_file
 
 _EPISODES_PER_TABLE = 100
 _MAX_SECONDS_PER_VIDEO = 900.0
@@ -374,11 +374,11 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(description)}), path)
-    sync_file(path)
+    sync_path(path)
 
 
 def write_text(path: Path, text: str) -> None:
     """A durable text file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
-    sync_file(path)
+    sync_path(path)
