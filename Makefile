@@ -29,7 +29,7 @@ test-slow: $(STAMP)
 	$(BIN)/pytest -m "slow and not long" $(IN_PARALLEL) --ignore tests/crash/test_ray.py
 	$(BIN)/pytest -m slow -n 0 tests/crash/test_ray.py  # alone: a node of Ray gives up on a machine that is too busy
 
-# Before a release: what test-slow does in part.
+# Before a release: what takes longest, or is more of what test-slow does.
 test-long: $(STAMP)
 	$(BIN)/pytest -m long -n $(TEST_WORKERS)
 

@@ -129,11 +129,11 @@ def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 def _at_hand(episode: CheckedEpisode, body: Body) -> NDArray[np.bool_]:
-    """(T - 1,) whether hand or fingers are at a body in the frame before a step or after it."""
+    """(T - 1,) whether hand or fingers are at a body in the frames before a step and after it."""
     robot = episode.info.robot
     links = (robot.hand_link, *robot.gripper.finger_links)
     near = np.max([depth_of_link(episode, link, body) for link in links], axis=0) > -NEAR
-    return np.asarray(near[:-1] | near[1:])
+    return np.asarray(near[:-1] & near[1:])
 
 
 @physics_check(

@@ -37,6 +37,7 @@ from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     Generation,
+    NotGeneratedError,
     RunFile,
     RunSession,
     load_run_file,
@@ -259,17 +260,21 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
 
 def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Inspector) -> RunFile:
     """The run that the first readable recording belongs to; the survey looks at each of them."""
+    strange: NotGeneratedError | None = None
     for file in recordings:
         try:
             _, made_with, versions = inspect(file)
             config = from_plain(dict(made_with), GenerateConfig)
-        except ConfigError:
-            raise
+        except NotGeneratedError as error:
+            strange = error
+            continue
         except (DemorecError, OSError, ValueError, MemoryError) as error:
             if (lack := resource_error(error, file)) is not None:
                 raise lack from error
             continue
         return asked.with_generation(config=config, versions=versions)
+    if strange is not None:
+        raise ConfigError(f"Nothing in the output folder was generated, choose another --out: {strange}")
     return asked
 
 

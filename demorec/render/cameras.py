@@ -21,7 +21,8 @@ class CameraPreset:
         eye, target: Where it is and what it looks at, in the mount's frame, metres; in the world for an arm of
             task_scale 1, nearer to a small one.
         up: Direction that is up in the image, in the mount's frame.
-        usual_mount: Whether it is where an arm has its usual camera on the hand (`RobotSpec.wrist_camera`), if it has.
+        usual_mount: Whether the usual place of an arm's camera on the hand (`RobotSpec.wrist_camera`) takes the place
+            of eye, target and up, where the arm has one.
         fov_y: Vertical field of view, rad.
         fov_x: Horizontal field that it has at least, rad: of an image that is too narrow for it the vertical field
             becomes wider than `fov_y`.

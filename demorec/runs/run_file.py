@@ -41,6 +41,10 @@ STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
 
 
+class NotGeneratedError(RecordingError):
+    """A recording was rendered or replayed from another one, or a policy made it."""
+
+
 class DamagedRunFileError(DemorecError):
     """run.json is there but cannot be read; the recordings tell what it held."""
 
@@ -391,15 +395,13 @@ def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[s
 
     Raises:
         RecordingError: It is no complete recording of an episode that demorec simulated.
-        ConfigError: It was rendered or replayed, or a policy made it.
+        NotGeneratedError: It was rendered or replayed, or a policy made it.
     """
     attempt, info = recorded_line(path)
     if info.simulation is None:
         raise NotSimulatedError("scene", path)
     if info.origin:
-        raise ConfigError(
-            f"The folder holds a {info.origin}, which generate-dataset did not make: choose another --out: {path}"
-        )
+        raise NotGeneratedError(f"The recording is a {info.origin}, which generate-dataset did not make: {path}")
     if attempt.success is None:
         raise RecordingError(f"The recording was cut off by a crash: {path}")
     return attempt, info.config, info.versions

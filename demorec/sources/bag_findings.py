@@ -154,7 +154,7 @@ def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
 
 
 def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
-    """Cameras that hang. A drawn one gives the same images, for a moment, where the robot rests but once."""
+    """Cameras that hang. A rendered one repeats its image while the robot stands still for a moment."""
     for line in lines:
         if (run := frozen_images(line)) is None:
             continue
@@ -169,16 +169,15 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
     """Whether all that is measured of the robot stands still in a time; False where nothing is."""
     moves = []
     for line in lines:
-        if line.stream.values is None or line.stream.label == ACTION:
+        if (values := line.stream.values) is None or line.stream.label.partition(" (")[0] == ACTION:
             continue
-        values = line.stream.values[line.order].astype(np.float64)
-        for start in line.stream.layout.quaternions if line.stream.layout else ():
-            values[:, start : start + 4] *= signs_of_course(values[:, start : start + 4])[:, None]
-        within = values[(line.times_ns >= begin_ns) & (line.times_ns <= end_ns)]
+        within = values[line.order[(line.times_ns >= begin_ns) & (line.times_ns <= end_ns)]].astype(np.float64)
         if len(within) < 2:
-            return False
-        way, whole = (float(np.linalg.norm(np.ptp(rows, axis=0))) for rows in (within, values))
-        moves.append(not way <= _RESTS * whole)  # nor where a number is none
+            continue
+        for start in line.stream.layout.quaternions if line.stream.layout else ():
+            within[:, start : start + 4] *= signs_of_course(within[:, start : start + 4])[:, None]
+        whole = np.linalg.norm(np.nanmax(values, axis=0) - np.nanmin(values, axis=0))
+        moves.append(not np.linalg.norm(np.ptp(within, axis=0)) <= _RESTS * whole)  # nor where a number is none
     return bool(moves) and not any(moves)
 
 

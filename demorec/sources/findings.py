@@ -34,9 +34,10 @@ _LEAST_JUMP = 1e-4
 """rad, m: what no sensor tells from noise."""
 _AS_FAST = 1.5
 """Times the largest step of what goes on."""
-_GOES_ON, _SETTLES = 0.1, 5.0
-"""Share of a step that the next one, or the one before, has in the same direction where something moves; or times the
-usual step, as of fingers that shut on something within a frame."""
+_GOES_ON = 0.1
+"""Share of a step that the next one, or the one before, has in the same direction where something moves."""
+_NOISE = 5.0
+"""Times the usual step of an element that rests, beyond which it moves."""
 _EARLY_S = 0.05
 """By which a header may be later than its recording, in which it was no more: clocks that NTP sets differ by less."""
 LOST = 1.6
@@ -172,10 +173,13 @@ def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
         usual = float(np.percentile(steps, 90))
         # What begins to move after a long rest goes on, as an opening gripper does. At a low rate a shorter way takes
         # one step, but no larger one than those of the longer.
-        beside, least = (change[1:] * change[:-1]).sum(axis=1), np.minimum(_GOES_ON * steps, _SETTLES * usual) * steps
+        beside, least = (change[1:] * change[:-1]).sum(axis=1), _GOES_ON * steps**2
         goes_on = np.append(beside > least[:-1], False) | np.insert(beside > least[1:], 0, False)
         limit = max(_SPIKE * usual, _LEAST_JUMP, _AS_FAST * float(steps[goes_on].max(initial=0.0)))
-        steps[goes_on] = 0.0
+        # Fingers at rest that shut on something within a message go on a little, and rest.
+        rests, settles = steps <= _NOISE * usual, np.zeros(len(steps), dtype=np.bool_)
+        settles[1:-2] = rests[:-3] & (beside[1:-1] > _NOISE * usual * steps[1:-2]) & rests[3:]
+        steps[goes_on | settles] = 0.0
         largest = int(steps.argmax())
         if usual > 0 and steps[largest] > limit:
             at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS

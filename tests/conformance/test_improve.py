@@ -151,7 +151,6 @@ def told_rounds(told: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_it_goes_from_demonstrations_to_a_corrected_policy(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = place / "whole"

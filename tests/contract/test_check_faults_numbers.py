@@ -232,6 +232,12 @@ def woken_early(c: Changed) -> Changed:
     return cube(plus(np.s_[first - 4 : first - 2, 2], 0.005))(c)
 
 
+def leaps_to_the_fingers(c: Changed) -> Changed:
+    """The cube is 12 mm aside, until shortly before they close."""
+    first = int(np.flatnonzero(c.columns.contact_force > 0)[0])
+    return cube(plus(np.s_[: first - 4, 1], 0.012))(c)
+
+
 def one_joint(index: int, change: Callable[[Rows], Rows]) -> Callable[[Rows], Rows]:
     """Other values of one column."""
     return lambda rows: np.column_stack([rows[:, :index], change(rows[:, index]), rows[:, index + 1 :]])
@@ -245,6 +251,7 @@ CASES: list[tuple[str, Fault, str]] = [
     ("an effort of zero", column("joint_effort", one_joint(6, np.zeros_like)), "stuck_sensors"),
     ("contact force beyond the release", held_on, "touches_nothing"),
     ("a cube that moves before it is touched", woken_early, "object_motion"),
+    ("a cube that leaps to the fingers", leaps_to_the_fingers, "object_motion"),
     ("contact force two frames late", column("contact_force", lambda r: late(late(r))), "contact_lag"),
     ("contact force doubled once", once_while_carried("contact_force", 2.0), "force_spikes"),
     ("a sample of the contact force lost", once_while_carried("contact_force", 0.0), "force_spikes"),
@@ -383,3 +390,15 @@ def test_the_good_one_passes(good: Path) -> None:
 def test_a_fault(name: str, fault: Fault, check: str, good: Path) -> None:
     result = judged(good, check, fault)
     assert result.level == "fail", (result.value, result.detail)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.5])
+def test_a_wrench_of_another_size_while_a_jaw_carries(share: float, tmp_path: Path) -> None:
+    path = simulate(tmp_path / "e.mcap", robot="so101", variation="none", fps=20, seed=5)
+    assert judged(path, "wrench_bears_the_hand", replace).level == "pass"
+
+    def spoilt(c: Changed) -> Changed:
+        carries = np.isin(c.columns.phase, ("lift", "transport", "lower"))
+        return wrench(lambda rows: np.where(carries[:, None], share * rows, rows))(c)
+
+    assert judged(path, "wrench_bears_the_hand", spoilt).level == "fail"

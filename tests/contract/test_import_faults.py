@@ -97,6 +97,7 @@ def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
         ([0.2, 0.4, 0.6, 0.6, 0, 0], True),
         ([0.2, 0.212, 0.212], False),
         ([0.2, 0.2, 0.2], True),
+        ([0.01, 0.02, 0.03, 0.54, 0.55, 0.56], True),
     ],
 )
 def test_a_gripper_that_opens_after_a_long_rest_does_not_jump(way: list[float], jumps: bool, tmp_path: Path) -> None:
@@ -146,7 +147,7 @@ def test_a_drawn_camera_at_rest_is_not_frozen(notes: bags.Notes, tmp_path: Path)
 def test_a_drawn_camera_that_sees_a_robot_rest_once(
     notes: bags.Notes, rests: bool, count: int, is_frozen: bool, tmp_path: Path
 ) -> None:
-    """For a moment; what is longer, or while the robot moves, is a camera that hangs."""
+    """Its image repeats for a moment. If it repeats for longer, or while the robot moves, the camera hangs."""
     images, states = bags.of_topic(notes, FRONT), bags.of_topic(notes, STATE)
     begin, end = (images[k].header_ns for k in (20, 20 + count))
     stands = min(states, key=lambda note: abs(note.header_ns - begin)).body["position"]

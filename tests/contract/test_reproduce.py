@@ -76,5 +76,8 @@ def test_renderings_of_a_run_are_no_copy_of_it(run: Path, tmp_path: Path, capsys
     assert len(there) == 5
     for command in (("reproduce", run), ("generate", "--num-episodes", 5, "--seed", 3, "--fps", 10)):
         assert exit_code(*command, "--out", out) == 2
-        assert "which generate-dataset did not make: choose another --out" in capsys.readouterr().err
+        assert (
+            "Nothing in the output folder was generated, choose another --out: The recording is a render of"
+            in capsys.readouterr().err
+        )
     assert {path.name: path.read_bytes() for path in out.rglob("*") if path.is_file()} == there
