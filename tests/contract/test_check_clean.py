@@ -66,7 +66,7 @@ def test_an_arm_that_noise_shakes(config: dict[str, Any], tmp_path: Path) -> Non
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
 
 
-def test_a_palm_that_presses_on_what_stands_beside(tmp_path: Path) -> None:
+def test_a_palm_that_presses_on_a_neighbour(tmp_path: Path) -> None:
     """A large cube moves by a millimetre that no finger touches."""
     path = simulate(tmp_path / "e.mcap", task="stack", variation="none", fps=20, seed=92000, episode_index=4)
     with Recording(path) as recording:
