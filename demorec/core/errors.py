@@ -70,6 +70,10 @@ class RecordingError(DemorecError):
     """A recording cannot be written or read: no MCAP, cut off, damaged, of an unknown format version."""
 
 
+class NotGeneratedError(RecordingError):
+    """A recording was rendered or replayed from another one, or a policy made it."""
+
+
 class NotSimulatedError(RecordingError):
     """Something was asked of an episode that only a simulated one has.
 

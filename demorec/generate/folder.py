@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, GenerationError, resource_error
+from demorec.core.errors import ConfigError, DemorecError, GenerationError, NotGeneratedError, resource_error
 from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
@@ -37,7 +37,6 @@ from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     Generation,
-    NotGeneratedError,
     RunFile,
     RunSession,
     load_run_file,

@@ -19,6 +19,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import (
     ConfigError,
     DemorecError,
+    NotGeneratedError,
     NotSimulatedError,
     RecordingError,
     describe_error,
@@ -39,10 +40,6 @@ IMPORT_NAME = "import.json"
 """Beside run.json: what `demorec import` read, and what it found in it (`demorec.sources.import_file`)."""
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
-
-
-class NotGeneratedError(RecordingError):
-    """A recording was rendered or replayed from another one, or a policy made it."""
 
 
 class DamagedRunFileError(DemorecError):

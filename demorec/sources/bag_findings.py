@@ -176,7 +176,7 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
             continue
         for start in line.stream.layout.quaternions if line.stream.layout else ():
             within[:, start : start + 4] *= signs_of_course(within[:, start : start + 4])[:, None]
-        whole = np.linalg.norm(np.nanmax(values, axis=0) - np.nanmin(values, axis=0))
+        whole = np.linalg.norm(np.ptp(np.nan_to_num(values), axis=0))
         moves.append(not np.linalg.norm(np.ptp(within, axis=0)) <= _RESTS * whole)  # nor where a number is none
     return bool(moves) and not any(moves)
 

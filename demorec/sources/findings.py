@@ -261,7 +261,7 @@ def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
 
 
 def frozen_images(line: Timeline) -> tuple[int, int] | None:
-    """First and last index of images in a row with the very same bytes, of a camera that never gives but two alike."""
+    """First and last index of images in a row with the very same bytes, of a camera that repeats none for less."""
     if not line.stream.heads:
         return None
     sums = np.asarray(line.stream.image_sums)[line.order].astype(np.int64)
