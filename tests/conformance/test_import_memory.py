@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import tracemalloc
 from pathlib import Path
 
@@ -57,15 +58,17 @@ def test_what_is_kept_of_messages(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(MAPPING)
     mapping = read_mapping(tmp_path / "robot.toml")
     kept = []
-    for seconds in (1, 2, 8):  # the first loads what is loaded once
+    for seconds in (1, 2, 32):  # the first loads what is loaded once
         bag = open_bag(write_bag(tmp_path / f"{seconds}.mcap", seconds, rate=100))
+        gc.collect()
         tracemalloc.start()
         streams = read_streams(bag, mapping)
+        gc.collect()
         kept.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
         assert len(streams.sources["observation.state", 0]) == 100 * seconds
-    # Arrays grow by an eighth more than is needed.
-    assert kept[2] - kept[1] < 6 * 100 * (2 * PER_JOINT_MESSAGE + PER_IMAGE) * 1.2
+    # Arrays grow by an eighth more than is needed; what other tests leave behind is little beside 30 s of messages.
+    assert kept[2] - kept[1] < 30 * 100 * (2 * PER_JOINT_MESSAGE + PER_IMAGE) * 1.2
 
 
 @pytest.mark.slow
