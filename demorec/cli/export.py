@@ -21,11 +21,10 @@ from demorec.datasets.options import CommonOptions, ExportReport
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Turn recordings into a dataset: lerobot (LeRobot v3.0) or hdf5 (robomimic).
+    """Turn recordings into a dataset.
 
-    LeRobot datasets get each recorded video packet unchanged, HDF5 files the decoded images; the numbers are the same.
     The dataset appears whole or not at all; the recordings are never touched. The flags below apply to every format;
-    name a format in front of --help to see its own flags as well.
+    name a format in front of --help to see its own flags as well. `demorec list exporters` says what each makes.
 
     Examples:
       demorec export lerobot recordings/cubes --out cubes --repo-id me/cubes
@@ -35,11 +34,10 @@ class Export:
       demorec export hdf5 recordings/cubes --out cubes.hdf5 --action ee_delta
     """
 
-    format: Annotated[Positional[str], arg(metavar="FORMAT")]
-    """Format of the dataset: lerobot or hdf5."""
+    format: Annotated[Positional[str], arg(metavar="FORMAT", help=f"One of: {', '.join(EXPORTERS.names())}.")]
     sources: Readable
     out: Path
-    """Folder (LeRobot) or file (HDF5) to create."""
+    """Folder or file to create."""
     mapping: MappingFile = None
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
     """How to export."""

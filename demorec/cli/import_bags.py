@@ -17,10 +17,12 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.registry import nearest_match
 from demorec.robots.motors import Motors, MotorUnits
-from demorec.runs.find import find
+from demorec.runs.find import find, name_of
 from demorec.sources.formats import FORMATS, SourceFormat
 
 MAX_WORKERS = 1000
+_BAGS = "Bags; each is an episode, or several, as the mapping says."
+_WORDS = ", ".join(f"{word} ({form.name})" for word, form in FORMATS.items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +49,9 @@ class Import:
       demorec import hdf5 demo.hdf5 --mapping demo.toml --out runs/demo
     """
 
-    bags: Positional[tuple[Path, ...]]
-    """Bags; each is an episode, or several, as the mapping says. Or the word lerobot and a dataset, or the word hdf5
-    and HDF5 files."""
+    bags: Annotated[Positional[tuple[Path, ...]], arg(help=f"{_BAGS} Or a word in front of what is no bag: {_WORDS}.")]
     mapping: Path | None = None
-    """Mapping file (TOML): which topics or datasets become which features; required for bags and HDF5 files."""
+    """Mapping file (TOML): which topics or datasets become which features; required where --suggest writes one."""
     out: Path | None = None
     """Folder of the run, new or to be continued; required unless --suggest is given."""
     skip_bad: bool = False
@@ -60,7 +60,7 @@ class Import:
     workers: int = 1
     """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
-    """Write a mapping for the first bag or HDF5 file to standard output instead of importing."""
+    """Write a mapping for the first bag or file to standard output instead of importing."""
     motor_units: MotorUnits | None = None
     """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
     degrees, LeRobot's default, or scaled to -100..100 of their ranges. Its recordings then have the arm's URDF and
@@ -108,13 +108,13 @@ class Import:
             raise ConfigError(
                 "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
             )
-        example = f"demorec import {word} {form.example}"
+        example, name = f"demorec import {word} {form.example}", name_of(form.kind)
         if not paths:
             raise ConfigError(
-                f"Name {form.name} after the word {word}: {example}. A bag of that name is given with its folder."
+                f"Name {name} after the word {word}: {example}. A bag of that name is given with its folder."
             )
         if form.mapping is None and (self.suggest or self.mapping is not None):
-            raise ConfigError(f"The import of {form.name} needs no mapping: leave --mapping and --suggest out.")
+            raise ConfigError(f"The import of {name} needs no mapping: leave --mapping and --suggest out.")
         if self.suggest:
             say(*form.suggest(paths[0]))
             return 0

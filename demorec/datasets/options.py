@@ -36,7 +36,7 @@ class CommonOptions:
     are always there. Fewer features make training faster. Simulated episodes have more that must be named: command, and
     sensed values such as observation.effort (docs/dataset-format.md)."""
     depth: bool = False
-    """Add depth images of recordings that have depth: LeRobot's 12-bit videos, or float32 metres in HDF5."""
+    """Add depth images of recordings that have depth."""
     fps: int | None = None
     """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
     hold_images: float = 0.0

@@ -138,6 +138,11 @@ def find(path: Path) -> Found:
         return Found(path=path, kind="unreadable", reason=f"This cannot be read ({error.strerror})")
 
 
+def name_of(kind: PathKind) -> str:
+    """What a kind is called in a sentence: "an HDF5 file"."""
+    return _WORDS[kind][0]
+
+
 def expect(path: Path, *kinds: PathKind) -> Found:
     """What a path is, if it is of one of these kinds and, as a folder of episodes, has a recording.
 

@@ -19,11 +19,11 @@ import zstandard
 
 from demorec.core.errors import ConfigError, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
-from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.scan import ScannedMessage
 from demorec.runs.find import BAG_SUFFIXES, ROSBAG2
 from demorec.sources.bag_files import MAX_TIME_NS, SQLITE_MAGIC, BagError, read_mcap, read_sqlite
+from demorec.sources.formats import importing_advice
 from demorec.sources.words import in_natural_order
 
 _SUFFIXES = (".mcap", *BAG_SUFFIXES)
@@ -115,7 +115,7 @@ def bags_in(path: Path) -> list[Path]:
     They are rosbag2 folders, MCAP and .db3 files, and those files in folders in it whose metadata.yaml was lost. A
     folder that holds none of them is given back itself.
     """
-    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or (path / INFO_PATH).is_file():
+    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or importing_advice(path):
         return [path]
     found: list[Path] = []
     for entry in _entries(path):
@@ -173,11 +173,8 @@ def _kind_of(path: Path) -> bytes:
             f"This is a bag of ROS 1; rosbags-convert --src {path.name} --dst {path.stem} makes a rosbag2 folder of "
             f"it, which is read: {path}"
         )
-    if head.startswith(b"\x89HDF"):
-        raise ConfigError(
-            f"This is an HDF5 file, no bag: demorec import hdf5 {path} --suggest > demo.toml writes a mapping for it: "
-            f"{path}"
-        )
+    if advice := importing_advice(path):
+        raise ConfigError(f"{advice}: {path}")
     raise BagError(f"This is no bag: MCAP files, .db3 files and rosbag2 folders are read: {path}")
 
 
@@ -190,10 +187,8 @@ def _folder(path: Path) -> Bag:
         mode = str(information.get("compression_mode") or "").lower()
         compression = str(information.get("compression_format") or "")
     except FileNotFoundError:
-        if (path / INFO_PATH).is_file():
-            raise ConfigError(
-                f"This is a LeRobot dataset, no bag: demorec import lerobot {path} --out RUN makes a run of it: {path}"
-            ) from None
+        if advice := importing_advice(path):
+            raise ConfigError(f"{advice}: {path}") from None
         raise BagError(
             f"The folder holds no {ROSBAG2}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
             f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"

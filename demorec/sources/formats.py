@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.robots.motors import Motors
-from demorec.runs.find import PathKind
+from demorec.runs.find import PathKind, find, name_of
 from demorec.sources.mapping import SourceKind
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class SourceFormat:
 
     Attributes:
         kind: What `demorec.runs.find` takes them for.
-        name: In a sentence.
+        name: In a sentence, of many.
         example: What follows `demorec import` and the format's word.
         read: (paths, mapping, out, how pixels are encoded, what its numbers are) -> what was made. The run `out` is
             made or continued. Heavy imports stand in it. Raises DemorecError.
@@ -72,7 +72,7 @@ def _suggest_hdf5(path: Path) -> list[str]:
 FORMATS: Mapping[str, SourceFormat] = {
     "lerobot": SourceFormat(
         kind="dataset",
-        name="a LeRobot dataset",
+        name="LeRobot datasets",
         example="datasets/cups --out runs/cups",
         read=_read_lerobot,
         has_motor_units=True,
@@ -91,3 +91,14 @@ FORMATS: Mapping[str, SourceFormat] = {
 WORD_OF: Mapping[PathKind, str] = {found.kind: word for word, found in FORMATS.items()}
 IMPORTED: tuple[PathKind, ...] = ("rosbag", *(kind for kind in WORD_OF if kind != "dataset"))
 """Kinds of paths that no command reads as they are. Datasets are, but where recordings are needed (export)."""
+
+
+def importing_advice(path: Path) -> str:
+    """How to import what was given as a bag and is of one of the formats, as a sentence without its end; else ""."""
+    kind = find(path).kind
+    if kind not in WORD_OF:
+        return ""
+    flags = "--suggest > demo.toml writes a mapping for it"
+    if FORMATS[WORD_OF[kind]].mapping is None:
+        flags = "--out RUN makes a run of it"
+    return f"This is {name_of(kind)}, no bag: demorec import {WORD_OF[kind]} {path} {flags}"

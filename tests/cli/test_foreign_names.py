@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.check import Spoilt
-from support.commands import exit_code
+from support.commands import ON_A_PATH, exit_code, words_of
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, NotAllowedError
@@ -82,17 +82,11 @@ def dataset_of(name: str, folder: Path, source: Path) -> Path:
 
 
 COMMANDS = {
-    "info": ["info", "{path}"],
-    "view": ["view", "{path}", "--save", "{out}/view.rrd"],
-    "check": ["check", "{path}", "--replay", "1", "--no-images"],
-    "report": ["report", "{path}", "--out", "{path}.html"],
-    "replay": ["replay", "{path}", "--out", "{out}/replayed"],
-    "replay states": ["replay", "{path}", "--out", "{out}/replayed", "--states"],
-    "render": ["render", "{path}", "--out", "{out}/rendered", "--workers", "1"],
-    "reproduce": ["reproduce", "{path}", "--out", "{out}/reproduced", "--workers", "1"],
-    "export": ["export", "lerobot", "{path}", "--out", "{out}/exported", "--no-verify"],
-    "recover": ["recover", "{path}"],
-    "evaluate": ["evaluate", "--compare", "{path}", "{path}"],
+    **ON_A_PATH,
+    "check": "check PATH --replay 1 --no-images",
+    "replay": "replay PATH --out NEW",
+    "replay states": "replay PATH --out NEW --states",
+    "evaluate": "evaluate --compare PATH PATH",
 }
 """Every command that reads what others may have made."""
 
@@ -106,8 +100,9 @@ def test_no_command_imports_what_a_file_names(
     if kind == "dataset":
         path = dataset_of(name, tmp_path / "dataset", path)
     refused = set()
-    for command, words in COMMANDS.items():
-        code = exit_code(*(word.format(path=path, out=tmp_path / "out" / command) for word in words))
+    for command, call in COMMANDS.items():
+        (tmp_path / "out" / command).mkdir(parents=True)
+        code = exit_code(*words_of(call, path, tmp_path / "out" / command / "new"))
         told = capsys.readouterr()
         assert not marker.exists(), command
         assert MODULE not in sys.modules, command
@@ -168,9 +163,8 @@ def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_of(name, tmp_path / "run")
-    for words in (COMMANDS["replay"], COMMANDS["reproduce"]):
-        command = [word.format(path=run, out=tmp_path / "out") for word in words]
-        assert exit_code(*command) == 2
+    for call in (COMMANDS["replay"], COMMANDS["reproduce"]):
+        assert exit_code(*words_of(call, run, tmp_path / "out")) == 2
         told = capsys.readouterr().err
         assert len(without_notes(told)) == 1, told
     assert exit_code("replay", run, "--allow", name.partition(":")[0] or "a") == 2

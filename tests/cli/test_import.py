@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import pytest
 from support import bag_mappings, bags
 from support.commands import exit_code
 from support.recording import write_episode
-
-from demorec.datasets.lerobot.paths import INFO_PATH
 
 BAD: dict[str, tuple[int, str]] = {
     "no bag": (2, "No bag is given"),
@@ -24,8 +21,6 @@ BAD: dict[str, tuple[int, str]] = {
     "two types on a topic": (1, "has messages of several types"),
     "a text file": (1, "This is no bag"),
     "an empty file": (1, "The bag is empty"),
-    "an HDF5 file": (2, "This is an HDF5 file, no bag: demorec import hdf5"),
-    "a dataset without a mapping": (2, "This is a LeRobot dataset, no bag: demorec import lerobot"),
     "somebody's folder": (2, "choose another"),
     "a URDF that is not there": (2, "The URDF cannot be read"),
     "a folder without metadata": (1, "holds no metadata.yaml"),
@@ -52,12 +47,6 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
             bag.write_text("hello")
         case "an empty file":
             bag.write_bytes(b"")
-        case "an HDF5 file":
-            h5py.File(bag, "w").close()
-        case "a dataset without a mapping":
-            bag = tmp_path / "dataset"
-            (bag / INFO_PATH).parent.mkdir(parents=True)
-            (bag / INFO_PATH).write_text("{}")
         case "a URDF that is not there":
             text = text.replace('name = "so101"', 'name = "so101"\nurdf = "none.urdf"')
         case "somebody's folder":
@@ -78,7 +67,6 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
         "no bag": words[1:],
         "no mapping": words[:1],
         "a word for a format that is misspelt": ["lerobt", bag, "--out", run],
-        "a dataset without a mapping": words[:1],
         "codec": [*words, "--gop", "0"],
     }
     words = others.get(name, words)

@@ -31,6 +31,7 @@ from demorec.core.replacing import (
     settle_parts,
     written_whole,
 )
+from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import reproduce as reproducing
 from demorec.generate.options import RunObserver, RunOptions
@@ -474,21 +475,25 @@ def test_screenshots_replace_images_only(place: Path, capsys: pytest.CaptureFixt
     assert files_of(place.parent) == before
 
 
-@pytest.mark.parametrize("suffix", ["mcap", "hdf5", "rrd", "html", "png"])
-def test_an_empty_file_is_not_replaced(place: Path, capsys: pytest.CaptureFixture[str], suffix: str) -> None:
+@pytest.mark.parametrize(
+    ("words", "flag", "name"),
+    [
+        ("recover", "--out", "lock.mcap"),
+        ("view", "--save", "lock.rrd"),
+        ("view", "--screenshot", "lock.png"),
+        ("report", "--out", "lock.html"),
+        *((f"export {exporter}", "--out", "lock") for exporter in EXPORTERS.names()),
+    ],
+)
+def test_an_empty_file_is_not_replaced(
+    place: Path, capsys: pytest.CaptureFixture[str], words: str, flag: str, name: str
+) -> None:
     """It may be somebody's lock or mark; nothing in it says that it is ours."""
-    target, recording = place / f"lock.{suffix}", place / "alone.mcap"
+    target = place / name
     target.touch()
     before = files_of(place)
-    commands: dict[str, tuple[object, ...]] = {
-        "mcap": ("recover", recording, "--out", target),
-        "hdf5": ("export", "hdf5", recording, "--out", target),
-        "rrd": ("view", recording, "--save", target),
-        "html": ("report", recording, "--out", target),
-        "png": ("view", recording, "--screenshot", target),
-    }
     for flags in ((), ("--overwrite",)):
-        assert exit_code(*commands[suffix], *flags) == 2
+        assert exit_code(*words.split(), place / "alone.mcap", flag, target, *flags) == 2
         said = capsys.readouterr().err
         assert len(said.splitlines()) == 1
         assert str(target) in said
@@ -537,8 +542,10 @@ INSIDE: dict[str, Sequence[str]] = {
     "report --out": ("runs/other/episodes/v.html", "dataset/v.html"),
     "render --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
     "replay --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),
-    "export lerobot --out": ("runs/other/episodes/x", "runs/other/unfinished", "dataset/inner", "dataset/a/b"),
-    "export hdf5 --out": ("runs/other/failed/x.hdf5", "dataset/x.hdf5"),
+    **{
+        f"export {exporter} --out": ("runs/other/episodes/x", "runs/other/unfinished", "dataset/inner", "dataset/a/b")
+        for exporter in EXPORTERS.names()
+    },
 }
 
 

@@ -21,20 +21,14 @@ import pytest
 from conformance.test_import_v21 import write_v21
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags, hdf5
-from support.commands import exit_code
+from support.commands import ON_A_PATH, ON_EVERYTHING, exit_code
 from support.export import without_verification
 from support.foreign_dataset import write_foreign
 
 from demorec.sources import opening
 
 pytestmark = pytest.mark.usefixtures("hdf5_read_here")
-COMMANDS = {
-    "info": "info PATH",
-    "check": "check PATH --no-images",
-    "view": "view PATH --save NEW.rrd",
-    "report": "report PATH --out NEW.html",
-    "export": "export hdf5 PATH --out NEW.hdf5",
-}
+COMMANDS = {name: ON_A_PATH[name] for name in ON_EVERYTHING} | {"export": "export hdf5 PATH --out NEW.hdf5"}
 ROWS = {
     "mcap": (1, 48),
     "mcap with --mapping": (1, 48),
@@ -115,6 +109,25 @@ def test_a_command_reads_it(
         assert "failed:" not in page  # nobody said so
     if command == "view":
         assert len(list(tmp_path.glob("new*.rrd"))) == episodes
+
+
+@pytest.mark.parametrize(("kind", "word"), [("robomimic", "hdf5"), ("aloha", "hdf5"), ("lerobot v3.0", "lerobot")])
+@pytest.mark.parametrize("flags", [(), ("--mapping", "MAPPING", "--out", "NEW"), ("--suggest",)])
+def test_what_is_given_as_a_bag_gets_its_word(
+    kind: str,
+    word: str,
+    flags: tuple[str, ...],
+    places: dict[str, list[Path | str]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (path,) = places[kind]
+    values = {"MAPPING": places["mcap with --mapping"][-1], "NEW": tmp_path / "new"}
+    assert exit_code("import", path, *(values.get(flag, flag) for flag in flags)) == 2
+    told = capsys.readouterr().err
+    assert f"no bag: demorec import {word} {path} --" in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "new" / "run.json").exists()
 
 
 def test_numbers_are_those_of_the_file(

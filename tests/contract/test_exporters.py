@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from contextlib import suppress
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
-from support.export import data_table, export, files_of, make_run
+from support.export import content_of, export, feature_of, files_of, make_run
 from support.recording import make_episode
 
+from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.tables import EXPORTERS
 from demorec.episode.sensed import SENSED
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.recover import recover
+from demorec.runs.find import find, name_of
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
 
@@ -26,11 +26,6 @@ pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run") / "run", (6, 5, 4), failures=(1,))
-
-
-def content(place: Path) -> dict[str, bytes]:
-    """All files at a path, be it a folder or a file."""
-    return {"": place.read_bytes()} if place.is_file() else files_of(place)
 
 
 def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: Path, tmp_path: Path) -> None:
@@ -59,16 +54,24 @@ def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run:
     }[name]
     assert expected is not None
     assert np.ptp(expected) > 0
-    if exporter == "lerobot":
-        found = np.array(data_table(tmp_path / "d").column(name).to_pylist(), dtype=np.float32)
-        assert np.array_equal(found.reshape(len(found), -1), expected.astype(np.float32))
-        assert "filled in" not in (tmp_path / "d" / "README.md").read_text().split(f"`{name}`")[1].splitlines()[0]
-    else:
-        with h5py.File(tmp_path / "d") as file:
-            stored = file["data/demo_0/obs"][name.removeprefix("observation.")]
-            assert np.array_equal(stored[()], expected)
-            assert len(json.loads(stored.attrs["names"])) == expected.shape[1]
-        export(run, tmp_path / "d", exporter, overwrite=True)  # a file with it is still known as ours
+    found, names = feature_of(tmp_path / "d", name, exporter)
+    assert np.array_equal(found, expected.astype(np.float32 if exporter == "lerobot" else expected.dtype))
+    assert len(names) == expected.shape[1]
+    card = tmp_path / "d" / "README.md"
+    assert not card.is_file() or "filled in" not in card.read_text().split(f"`{name}`")[1].splitlines()[0]
+    export(run, tmp_path / "d", exporter, overwrite=True)  # what has it is still known as ours
+
+
+def test_what_it_makes_is_known(exporter: str, run: Path, tmp_path: Path) -> None:
+    """By every command that is given it; and nothing else is written into it, if it is a folder."""
+    out = tmp_path / "d"
+    export(run, out, exporter)
+    kind = find(out).kind
+    assert kind not in ("nothing", "unreadable")
+    assert name_of(kind)
+    if out.is_dir():
+        with pytest.raises(ConfigError, match="Nothing else is written into a dataset"):
+            refuse_inside([out / "inner"])
 
 
 def test_a_recovered_recording_is_no_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
@@ -88,17 +91,17 @@ def test_a_recovered_recording_is_no_failed_attempt(exporter: str, run: Path, tm
 def test_the_same_recordings_give_the_same_bytes(exporter: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "a", exporter, privileged=True, action="ee_delta")
     export(run, tmp_path / "b", exporter, privileged=True, action="ee_delta")
-    assert content(tmp_path / "a") == content(tmp_path / "b")
+    assert content_of(tmp_path / "a") == content_of(tmp_path / "b")
 
 
 def test_a_dataset_is_replaced_only_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, episodes="0")
-    before = content(tmp_path / "d")
+    before = content_of(tmp_path / "d")
     with pytest.raises(ConfigError, match="is there already"):
         export(run, tmp_path / "d", exporter)
-    assert content(tmp_path / "d") == before
+    assert content_of(tmp_path / "d") == before
     assert export(run, tmp_path / "d", exporter, overwrite=True).num_episodes == 3
-    assert content(tmp_path / "d") != before
+    assert content_of(tmp_path / "d") != before
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
@@ -112,10 +115,10 @@ def test_what_is_no_dataset_is_never_replaced(exporter: str, run: Path, tmp_path
         (out / "thesis.txt").write_text("years of work")
     else:
         shutil.copy(run / "episodes" / "episode_000000.mcap", out)
-    before = content(out)
+    before = content_of(out)
     with pytest.raises(ConfigError, match="never replaced"):
         export(run, out, exporter, overwrite=True)
-    assert content(out) == before
+    assert content_of(out) == before
 
 
 @pytest.mark.parametrize(

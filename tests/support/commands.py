@@ -10,6 +10,28 @@ import psutil
 
 from demorec.cli import main
 
+ON_A_PATH = {
+    "info": "info PATH",
+    "check": "check PATH --no-images",
+    "view": "view PATH --save NEW.rrd",
+    "report": "report PATH --out NEW.html",
+    "export": "export lerobot PATH --out NEW --no-verify",
+    "replay": "replay PATH",
+    "render": "render PATH --out NEW --workers 1",
+    "reproduce": "reproduce PATH --out NEW --workers 1",
+    "recover": "recover PATH --out NEW.mcap",
+}
+"""How every command that takes recordings, runs or datasets is called with a PATH; what it makes begins with NEW."""
+ON_EVERYTHING = ("info", "check", "view", "report", "export")
+"""Those that read bags and other formats, too."""
+OTHERS = {"generate", "import", "dataset", "pretrain", "train", "evaluate", "correct", "improve", "list"}
+"""Commands that take other things."""
+
+
+def words_of(call: str, path: object, new: object) -> list[str]:
+    """The words of a call such as those of `ON_A_PATH`."""
+    return [word.replace("PATH", str(path)).replace("NEW", str(new)) for word in call.split()]
+
 
 def exit_code(*arguments: object, program: Callable[[list[str]], object] = main) -> int:
     """The exit code of a command that is run in this process: `demorec ARGUMENTS...`."""

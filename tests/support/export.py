@@ -12,10 +12,12 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from numpy.typing import NDArray
 
 from demorec.check import dataset_files
 from demorec.core.config import VideoConfig
@@ -49,6 +51,21 @@ def make_run(
         path = folder / "failed" / f"episode_{index:06d}.attempt_0.mcap"
         write_episode(path, video=video, num_frames=12, episode_index=index, success=False, **arguments)
     return folder
+
+
+def content_of(place: Path) -> dict[str, bytes]:
+    """Relative path -> content of every file of a folder; "" -> that of a file; {} of nothing."""
+    return {"": place.read_bytes()} if place.is_file() else files_of(place)
+
+
+def feature_of(dataset: Path, name: str, exporter: str) -> tuple[NDArray[Any], list[str]]:
+    """(T, D) of a feature in the first episode of what an exporter made, and the names of its elements."""
+    if exporter == "lerobot":
+        rows = np.array(data_table(dataset).column(name).to_pylist())
+        return rows.reshape(len(rows), -1), info(dataset)["features"][name]["names"]
+    with h5py.File(dataset) as file:
+        stored = file["data/demo_0/obs"][name.removeprefix("observation.")]
+        return stored[()], json.loads(stored.attrs["names"])
 
 
 def export(sources: Path | Sequence[Path], out: Path, exporter: str = "lerobot", **options: Any) -> ExportReport:

@@ -35,6 +35,7 @@ from tyro.constructors import (
 from demorec.cli.shared.output import say, tell
 from demorec.core.errors import ConfigError
 from demorec.core.registry import is_module_name, split_name
+from demorec.sources.formats import FORMATS
 
 FLAG_TYPES = ConstructorRegistry()
 
@@ -194,13 +195,15 @@ Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_b
 """One module or package each time, since paths may follow."""
 
 
-WHAT_IS_READ = "recordings, runs, LeRobot datasets, HDF5 files, bags, folders of recordings or of bags"
+WHAT_IS_READ = (
+    f"recordings, runs, {', '.join(form.name for form in FORMATS.values())}, bags, folders of recordings or bags"
+)
 Readable = Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}.")]
 MappingFile = Annotated[
     Path | None,
     arg(
-        help="Mapping file for bags and HDF5 files, as demorec import takes it (auto: the one that demorec import "
-        "--suggest writes, if it leaves nothing to decide)."
+        help="Mapping file, as demorec import takes it, for bags and other formats that need one (auto: the one that "
+        "demorec import --suggest writes, if it leaves nothing to decide)."
     ),
 ]
 
