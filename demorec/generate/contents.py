@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import ConfigError, DemorecError, describe_error, resource_error, without_path
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error, without_path
 from demorec.core.files import free_name, sha256_of, sync_path
 from demorec.core.own_versions import differences
 from demorec.core.plain import to_plain
@@ -64,21 +64,28 @@ def _number(kind: re.Pattern[str], names: list[str]) -> int:
     return sum(bool(kind.fullmatch(name)) for name in names)
 
 
-def foreign_recordings(folder: Path, place: str, *, known: frozenset[str] = frozenset()) -> Iterator[str]:
+def foreign_recordings(
+    folder: Path,
+    place: str,
+    *,
+    known: frozenset[str] = frozenset(),
+    is_ours: Callable[[Path], bool] = RECORDING.recognises,
+) -> Iterator[str]:
     """What in a folder of recordings is none of ours.
 
     Args:
         folder: Of the run or the evaluation.
         place: episodes or failed.
         known: Files, relative to `folder`, that it has made, whatever has become of them.
+        is_ours: Whether another file may be one that it has made.
     """
     if (folder / place).is_symlink():
         yield place
         return
     for name in files_below(folder / place):
         file = folder / place / name
-        is_ours = file.is_file() and (f"{place}/{name}" in known or RECORDING.recognises(file))
-        if not (_RECORDING.fullmatch(name) and is_ours):
+        is_made = file.is_file() and (f"{place}/{name}" in known or is_ours(file))
+        if not (_RECORDING.fullmatch(name) and is_made):
             yield f"{place}/{name}"
 
 
@@ -113,16 +120,33 @@ def check_dataset_place(folder: Path, run: RunFile) -> None:
 
 def _recognises(folder: Path) -> bool:
     run = json_object(folder / RUN_NAME)
-    return (isinstance(run.get("episodes"), list) and "config_digest" in run) or any(
-        RECORDING.recognises(file) for file in recordings_of(folder)
-    )
+    if run:  # a run that was imported has one as well
+        return isinstance(run.get("episodes"), list) and "config_digest" in run
+    return any(_may_be_generated(file) for file in recordings_of(folder))
+
+
+def _may_be_generated(file: Path) -> bool:
+    """Whether a file is a recording that does not say itself that something else made it: a render, an import."""
+    from demorec.mcap import open_recording
+
+    if not RECORDING.recognises(file):
+        return False
+    try:
+        with open_recording(file) as recording:
+            return recording.info.simulation is not None and not recording.info.origin
+    except RecordingError:
+        return True  # what is damaged is made again
 
 
 def _strangers(folder: Path) -> list[str]:
     run = json_object(folder / RUN_NAME)
     lines = run.get("episodes")
     known = frozenset(str(line.get("file")) for line in lines or () if isinstance(line, dict))
-    found = [name for place in (EPISODES, FAILED) for name in foreign_recordings(folder, place, known=known)]
+    found = [
+        name
+        for place in (EPISODES, FAILED)
+        for name in foreign_recordings(folder, place, known=known, is_ours=_may_be_generated)
+    ]
     if (folder / UNFINISHED).is_symlink():
         found.append(UNFINISHED)
     else:

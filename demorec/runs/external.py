@@ -170,7 +170,8 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
         RecordingError: One of its recordings is damaged.
     """
     path = path.absolute()
-    if path.exists() and not path.is_dir():
+    was_there = path.exists()
+    if was_there and not path.is_dir():
         raise ConfigError(f"This is a file, no folder for a run: choose another: {path}")
     if path.is_dir() and not is_external_run(path):
         if (path / RUN_NAME).exists():
@@ -185,6 +186,11 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
             yield folder
         finally:
             folder.save(ended=True)
+            if not was_there and not (path / RUN_NAME).exists():
+                with suppress(OSError):  # of what is in it: a recording, or what is left of one
+                    (path / EPISODES).rmdir()
+                    (path / LOCK_NAME).unlink()
+                    path.rmdir()
 
 
 def episode_path(run: Path, episode_index: int) -> Path:

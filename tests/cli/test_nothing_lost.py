@@ -17,7 +17,7 @@ from PIL import Image
 from support.commands import exit_code
 from support.export import export, files_of, make_run
 from support.generate import run_fake
-from support.recording import write_episode
+from support.recording import make_episode, write_episode
 
 from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import GenerateConfig
@@ -36,6 +36,7 @@ from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import reproduce as reproducing
 from demorec.generate.options import RunObserver, RunOptions
 from demorec.learn.evaluate.rollouts import Settings, _open
+from demorec.mcap import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 
 
@@ -246,6 +247,32 @@ def test_folders_named_as_a_runs_are_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="not a run"):
         run_fake(tmp_path, overwrite=True)
     assert {name: data for name, data in files_of(tmp_path).items() if name != ".lock"} == before
+
+
+@pytest.mark.parametrize("origin", ["rendered", "imported", "imported, run.json lost", "imported among its own"])
+def test_episodes_that_were_not_generated_are_not_overwritten(
+    run: Path, place: Path, tmp_path: Path, origin: str
+) -> None:
+    folder = tmp_path / "others"
+    if origin == "rendered":
+        (folder / "episodes").mkdir(parents=True)
+        info, frames, outcome = make_episode(num_frames=4, cameras=())
+        info = replace(info, origin="render of episode_000000.mcap")
+        with EpisodeWriter(folder / "episodes/episode_000000.mcap", info) as writer:
+            for frame in frames:
+                writer.write(frame)
+            writer.finish(outcome)
+    else:
+        assert exit_code("import", "lerobot", place / "dataset", "--out", folder) == 0
+    if origin == "imported, run.json lost":
+        (folder / "run.json").unlink()
+    if origin == "imported among its own":
+        shutil.copy(folder / "episodes/episode_000000.mcap", run / "episodes/episode_000088.mcap")
+        folder = run
+    before = {name: data for name, data in files_of(folder).items() if name != ".lock"}
+    with pytest.raises(ConfigError, match=r"not a run|episode_000088\.mcap|choose another --out"):
+        run_fake(folder, num_episodes=2, seed=1, overwrite=True)
+    assert {name: data for name, data in files_of(folder).items() if name != ".lock"} == before
 
 
 def test_an_overwriting_that_fails_puts_the_run_back(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
