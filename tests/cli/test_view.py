@@ -189,6 +189,7 @@ def test_a_screenshot_of_an_episode(run_folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.viewer
 def test_a_screenshot_of_a_comparison(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
@@ -216,7 +217,8 @@ def test_episodes_arrive_while_the_viewer_is_open(
     assert any("episode_000001" in name for name in names)
 
 
-@pytest.mark.slow  # the web viewer takes a minute to draw on a software rasteriser
+@pytest.mark.slow
+@pytest.mark.long  # the web viewer takes a minute to draw on a software rasteriser
 @pytest.mark.viewer
 def test_the_browser_shows_an_episode(run_folder: Path, tmp_path: Path) -> None:
     program = need_chromium()

@@ -130,6 +130,7 @@ def test_evaluate_records_every_rollout_and_goes_on(trained: Path, capsys: pytes
     assert "0/3 = 0.0 %" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["correct", "--policy", str(trained / "train"), "--episode-length", "9", "--workers", "1", "--seed", "3"]
     words += ["--stray-metres", "0", "--stray-radians", "0"]  # it strays from its first action on

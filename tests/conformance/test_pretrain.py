@@ -216,6 +216,7 @@ def test_one_stopped_in_its_last_part_ends_with_the_same_weights(
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
+@pytest.mark.long
 def test_changed_images_are_the_same_after_a_stop(
     settings: Path, pretrained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -363,6 +364,7 @@ def encoded(settings: Path, folder: Path) -> np.ndarray[Any, Any]:
     return np.asarray(policy.encode(before(default_collate([dataset[7]]))).numpy())
 
 
+@pytest.mark.long
 def test_the_encoder_must_have_been_pretrained(settings: Path, tmp_path: Path) -> None:
     command = [str(Path(sys.executable).parent / "demorec"), "train", f"--config_path={settings}"]
     done = subprocess.run([*command, f"--output_dir={tmp_path / 'out'}"], capture_output=True, text=True, check=False)

@@ -14,7 +14,6 @@ from support.export import content_of, count_calls, export, export_in_child, fil
 
 from demorec.core.tables import EXPORTERS
 
-KILLS = 10  # of each case
 MODES: dict[str, dict[str, Any]] = {
     "new": {},
     "overwrite": {"overwrite": True},
@@ -52,8 +51,9 @@ def exit_code(context: Any, *arguments: Any, **limits: int) -> int:
     return int(process.exitcode)
 
 
+@pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.long)])
 @pytest.mark.parametrize(("exporter", "mode"), CASES)
-def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, exporter: str, mode: str) -> None:
+def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, exporter: str, mode: str, kills: int) -> None:
     place = tmp_path / "place"
     place.mkdir()
     out = place / "d"
@@ -75,7 +75,7 @@ def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, exporter:
 
     rng = np.random.default_rng(CASES.index((exporter, mode)))
     outcomes, left_something = [], False
-    for moment in ((np.arange(KILLS) + rng.random(KILLS)) / KILLS * calls).astype(int).tolist():
+    for moment in ((np.arange(kills) + rng.random(kills)) / kills * calls).astype(int).tolist():
         start_anew()
         assert exit_code(context, run, out, options, kill_at=max(1, moment)) == -signal.SIGKILL
         outcomes.append(content_of(out))

@@ -61,7 +61,7 @@ def content_of(place: Path) -> dict[str, bytes]:
 def feature_of(dataset: Path, name: str, exporter: str) -> tuple[NDArray[Any], list[str]]:
     """(T, D) of a feature in the first episode of what an exporter made, and the names of its elements."""
     if exporter == "lerobot":
-        rows = np.array(data_table(dataset).column(name).to_pylist())
+        rows = np.array(data_table(dataset).column(name).to_pylist(), dtype=np.float32)
         return rows.reshape(len(rows), -1), info(dataset)["features"][name]["names"]
     with h5py.File(dataset) as file:
         stored = file["data/demo_0/obs"][name.removeprefix("observation.")]

@@ -27,7 +27,7 @@ from demorec.episode.info import Feature
 from demorec.robots.assets import asset_path
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
-from demorec.robots.so101 import SO101, SO101_FOLLOWER
+from demorec.robots.so101 import SO101_FOLLOWER
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml, read_links
 
 if TYPE_CHECKING:
@@ -166,7 +166,8 @@ def robot_of_motors(motors: Motors) -> DatasetRobot:
     """The arm that has these servos."""
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
-    urdf = robot_description(SO101.urdf, 1.0)
+    (model,) = (ROBOTS.load(name).urdf for name, arm in IN_MOTOR_UNITS.items() if arm.robot_type == motors.robot_type)
+    urdf = robot_description(model, 1.0)
     features = motor_features(motors)
     record = RobotRecord(
         name=motors.robot_type,
