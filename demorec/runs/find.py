@@ -53,6 +53,8 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
     "recordings": ("a folder of recordings", "; name one of them"),
 }
 """What each kind is called, and what to do where it was not expected."""
+IMPORT_WORDS: dict[PathKind, str] = {"dataset": "lerobot", "hdf5": "hdf5"}
+"""The word after `demorec import` by which each kind is imported that is no bag (`demorec.sources.formats`)."""
 ROSBAG2 = "metadata.yaml"
 """In a folder that is a bag of rosbag2."""
 BAG_SUFFIXES = (".db3", ".mcap.zstd", ".db3.zstd")

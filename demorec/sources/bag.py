@@ -21,9 +21,8 @@ from demorec.core.errors import ConfigError, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
 from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.scan import ScannedMessage
-from demorec.runs.find import BAG_SUFFIXES, ROSBAG2
+from demorec.runs.find import BAG_SUFFIXES, IMPORT_WORDS, ROSBAG2, find, name_of
 from demorec.sources.bag_files import MAX_TIME_NS, SQLITE_MAGIC, BagError, read_mcap, read_sqlite
-from demorec.sources.formats import importing_advice
 from demorec.sources.words import in_natural_order
 
 _SUFFIXES = (".mcap", *BAG_SUFFIXES)
@@ -115,7 +114,7 @@ def bags_in(path: Path) -> list[Path]:
     They are rosbag2 folders, MCAP and .db3 files, and those files in folders in it whose metadata.yaml was lost. A
     folder that holds none of them is given back itself.
     """
-    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or importing_advice(path):
+    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or find(path).kind in IMPORT_WORDS:
         return [path]
     found: list[Path] = []
     for entry in _entries(path):
@@ -173,9 +172,17 @@ def _kind_of(path: Path) -> bytes:
             f"This is a bag of ROS 1; rosbags-convert --src {path.name} --dst {path.stem} makes a rosbag2 folder of "
             f"it, which is read: {path}"
         )
-    if advice := importing_advice(path):
-        raise ConfigError(f"{advice}: {path}")
+    _refuse_other_formats(path)
     raise BagError(f"This is no bag: MCAP files, .db3 files and rosbag2 folders are read: {path}")
+
+
+def _refuse_other_formats(path: Path) -> None:
+    """ConfigError for what is no bag and imported by a word of its own."""
+    kind = find(path).kind
+    if kind in IMPORT_WORDS:
+        raise ConfigError(
+            f"This is {name_of(kind)}, no bag: demorec import {IMPORT_WORDS[kind]} {path} imports it: {path}"
+        ) from None
 
 
 def _folder(path: Path) -> Bag:
@@ -187,8 +194,7 @@ def _folder(path: Path) -> Bag:
         mode = str(information.get("compression_mode") or "").lower()
         compression = str(information.get("compression_format") or "")
     except FileNotFoundError:
-        if advice := importing_advice(path):
-            raise ConfigError(f"{advice}: {path}") from None
+        _refuse_other_formats(path)
         raise BagError(
             f"The folder holds no {ROSBAG2}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
             f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"

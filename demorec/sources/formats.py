@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.robots.motors import Motors
-from demorec.runs.find import PathKind, find, name_of
+from demorec.runs.find import IMPORT_WORDS, PathKind
 from demorec.sources.mapping import SourceKind
 
 if TYPE_CHECKING:
@@ -69,15 +69,15 @@ def _suggest_hdf5(path: Path) -> list[str]:
     return suggested_hdf5_mapping(path)
 
 
-FORMATS: Mapping[str, SourceFormat] = {
-    "lerobot": SourceFormat(
+_ROWS = (
+    SourceFormat(
         kind="dataset",
         name="LeRobot datasets",
         example="datasets/cups --out runs/cups",
         read=_read_lerobot,
         has_motor_units=True,
     ),
-    "hdf5": SourceFormat(
+    SourceFormat(
         kind="hdf5",
         name="HDF5 files",
         example="demo.hdf5 --mapping demo.toml --out runs/demo",
@@ -85,20 +85,8 @@ FORMATS: Mapping[str, SourceFormat] = {
         mapping="hdf5",
         suggest=_suggest_hdf5,
     ),
-}
+)
+FORMATS: Mapping[str, SourceFormat] = {IMPORT_WORDS[form.kind]: form for form in _ROWS}
 """The first word after `demorec import` -> the format."""
-
-WORD_OF: Mapping[PathKind, str] = {found.kind: word for word, found in FORMATS.items()}
-IMPORTED: tuple[PathKind, ...] = ("rosbag", *(kind for kind in WORD_OF if kind != "dataset"))
+IMPORTED: tuple[PathKind, ...] = ("rosbag", *(kind for kind in IMPORT_WORDS if kind != "dataset"))
 """Kinds of paths that no command reads as they are. Datasets are, but where recordings are needed (export)."""
-
-
-def importing_advice(path: Path) -> str:
-    """How to import what was given as a bag and is of one of the formats, as a sentence without its end; else ""."""
-    kind = find(path).kind
-    if kind not in WORD_OF:
-        return ""
-    flags = "--suggest > demo.toml writes a mapping for it"
-    if FORMATS[WORD_OF[kind]].mapping is None:
-        flags = "--out RUN makes a run of it"
-    return f"This is {name_of(kind)}, no bag: demorec import {WORD_OF[kind]} {path} {flags}"

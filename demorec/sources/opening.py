@@ -15,10 +15,10 @@ from pathlib import Path
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
-from demorec.runs.find import PathKind, find
+from demorec.runs.find import IMPORT_WORDS, PathKind, find
 from demorec.sources.bag import bags_in
 from demorec.sources.bag_files import BagError
-from demorec.sources.formats import FORMATS, IMPORTED, WORD_OF
+from demorec.sources.formats import FORMATS, IMPORTED
 from demorec.sources.import_file import dropped_lines
 from demorec.sources.import_run import import_bags
 from demorec.sources.mapping import SourceMapping
@@ -67,8 +67,8 @@ def opened(
             chosen = None
             if _needs_mapping(kind):
                 chosen = mapping or _suggested(path, kind, Path(folder) / f"{number}.toml", tell)
-            if kind in WORD_OF:
-                for line in FORMATS[WORD_OF[kind]].read([path], chosen, run, VideoConfig(), None).left_out_lines():
+            if kind in IMPORT_WORDS:
+                for line in FORMATS[IMPORT_WORDS[kind]].read([path], chosen, run, VideoConfig(), None).left_out_lines():
                     tell(line)
             elif chosen is not None:
                 _import_bag(path, chosen, run, tell)
@@ -83,9 +83,9 @@ def _import_kind(path: Path, imports_datasets: bool) -> PathKind | None:
 
 
 def _needs_mapping(kind: PathKind | None) -> bool:
-    if kind is None or kind not in WORD_OF:
+    if kind is None or kind not in IMPORT_WORDS:
         return kind == "rosbag"
-    return FORMATS[WORD_OF[kind]].mapping is not None
+    return FORMATS[IMPORT_WORDS[kind]].mapping is not None
 
 
 def _check_space(paths: Sequence[Path], folder: Path) -> None:
@@ -106,7 +106,7 @@ def _suggested(path: Path, kind: PathKind, target: Path, tell: Callable[[str], N
         ConfigError: It leaves something to the user.
     """
     doubts: list[str] = []
-    word = WORD_OF.get(kind, "")
+    word = IMPORT_WORDS.get(kind, "")
     form = FORMATS.get(word)
     lines = form.suggest(path) if form else suggested_mapping(bags_in(path)[0], doubts.append)
     target.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -125,7 +125,7 @@ def test_what_is_given_as_a_bag_gets_its_word(
     values = {"MAPPING": places["mcap with --mapping"][-1], "NEW": tmp_path / "new"}
     assert exit_code("import", path, *(values.get(flag, flag) for flag in flags)) == 2
     told = capsys.readouterr().err
-    assert f"no bag: demorec import {word} {path} --" in told
+    assert f"no bag: demorec import {word} {path} imports it" in told
     assert told.count("\n") == 1
     assert not (tmp_path / "new" / "run.json").exists()
 
