@@ -100,12 +100,14 @@ def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
 )
 def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
     """An object moves or turns only when touched, or for a moment after it (falling, rolling, tipping). What lies still
-    is woken by a force on the fingers, also in the hand's reach, by another object, or by a hand that comes within 2 mm
-    of it (boxes, spheres, cylinders, capsules).
+    is woken by a force on the fingers, also in the hand's reach, by another object, by a hand that comes within 2 mm of
+    it (boxes, spheres, cylinders, capsules), or by fingers that open or shut (meshes, of which they may have pushed one
+    aside between two frames).
 
     0.1 m/s are counted for each rad/s. Of meshes over a thirtieth of a second at least: at rest they twitch.
     """
     fps, force = episode.info.fps, episode.columns.contact_force
+    fingers_move = np.abs(np.diff(episode.columns.gripper_width)) > NEAR
     speeds = {
         name: displacement(pose[1:], pose[:-1]) * fps
         for name, pose in ((name, episode.world_from_object(name)) for name in episode.columns.object_poses)
@@ -119,8 +121,8 @@ def object_motion(episode: CheckedEpisode) -> Iterator[Found]:
         lies[lain:] = ~held_for(moving[name], lain - 1)[lain - 1 : -1]
         asleep = lies & quiet & ~np.any([rows for other, rows in moving.items() if other != name] or [~quiet], axis=0)
         is_solid = bodies[name].shape.kind in SOLID
-        if is_solid and (asleep & moving[name]).any():
-            asleep &= ~_at_hand(episode, bodies[name])
+        if (asleep & moving[name]).any():
+            asleep &= ~(_at_hand(episode, bodies[name]) if is_solid else fingers_move)
         span = 1 if is_solid else max(1, round(fps / 30))
         free, count = ~touched | asleep, max(len(touched) - span + 1, 0)
         pose = episode.world_from_object(name)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import checked, simulate
+from support.check import Spoilt, checked, level_of, simulate
 from support.commands import exit_code
 from support.tasks import QUICK_TASKS
 
@@ -74,6 +74,18 @@ def test_a_palm_that_presses_on_a_neighbour(tmp_path: Path) -> None:
     lowered = int(np.flatnonzero(numbers.contact_force)[0])
     assert np.ptp(numbers.object_poses["blue_cube"][:lowered, 1]) > 0.001
     assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+
+
+def test_fingers_that_push_a_mesh_aside_as_they_shut(tmp_path: Path) -> None:
+    """It moves by 2 mm between two frames in which no finger touches it; earlier, that is a fault."""
+    path = simulate(tmp_path / "e.mcap", task="pick_anything", variation="full", fps=10, seed=98000, episode_index=4)
+    spoilt = Spoilt(path)
+    force, poses = spoilt.columns.contact_force, spoilt.columns.object_poses["purple_cross"]
+    step = int(np.flatnonzero(np.abs(np.diff(poses[:, 1])) > 0.001)[0])
+    assert not force[step - 1 : step + 3].any()
+    assert [r for r in checked(path).results if r.level in ("warn", "fail")] == []
+    spoilt.pose_of("purple_cross", np.where(np.arange(len(poses))[:, None] < step - 3, poses, poses[[step + 1]]))
+    assert level_of(spoilt.write(tmp_path / "early.mcap"), "object_motion") != "pass"
 
 
 def test_an_attempt_that_ended_at_once(tmp_path: Path) -> None:
