@@ -518,7 +518,7 @@ def test_jpeg_files_must_be_whole(name: str, tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("import", "hdf5"), "Name HDF5 files"),
+        (("import", "hdf5"), "Name an HDF5 file"),
         (("import", "hdf5", "demo.hdf5"), "An import needs --mapping and --out"),
         (("import", "hdf5", "demo.toml", "--suggest"), "The file is no recording"),
         (("import", "hdf5", "none.hdf5", "--suggest"), "There is no such file"),
