@@ -40,9 +40,9 @@ _STEADY = 5
 """Frames whose median torque is that of the weight alone."""
 _OFTEN, _OWN_INERTIA = 0.9, 0.15
 """Share of the frames by whose worst efforts are judged; of a motor's peak that its links' own inertia may make."""
-_FIRM = 6
-"""Times the root mean square of what noise shakes a joint that its weight must be: their links' own inertia, which is
-left out, makes up to 0.56 of that (of the third joint of a Panda)."""
+_SHAKEN = 7
+"""Times what noise shakes a joint, the least unit of its efforts: of that the links' own inertia, which is left out,
+makes up to 0.86 in a tenth of the frames and 2.07 in single ones (third joint of a Panda)."""
 _AROUND = 6
 """Frames before and after a peak of the contact force in which it must be the only one."""
 _MOVES = 0.3
@@ -211,7 +211,7 @@ def effort_in_each_frame(episode: CheckedEpisode) -> Found:
     rows = servo.dynamics.is_judged
     for index in np.flatnonzero(servo.is_loaded):
         off = np.abs(episode.columns.joint_effort[rows, index] - servo.torque[rows, index])
-        share = float(np.quantile(off, _OFTEN) / servo.usual[index])
+        share = float(np.quantile(off, _OFTEN) / max(servo.usual[index], _SHAKEN * servo.shaken[index]))
         found.append(
             Measurement(value=share, detail=f"{episode.info.robot.arm_joints[index]}, {int(rows.sum())} frames")
         )
@@ -224,12 +224,14 @@ class _Servo(NamedTuple):
     Attributes:
         torque: (T, n) N m.
         usual: (n,) N m, root mean square over the frames that are judged.
-        is_loaded: (n,) whether the joint bears far more weight than noise shakes it.
+        shaken: (n,) N m, root mean square of what is left of it beside its slow part: what noise shakes.
+        is_loaded: (n,) whether the weight that the joint bears is more than noise shakes it.
         dynamics: Which frames are judged; of the hand.
     """
 
     torque: Array
     usual: Array
+    shaken: Array
     is_loaded: NDArray[np.bool_]
     dynamics: Dynamics
 
@@ -249,7 +251,8 @@ def _servo(episode: CheckedEpisode) -> _Servo | NotMeasured:
     return _Servo(
         torque=torque,
         usual=np.sqrt((torque[rows] ** 2).mean(axis=0)),
-        is_loaded=np.median(np.abs(steady), axis=0) >= np.maximum(MIN_LOAD, _FIRM * shaken),
+        shaken=shaken,
+        is_loaded=np.median(np.abs(steady), axis=0) >= np.maximum(MIN_LOAD, shaken),
         dynamics=dynamics,
     )
 
@@ -292,8 +295,11 @@ def _peaks_of_motors(episode: CheckedEpisode, servo: _Servo) -> tuple[Array, Arr
     effort = episode.columns.joint_effort[:, : episode.num_arm]
     peaks = _peaks(effort - servo.torque) - _OWN_INERTIA * _peaks(servo.torque)
     peaks *= _weight_near_limit(episode)[:, None]
-    of_loaded = np.where(servo.is_loaded, peaks / np.maximum(servo.usual, 1e-12), 0.0).max(axis=1)
-    return of_loaded, np.maximum(of_loaded, peaks.max(axis=1) / max(float(servo.usual.max()), 1e-12))
+    of_loaded = np.where(servo.is_loaded, peaks, 0.0)
+    of_all = (of_loaded / np.maximum(servo.usual, 1e-12)).max(axis=1)
+    of_all = np.maximum(of_all, peaks.max(axis=1) / max(float(servo.usual.max()), 1e-12))
+    unit = np.maximum(np.maximum(servo.usual, _SHAKEN * servo.shaken), 1e-12)
+    return (of_loaded / unit).max(axis=1), of_all
 
 
 def _peaks_of_wrench(episode: CheckedEpisode, hand: _Hand, servo: _Servo) -> Array:
