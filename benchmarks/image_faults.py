@@ -551,7 +551,9 @@ class Stranger:
 
 def judge_stranger(subject: Stranger) -> list[Result]:
     """What the laws of images over time say."""
-    names = [name for name in CHECKS.names() if CHECKS.load(name).measure.__module__.endswith(".over_time")]
+    names = [
+        name for name in CHECKS.names() if CHECKS.load(name).measure.__module__.endswith((".over_time", ".repeats"))
+    ]
     return [CHECKS.load(name).run(subject) for name in (*names, "images_show_something", "distinct_cameras")]
 
 
