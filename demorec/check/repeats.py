@@ -10,7 +10,6 @@ from demorec.check.base import Found, Measurement, NotMeasured
 from demorec.check.evidence import Flags
 from demorec.check.films import Film, Filmed, difference
 from demorec.check.over_time import CHANGES, FEWEST_IMAGES, MOVING, film_check, moving
-from demorec.check.rows import longest_run
 
 _NEARLY, _NEARLY_COUNTS, _CATCHES_UP = 0.05, 0.25, 2.0
 """Share of the usual change at a speed below which an image is nearly the same; what counts of such a time: of clean
@@ -56,22 +55,29 @@ def frozen_images(subject: Filmed) -> Iterator[Found]:
         usual = float(np.median(np.concatenate(shown))) if any(map(len, shown)) else 0.0
         for (film, _), step in zip(known, steps, strict=True):
             same, moves = (film.cells[1:] == film.cells[:-1]).all(axis=(1, 2, 3)), step > limit
-            # Where nothing moves, the same image again says nothing, and ends no run.
-            length, start = longest_run(same | ~moves)
+            frames, begin, end = _longest(film, same, moves)
+            nearly, other, _ = _longest(film, film.step <= _NEARLY * usual * step, moves)
+            frame, first = max((frames, begin), (_NEARLY_COUNTS * nearly, other))
+            found.append(Measurement(value=frame / film.fps, frame=int(film.frames[first]) + 1, detail=film.where))
             run = np.zeros(len(same), dtype=np.bool_)
-            run[start : start + length] = True
-            frames = np.diff(film.frames)[same & moves & run].sum() * _catches_up(film, moves, start, start + length)
-            length, begin = longest_run((film.step <= _NEARLY * usual * step) | ~moves)
-            nearly = (
-                _NEARLY_COUNTS * moves[begin : begin + length].sum() * _catches_up(film, moves, begin, begin + length)
-            )
-            seconds, first = max((frames / film.fps, start), (nearly / film.fps, begin))
-            found.append(Measurement(value=seconds, frame=int(film.frames[first]) + 1, detail=film.where))
+            run[begin:end] = True
             hidden, others = hidden + int((same & moves & ~run).sum()), others + int((moves & ~run).sum())
         if hidden > 0.2 * others:
             yield NotMeasured(why=f"{camera} hardly sees the robot move")
         else:
             yield from found
+
+
+def _longest(film: Film, same: Flags, moves: Flags) -> tuple[int, int, int]:
+    """For how many frames the robot moves in the longest time of the same image, and where in the film that is.
+
+    Where nothing moves, the same image again says nothing, and ends no such time.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same | ~moves, [False]]).astype(np.int8)))
+    count = np.concatenate([[0], np.cumsum(np.diff(film.frames) * (same & moves))])
+    times = [(int(count[end] - count[begin]), int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
+    hung = (time for time in sorted(times, reverse=True) if time[0] and _catches_up(film, moves, time[1], time[2]))
+    return next(hung, (0, 0, 0))
 
 
 def _catches_up(film: Film, moves: Flags, begin: int, end: int) -> bool:
