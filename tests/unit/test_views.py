@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from demorec.check.base import Measurement
 from demorec.check.films import Film
+from demorec.check.repeats import frozen_images
 from demorec.check.views import views_alike, views_stay
 
 Views = NDArray[np.float64]
@@ -74,3 +75,27 @@ def test_a_camera_that_was_nudged_before_one_episode(seed: int) -> None:
 
 def test_images_of_a_single_row_of_parts_have_no_edges() -> None:
     assert values(views_alike, room(8, 0)[:, :1]) == [0]
+
+
+@pytest.mark.parametrize("hangs_at", [20, 110])
+def test_a_short_hang_is_found_beside_a_longer_rest(hangs_at: int) -> None:
+    """A square goes with the robot, which rests for three seconds between two motions; the camera hangs for 1.2 s."""
+    where = np.concatenate([np.arange(60), np.full(30, 60), np.arange(60, 120)]) / 120
+    images = np.full((len(where), 28, 28, 3), 90, dtype=np.uint8)
+    images += np.random.default_rng(0).integers(0, 3, images.shape, dtype=np.uint8) * (np.gradient(where) > 0)[
+        :, None, None, None
+    ].astype(np.uint8)
+    for image, place in zip(images, where, strict=True):
+        image[10:16, round(22 * place) : round(22 * place) + 6] = 200
+
+    def seconds(cells: NDArray[np.uint8]) -> float:
+        film = Film(where="front", fps=10, cells=cells, detail=np.ones(len(cells)), frames=np.arange(len(cells)),
+                    state=where[:, None])  # fmt: skip
+        found = frozen_images.measure(SimpleNamespace(films={"front": [film]}))
+        assert isinstance(found, Measurement)
+        return found.value
+
+    assert seconds(images) < 0.33
+    hung = images.copy()
+    hung[hangs_at : hangs_at + 12] = hung[hangs_at]
+    assert seconds(hung) == pytest.approx(1.1)
