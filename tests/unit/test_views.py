@@ -82,9 +82,8 @@ def test_a_short_hang_is_found_beside_a_longer_rest(hangs_at: int) -> None:
     """A square goes with the robot, which rests for three seconds between two motions; the camera hangs for 1.2 s."""
     where = np.concatenate([np.arange(60), np.full(30, 60), np.arange(60, 120)]) / 120
     images = np.full((len(where), 28, 28, 3), 90, dtype=np.uint8)
-    images += np.random.default_rng(0).integers(0, 3, images.shape, dtype=np.uint8) * (np.gradient(where) > 0)[
-        :, None, None, None
-    ].astype(np.uint8)
+    moves = np.gradient(where) > 0
+    images[moves] += np.random.default_rng(0).integers(0, 3, images[moves].shape, dtype=np.uint8)
     for image, place in zip(images, where, strict=True):
         image[10:16, round(22 * place) : round(22 * place) + 6] = 200
 
