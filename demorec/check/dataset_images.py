@@ -40,22 +40,31 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
         if not images:
             continue
         told, weights = stats.get(key, {}), [p.count for p in images]
-        mean = np.average([p.mean for p in images], axis=0, weights=weights)
-        squares = [p.std**2 + p.mean**2 for p in images]
-        std = np.sqrt(np.maximum(np.average(squares, axis=0, weights=weights) - mean**2, 0.0))
-        yield _off_colour(told.get("mean"), mean, key)
-        yield _off_colour(told.get("std"), std, f"deviation of {key}")
+        own = [np.concatenate([p.mean, p.std]) for p in images]
+        of_all = _pooled(own, weights)
+        yield _off_colour(told.get("mean"), of_all[:3], key)
+        yield _off_colour(told.get("std"), of_all[3:], f"deviation of {key}")
         yield _disordered(told, stats, key)
-        own = [(*p.mean, *p.std) for p in images]
         columns = [episode_column(dataset, f"stats/{key}/{quantity}") for quantity in ("mean", "std")]
         for quantity, stated in zip(("mean", "std"), columns, strict=True):
             for number, (said, p) in enumerate(zip(stated, images, strict=False)):
                 yield _off_colour(said, getattr(p, quantity), f"{quantity} of {key}, episode {number}")
         stated = [np.concatenate([numbers_of(said) for said in pair]) for pair in zip(*columns, strict=True)]
         yield _exchanged(stated, own, [f"{key}, episode {number}" for number in range(len(own))])
-        of_cameras[key] = (*numbers_of(told.get("mean")), *numbers_of(told.get("std"))), (*mean, *std)
-    said, true = [pair[0] for pair in of_cameras.values()], [pair[1] for pair in of_cameras.values()]
-    yield _exchanged(said, true, list(of_cameras))
+        said = np.concatenate([numbers_of(told.get("mean")), numbers_of(told.get("std"))])
+        known = len(stated) == len(own) and all(one.shape == of_all.shape for one in stated)
+        of_cameras[key] = said, of_all, _pooled(stated, weights) if known else of_all
+    # LeRobot merges the episodes' own, which are nearer to what it says of all than images that were encoded.
+    for true in (1, 2):
+        yield _exchanged([c[0] for c in of_cameras.values()], [c[true] for c in of_cameras.values()], list(of_cameras))
+
+
+def _pooled(parts: Sequence[Array], weights: Sequence[int]) -> Array:
+    """(6,) mean and deviation of three colours of all, by those of each part."""
+    means, deviations = np.array(parts)[:, :3], np.array(parts)[:, 3:]
+    mean = np.average(means, axis=0, weights=weights)
+    squares = np.average(deviations**2 + means**2, axis=0, weights=weights)
+    return np.concatenate([mean, np.sqrt(np.maximum(squares - mean**2, 0.0))])
 
 
 def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
@@ -66,7 +75,7 @@ def _off_colour(said: Any, true: Array, detail: str) -> Measurement:
     return Measurement(value=float(off.max()), detail=detail)
 
 
-def _exchanged(said: Sequence[Sequence[float]], true: Sequence[Sequence[float]], names: Sequence[str]) -> Measurement:
+def _exchanged(said: Sequence[Array], true: Sequence[Array], names: Sequence[str]) -> Measurement:
     """Whether the colours that are said of one are those of another, and the other way round; 1 for such a pair."""
     doubtful = []
     for told, own, name in zip(said, true, names, strict=False):
@@ -78,7 +87,7 @@ def _exchanged(said: Sequence[Sequence[float]], true: Sequence[Sequence[float]],
     return Measurement(value=0.0, detail="")
 
 
-def _mean_off(told: Sequence[float], true: Sequence[float]) -> float:
+def _mean_off(told: Array, true: Array) -> float:
     """Mean difference; what is NaN in `true` is not known."""
     return float(np.nanmean(np.abs(np.subtract(told, true))))
 

@@ -52,6 +52,13 @@ class Film:
         return difference(self.cells[1:], self.cells[:-1])
 
     @cached_property
+    def speed(self) -> Array | None:
+        """(N - 1,) how far the state goes from image to image, in standard deviations of its elements."""
+        if self.state is None:
+            return None
+        return np.asarray(np.linalg.norm(np.diff(self.state / (self.state.std(axis=0) + 1e-3), axis=0), axis=1))
+
+    @cached_property
     def flat(self) -> NDArray[np.bool_]:
         """(N,) images of one colour."""
         return np.asarray(self.cells.std(axis=(1, 2)).max(axis=1, initial=0.0) < _BLANK_LEVELS)
@@ -81,7 +88,7 @@ class Film:
         found, unrest = self._gains
         if math.isnan(unrest):
             return NotMeasured(why=f"most of what {self.where} shows is black or white")
-        return found if unrest <= _STANDS else NotMeasured(why=f"{self.where} moves")
+        return found if unrest <= STANDS else NotMeasured(why=f"{self.where} moves")
 
     @property
     def unrest(self) -> float:
@@ -104,7 +111,7 @@ class Film:
         return np.array(gains), float(np.quantile(np.max(stays, axis=0), 0.9))
 
 
-_STANDS = 0.02
+STANDS = 0.02
 """Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
 _DIFFERENT, _ALIKE = 0.9, 0.98
 """Correlations of two cameras that show different things, and of one whose images were encoded twice."""

@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
 from demorec.check.evidence import Flags
-from demorec.check.films import Film, Filmed, difference, turned
+from demorec.check.films import STANDS, Film, Filmed, difference, turned
 from demorec.core.geometry import Array
 
-_ALIEN_LEVELS, _ALIEN_TIMES = 6.0, 4.0
+_ALIEN_LEVELS, _ALIEN_TIMES = 2.5, 4.0
 """An image from elsewhere differs so much from both of its neighbours, and so many times more than they do."""
+_CLEAR_LEVELS = 6.0
+"""The same where nobody knows how the robot moved; and views that turned differ by as much."""
+_BESIDE_CUT, _SLOW, _LEAST_SHOWN = 4, 0.3, 1.0
+"""Images on either side that a change is compared with; what is added to the robot's speed, of its root mean square,
+since other things move, too; and levels that the images beside are taken to change at least."""
 _BESIDE = 4
 """Images before and after a jump whose medians are compared."""
 _SAME_LEVELS, _LEAST_DETAIL = 0.7, 10.0
@@ -42,8 +47,8 @@ _SMOOTH = 3
 """Frames over which courses are averaged."""
 _FEWEST_EPISODES = 3
 FEWEST_IMAGES = 20
-_LEAST_UNREST = 0.005
-"""Share of change below which a camera is as still as any."""
+_LEAST_UNREST, _LESS_STILL = 0.005, 2.5
+"""Share of change below which a camera is as still as any, and times by which one that moves is less still at least."""
 _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
 CHANGES = 1.5
@@ -79,14 +84,12 @@ def _alien(film: Film) -> Flags:
     if len(alien) < 3:
         return alien
     least = np.minimum(film.step[:-1], film.step[1:])
-    alien[1:-1] = (least > _ALIEN_LEVELS) & (least > _ALIEN_TIMES * difference(film.cells[2:], film.cells[:-2]))
-    if not alien.any() or film.state is None:
+    levels = _CLEAR_LEVELS if film.speed is None else _ALIEN_LEVELS
+    alien[1:-1] = (least > levels) & (least > _ALIEN_TIMES * difference(film.cells[2:], film.cells[:-2]))
+    if not alien.any() or film.state is None or film.speed is None or not (moves := moving(film.speed)).any():
         return alien
     state = film.state / (film.state.std(axis=0) + 1e-3)
-    speed = np.linalg.norm(np.diff(state, axis=0), axis=1)
-    if not (moves := moving(speed)).any():
-        return alien
-    shown = float(np.quantile(film.step[moves] / speed[moves], 0.9))
+    shown = float(np.quantile(film.step[moves] / film.speed[moves], 0.9))
     there_and_back = np.linalg.norm(state[1:-1] - (state[2:] + state[:-2]) / 2, axis=1)
     explained = np.maximum(shown * there_and_back, 1e-9)
     beside = np.maximum(np.pad(film.step[:-2], (1, 0)), np.pad(film.step[2:], (0, 1)))
@@ -100,7 +103,7 @@ def moving(speed: Array) -> Flags:
 
 
 @film_check(
-    measures="times as much as in any other frame that a camera's images change in one",
+    measures="times what the images beside show of the robot's motion that a camera's images change in one frame",
     warn=4.0,
     fail=float("inf"),
 )
@@ -110,12 +113,25 @@ def image_cuts(subject: Filmed) -> Iterator[Found]:
     for film in _all(subject):
         if len(film.cells) < FEWEST_IMAGES or film.is_blank:
             continue
-        row = int(np.argmax(film.step))
-        others = np.delete(film.step, slice(max(row - 1, 0), row + 2))
-        beside = float(film.step[max(row - 1, 0) : row + 2].min())  # of a cut, one at least is as usual
-        usual = max(float(others.max()), beside, CHANGES)
-        times = float(film.step[row] / usual) if film.step[row] > _ALIEN_LEVELS else 1.0
-        yield Measurement(value=times, frame=int(film.frames[row + 1]), detail=film.where)
+        times = _times_beside(film)
+        row = int(np.argmax(times))
+        yield Measurement(value=float(times[row]), frame=int(film.frames[row + 1]), detail=film.where)
+
+
+def _times_beside(film: Film) -> Array:
+    """(N - 1,) times what the images beside it show of the robot's speed that each change shows; where the speed is
+    not known, times what any other shows."""
+    if film.speed is None:
+        way, reach, least = np.ones_like(film.step), len(film.step), CHANGES
+    else:
+        way = film.speed + _SLOW * float(np.sqrt((film.speed**2).mean())) + 1e-9
+        reach, least = _BESIDE_CUT, _LEAST_SHOWN
+    shown, times = film.step / way, np.ones_like(film.step)
+    for row in np.flatnonzero(film.step > least).tolist():
+        around = np.concatenate([shown[max(row - reach, 0) : max(row - 1, 0)], shown[row + 2 : row + 1 + reach]])
+        beside = shown[max(row - 1, 0) : row + 2].min()  # of a cut, one at least is as usual
+        times[row] = shown[row] / max(float(around.max()), float(beside), least / way[row])
+    return times
 
 
 @film_check(
@@ -131,7 +147,7 @@ def images_stay_upright(subject: Filmed) -> Iterator[Found]:
         row = int(np.argmax(film.step[_BESIDE - 1 : -_BESIDE + 1])) + _BESIDE
         before, after = (np.median(film.cells[a:b], axis=0) for a, b in ((row - _BESIDE, row), (row, row + _BESIDE)))
         as_is, *otherwise = (float(np.abs(after - view).mean()) for view in (before, *turned(before)))
-        times = as_is / max(min(otherwise), 1.0) if as_is > _ALIEN_LEVELS else 1.0
+        times = as_is / max(min(otherwise), 1.0) if as_is > _CLEAR_LEVELS else 1.0
         yield Measurement(value=times, frame=int(film.frames[row]), detail=film.where)
 
 
@@ -262,12 +278,13 @@ def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
             continue
         views = [np.median([film.first_view for film in side], axis=0) for side in zip(*films, strict=True)]
         stand = np.array([(a.stands, b.stands) for a, b in films])
-        usually = stand.mean(axis=0) > 0.5
         unrest = np.log(np.fmax([(a.unrest, b.unrest) for a, b in films], _LEAST_UNREST))
-        off = np.abs(unrest[:, :, None] - np.median(unrest, axis=0))  # of each camera from both cameras' usual one
+        usual = np.median(unrest, axis=0)
+        off = np.abs(unrest[:, :, None] - usual)  # of each camera from both cameras' usual one
         nearer = (off[:, 0, 1] < off[:, 0, 0]) & (off[:, 1, 0] < off[:, 1, 1])
-        moved = (stand == usually[::-1]).all(axis=1) & (usually[0] != usually[1]) & nearer
-        for (a, b), is_moved in zip(films, moved, strict=True):
+        is_known = abs(usual[0] - usual[1]) > math.log(_LESS_STILL)
+        moved = (stand == (usual <= math.log(STANDS))[::-1]).all(axis=1) & (stand[:, 0] != stand[:, 1]) & nearer
+        for (a, b), is_moved in zip(films, moved & is_known, strict=True):
             count = min(len(a.cells), len(b.cells))
             one_cells, other_cells = a.cells[:count], b.cells[:count]
             as_named = difference(one_cells, views[0][None]) + difference(other_cells, views[1][None])

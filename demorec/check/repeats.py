@@ -128,9 +128,7 @@ def _repeats(films: Sequence[Film], least: float) -> tuple[list[int], int]:
 
 def _robot_moves(film: Film) -> Flags:
     """(N - 1,) from which image to the next the robot moves; all, where its state is not known."""
-    if film.state is None:
-        return np.ones(len(film.step), dtype=np.bool_)
-    return moving(np.linalg.norm(np.diff(film.state / (film.state.std(axis=0) + 1e-3), axis=0), axis=1))
+    return np.ones(len(film.step), dtype=np.bool_) if film.speed is None else moving(film.speed)
 
 
 @film_check(

@@ -204,6 +204,7 @@ FAILS = (
     "exchanged_cameras",
     "distinct_cameras",
     "dataset_image_statistics",
+    "stray_images",
 )
 
 
@@ -238,6 +239,18 @@ def bars(images: Images) -> Images:
 
 def gray(images: Images) -> Images:
     return np.repeat(images.mean(axis=3, keepdims=True), 3, axis=3)
+
+
+def of_another_moment(images: Images) -> Images:
+    images[-8] = images[len(images) // 2]
+    return images
+
+
+def nearly_the_same_colours(dataset: Path) -> None:
+    """Brighter by seven levels: little more than encoding and a sample of the images make of them."""
+    loose.put_images(dataset, WRIST, (np.minimum(loose.images_of(dataset, FRONT), 248) + 7).astype(np.uint8))
+    assert level_of(dataset, "dataset_image_statistics", "dataset") == "pass"
+    stats(lambda data: data.update({FRONT: data[WRIST], WRIST: data[FRONT]}))(dataset)
 
 
 FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
@@ -284,9 +297,13 @@ FILMED_FAULTS: dict[str, tuple[Fault, str]] = {
     "a last image from elsewhere": (
         film(FRONT, lambda r: np.concatenate([r[:-1], np.roll(r[-1:], 24, axis=1)])), "image_cuts"
     ),
+    "an image of another moment, by a camera that stands": (film(FRONT, of_another_moment), "stray_images"),
     "gray images in one episode": (film(FRONT, pixels(gray)), "views_upright"),
     "statistics of two cameras exchanged": (
         stats(lambda data: data.update({FRONT: data[WRIST], WRIST: data[FRONT]})), "dataset_image_statistics"
+    ),
+    "statistics of two cameras exchanged that show nearly the same colours": (
+        nearly_the_same_colours, "dataset_image_statistics"
     ),
     "every second image is made of its neighbours": (
         film(FRONT, lambda r: halved(r.astype(np.float32)), only=None), "interpolated_images"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy import ndimage
 
 from demorec.check.base import Measurement
 from demorec.check.films import Film
+from demorec.check.over_time import exchanged_cameras
 from demorec.check.repeats import frozen_images
 from demorec.check.views import views_alike, views_stay
 
@@ -29,14 +31,14 @@ def room(count: int, seed: int) -> Views:
     return views
 
 
-def values(law: Any, views: Views) -> list[float]:
-    """What a law finds in a dataset whose films show these views, 30 images each."""
+def values(law: Any, views: Views, detail: Sequence[float] = ()) -> list[float]:
+    """What a law finds in a dataset whose films show these views, 30 images each, of so much detail."""
     films = [
         Film(
             where=f"front, episode {number}",
             fps=10,
             cells=np.repeat(np.rint(view)[None], 30, axis=0).astype(np.uint8),
-            detail=np.ones(30),
+            detail=np.full(30, detail[number] if detail else 1.0),
             frames=np.arange(30),
             state=None,
         )
@@ -73,8 +75,48 @@ def test_a_camera_that_was_nudged_before_one_episode(seed: int) -> None:
     assert values(views_alike, np.concatenate([views[:3], moved(views[3:4], 0.5), views[4:]])) == [1]
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_camera_out_of_focus_in_one_episode(seed: int) -> None:
+    """Which takes four fifths of the mean square of the detail, where light makes it differ by a twentieth."""
+    rng = np.random.default_rng(seed)
+    views, detail = np.repeat(room(1, seed), 8, axis=0), (200 * rng.uniform(0.95, 1.05, 8)).tolist()
+    assert values(views_alike, views, detail) == [0]
+    assert values(views_alike, views, [*detail[:5], 0.2 * detail[5], *detail[6:]]) == [1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_nearer_has_more_detail_and_more_contrast(seed: int) -> None:
+    views, shares = room(8, seed), np.random.default_rng(seed).uniform(0.3, 1.0, 8)
+    nearer = 100 + shares[:, None, None, None] * (views - 100)
+    assert values(views_alike, nearer, (200 * shares**2).tolist()) == [0]
+
+
 def test_images_of_a_single_row_of_parts_have_no_edges() -> None:
     assert values(views_alike, room(8, 0)[:, :1]) == [0]
+
+
+def test_cameras_exchanged_in_one_episode_where_one_hardly_moves_and_is_not_always_still() -> None:
+    """By how little the views of one change, with a light and things that differ from one episode to the next."""
+    rng = np.random.default_rng(0)
+    unrest = {"front": [0.015, 0.3, 0.01, 0.031], "wrist": [0.3, 0.015, 0.2, 0.3]}
+    where = {"front": [0, 1, 2, 3], "wrist": [4, 5, 6, 7]}
+
+    def film(camera: str, number: int) -> Film:
+        view = room(1, where[camera][number])[0]
+        cells = view * (1 + rng.normal(0, unrest[camera][number], (40, *view.shape)))
+        return Film(where=f"{camera}, episode {number}", fps=10, cells=np.clip(np.rint(cells), 0, 255).astype(np.uint8),
+                    detail=np.ones(40), frames=np.arange(40), state=None)  # fmt: skip
+
+    films = {camera: [film(camera, number) for number in range(4)] for camera in unrest}
+
+    found = exchanged_cameras.measure(SimpleNamespace(films=films))
+    assert isinstance(found, Measurement)
+    assert (found.value, found.detail) == (40, "front, episode 1 and wrist")
+    for camera, shown in films.items():
+        shown[1] = film(camera, 0)
+    found = exchanged_cameras.measure(SimpleNamespace(films=films))
+    assert isinstance(found, Measurement)
+    assert found.value == 0
 
 
 @pytest.mark.parametrize("hangs_at", [20, 110])
