@@ -52,7 +52,7 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
         stated = [np.concatenate([numbers_of(said) for said in pair]) for pair in zip(*columns, strict=True)]
         yield _exchanged(stated, own, [f"{key}, episode {number}" for number in range(len(own))])
         said = np.concatenate([numbers_of(told.get("mean")), numbers_of(told.get("std"))])
-        known = len(stated) == len(own) and all(one.shape == of_all.shape for one in stated)
+        known = len(stated) == len(own) and all(one.shape == of_all.shape and (abs(one) <= 1).all() for one in stated)
         of_cameras[key] = said, of_all, _pooled(stated, weights) if known else of_all
     # LeRobot merges the episodes' own, which are nearer to what it says of all than images that were encoded.
     for true in (1, 2):
