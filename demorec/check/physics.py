@@ -201,10 +201,11 @@ def gripper_width(episode: CheckedEpisode) -> Iterator[Found]:
     unit="rad",
 )
 def command_tracking(episode: CheckedEpisode) -> Measurement | None:
-    """The arm goes where it is sent, rad: catches commands of another episode, of another joint, or made up."""
-    c = episode.columns
+    """The arm goes where it is sent, rad, unless a motor is at its limit: catches commands of another episode, of
+    another joint, or made up."""
+    c, (is_free, _) = episode.columns, episode.shared(_by_servo)
     off = np.abs(c.joint_position[1:, : episode.num_arm] - c.command_joint_target[:-1])
-    return worst_entry(off, episode.info.robot.arm_joints, first=1)
+    return worst_entry(np.where(is_free, off, 0.0), episode.info.robot.arm_joints, first=1)
 
 
 @physics_check(

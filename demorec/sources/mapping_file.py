@@ -29,7 +29,12 @@ _DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{16}}")
 
 
 def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
-    """A mapping of bags, or of HDF5 files, from its TOML file; ConfigError says all that is wrong with it at once."""
+    """A mapping of bags, or of HDF5 files, from its TOML file.
+
+    Raises:
+        ConfigError: All keys that are unknown, else all values of a wrong type, else all that is impossible: the former
+            often cause the latter.
+    """
     try:
         text = read_text_limited(path, _MAX_FILE_BYTES)
         if _DEEP_KEY.search(text):

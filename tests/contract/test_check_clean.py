@@ -56,6 +56,7 @@ def test_every_robot_and_variation(robot: str, variation: str, tmp_path: Path) -
         {"task": "sort_by_color", "robot": "iiwa", "variation": "full", "fps": 60, "seed": 92000, "episode_index": 4},
         {"task": "place_in_tray", "variation": "full", "fps": 60, "seed": 92000, "episode_index": 19},
         {"task": "tutorial", "variation": "mild", "fps": 48, "seed": 92000, "episode_index": 44},
+        {"task": "tutorial", "variation": "full", "fps": 30, "seed": 100000, "episode_index": 16},
         {"task": "pick_shapes", "variation": "full", "fps": 20, "seed": 98000, "episode_index": 60},
         {"task": "stack_three", "robot": "so101", "variation": "mild", "fps": 10, "seed": 594510, "episode_index": 8},
     ],

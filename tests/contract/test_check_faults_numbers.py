@@ -277,6 +277,8 @@ CASES: list[tuple[str, Fault, str]] = [
     ("random actions", column("action_joint_target", random_targets), "action_lag"),
     ("random labels", column("action_joint_target", random_targets), "action_matches_command"),
     ("commands of another motion", column("command_joint_target", backwards), "command_tracking"),
+    ("commands of a joint that are off for ten frames", column("command_joint_target", plus(np.s_[40:50, 1], 0.13)),
+     "command_tracking"),
     ("effort that is no number", column("joint_effort", plus(np.s_[40, 3], math.nan)), "finite_numbers"),
     ("wrench that is no number", wrench(plus(np.s_[40, 5], math.nan)), "finite_numbers"),
     ("wrench of the load", wrench(inverted), "wrench_bears_the_hand"),
