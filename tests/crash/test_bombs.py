@@ -62,8 +62,8 @@ def empty_records(good: Path, path: Path) -> None:
 
 
 def empty_messages(good: Path, path: Path) -> None:
-    """Two million messages on a topic that is there."""
-    content = message_record(2, 0, b"") * 1_900_000
+    """Four million messages on a topic that is there."""
+    content = message_record(2, 0, b"") * 1_300_000
     chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
     path.write_bytes(rewritten(good, extra_chunks=[chunk] * 3))
 
