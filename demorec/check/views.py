@@ -26,8 +26,9 @@ the usual is 0.4, of a lens out of focus by 1.3); mean square of 255 that is add
 _EDGES_OF_SESSION = 0.65
 """What counts of how many times edges change from one episode on: of 870 drawn sets of 12 clean ones 4.3 at most."""
 _FEWEST_TO_TURN = 3
-_GRAY_LEVELS, _COLOURED_LEVELS = 1.0, 5.0
-"""Of 255, mean difference of red, green and blue in gray images, and in coloured ones at least."""
+_GRAY_LEVELS, _COLOURED_LEVELS = 5.0, 5.0
+"""Of 255, difference of red, green and blue in any part of gray images at most, and in the mean of coloured ones at
+least: a camera may begin above a gray table."""
 _BLACK, _BARS = 6, 0.05
 """Levels of 255 below which a part is black in all of an episode's images, and the share of such parts in bars."""
 _ONE_FILM = 1.15
@@ -141,7 +142,8 @@ def views_upright(dataset: Dataset) -> Iterator[Found]:
             usual = _usual(views, number)
             otherwise = min(float(_difference(view, other)) for other in turned(usual))
             times = float(_difference(view, usual)) / max(otherwise, _LEVELS)
-            if np.ptp(view, axis=-1).mean() < _GRAY_LEVELS < _COLOURED_LEVELS < np.ptp(usual, axis=-1).mean():
+            is_gray = bool(np.ptp(film.cells, axis=-1).max() < _GRAY_LEVELS)
+            if is_gray and np.ptp(usual, axis=-1).mean() > _COLOURED_LEVELS:
                 times = math.inf
             if bars[number] > _BARS and np.median(bars) == 0:
                 times = math.inf
