@@ -23,6 +23,9 @@ _QUICK, _SLOW = 0.5, 0.01
 _STEPS = 30
 """Finest steps that an element goes in an episode if it moves."""
 
+_STIRS = 1e-3
+"""Of an element's root mean square step: what changes by less rests, as a simulated arm does that settles."""
+
 
 @motion_check(
     measures="share of frames that repeat the one before, number by number, while the arm moves",
@@ -38,7 +41,8 @@ def repeated_frames(subject: Moving) -> Iterator[Found]:
         tables = [motion.state, *motion.sensors.values(), *([] if motion.action is None else [motion.action])]
         rows = np.column_stack([table.reshape(len(table), -1) for table in tables])
         same = ((rows[1:] == rows[:-1]) | np.isnan(rows[1:])).all(axis=1)
-        changes = (motion.state[1:] != motion.state[:-1]).any(axis=1)
+        steps = np.abs(np.diff(motion.state, axis=0))
+        changes = (steps > _STIRS * np.sqrt((steps**2).mean(axis=0))).any(axis=1)
         moves = _is_quick(motion)[1:]
         moves[1:-1] |= changes[:-2] & changes[2:]
         wrong = same if motion.contact is not None else same & moves

@@ -101,7 +101,9 @@ def test_a_damaged_one_is_not_taken_for_drawn(run: Path, tmp_path: Path) -> None
     assert target.read_bytes() == whole
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_ended_from_outside_it_is_quiet_and_goes_on(tmp_path: Path, number: signal.Signals) -> None:
     """With two workers, which hold semaphores that Python would call leaked. The last recording takes seconds."""
     run, out = make_run(tmp_path / "run", (3, 3, 40), cameras=("front",)), tmp_path / "out"

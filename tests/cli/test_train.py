@@ -107,7 +107,8 @@ def test_lerobots_parser_takes_the_configs(path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["act_numbers", pytest.param("images", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["act_numbers", "images"])
 def test_the_losses_are_those_of_lerobot_train(name: str, dataset: Path, tmp_path: Path) -> None:
     """Twelve updates by each program, with worker processes for the images: the same log but for its times."""
     workers, config = 0, ROOT / "examples" / f"{name}.json"

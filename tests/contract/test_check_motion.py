@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support import loose
 from support.check import checked, copy, edit_column, edit_json, simulate_run
 from support.export import rewrite_video
 
@@ -223,6 +224,22 @@ def test_frames_that_repeat_others_are_found(strange: Path, tmp_path: Path) -> N
             edit_column(spoilt, name, repeats)
     assert level(strange, "repeated_frames") == "pass"
     assert level(spoilt, "repeated_frames") == "warn"
+
+
+def test_frames_that_repeat_others_of_an_arm_that_settles(strange: Path, tmp_path: Path) -> None:
+    """Before it begins to move; by billionths of a metre, as a simulated one does."""
+    settles = copy(strange, tmp_path / "ds")
+    described = json.loads((settles / "meta/info.json").read_text())["features"]
+    for name, feature in described.items():
+        if name == ACTION or (name.startswith("observation.") and feature["dtype"] == "float32"):
+            rows = loose.rows_of(settles, name)
+            rows[:20] = rows[0]
+            if name == STATE:
+                rows[:20, -1] *= 1 + 2e-7 * (np.arange(20) // 2)
+            loose.put_rows(settles, name, rows)
+    states = loose.rows_of(settles, STATE)
+    assert [bool((states[k] == states[k + 1]).all()) for k in range(4)] == [True, False, True, False]
+    assert level(settles, "repeated_frames") == "pass"
 
 
 def make_by_lerobot(run: Path, root: Path, *, frozen: range = range(0)) -> Path:
