@@ -42,7 +42,7 @@ def repeated_frames(subject: Moving) -> Iterator[Found]:
         rows = np.column_stack([table.reshape(len(table), -1) for table in tables])
         same = ((rows[1:] == rows[:-1]) | np.isnan(rows[1:])).all(axis=1)
         steps = np.abs(np.diff(motion.state, axis=0))
-        changes = (steps > _STIRS * np.sqrt((steps**2).mean(axis=0))).any(axis=1)
+        changes = (steps > _STIRS * np.sqrt((steps**2).sum(axis=0) / max(len(steps), 1))).any(axis=1)
         moves = _is_quick(motion)[1:]
         moves[1:-1] |= changes[:-2] & changes[2:]
         wrong = same if motion.contact is not None else same & moves
