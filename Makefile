@@ -7,6 +7,7 @@ DEMO ?= recordings/demo
 TEST_WORKERS ?= $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); echo $$(( n > 4 ? 4 : n )))
 # In the order of their names: pytest-xdist would put files of few tests last, which are those that take long.
 IN_PARALLEL = -n $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder
+ALONE = -n 0 tests/crash/test_ray.py  # a node of Ray gives up on a machine that is too busy
 BIN := .venv/bin
 PYBULLET ?= $(or $(patsubst .venv/.stamp-%,%,$(wildcard .venv/.stamp-*)),$(shell command -v c++ g++ >/dev/null && echo source || echo wheel))
 STAMP := .venv/.stamp-$(PYBULLET)
@@ -27,11 +28,12 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/pytest -m "slow and not long" $(IN_PARALLEL) --ignore tests/crash/test_ray.py
-	$(BIN)/pytest -m slow -n 0 tests/crash/test_ray.py  # alone: a node of Ray gives up on a machine that is too busy
+	$(BIN)/pytest -m "slow and not long" $(ALONE)
 
 # Before a release: what takes longest, or is more of what test-slow does.
 test-long: $(STAMP)
-	$(BIN)/pytest -m long -n $(TEST_WORKERS)
+	$(BIN)/pytest -m long -n $(TEST_WORKERS) --ignore tests/crash/test_ray.py
+	$(BIN)/pytest -m long $(ALONE)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

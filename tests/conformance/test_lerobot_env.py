@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.commands import exit_code
+from support.lerobot_tools import Command, run_commands
 from support.sim import episode
 
 from demorec.core.config import GenerateConfig
@@ -22,9 +20,10 @@ from demorec.learn.evaluate.rollouts import evaluate, load_evaluation, settings_
 from demorec.loop import ScriptAgent, Session, make_world
 from demorec.mcap import EpisodeWriter, Recording
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # each command of LeRobot takes 15 s of CPU to start
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 PLUGIN = ["--env.discover_packages_path=demorec.lerobot_env", "--env.type=demorec", "--env.task=pick_place"]
+PLUGIN += ["--env.action=joint_increment"]
 ACT = [
     *("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=16"),
     *("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.n_encoder_layers=1", "--policy.use_vae=false"),
@@ -32,20 +31,9 @@ ACT = [
 ]
 
 
-def lerobot(command: str, *args: str, cwd: Path) -> str:
-    """Run one of LeRobot's commands as a user would, offline."""
-    program = Path(sys.executable).with_name(command)
-    env = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    result = subprocess.run(
-        [program, *args], cwd=cwd, env=env, capture_output=True, text=True, timeout=800, check=False
-    )
-    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
-    return result.stdout + result.stderr
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy of few parameters, trained by lerobot-train for two steps on an exported dataset."""
+    """A policy of few parameters, trained by lerobot-train for two steps on an exported dataset; then lerobot-eval."""
     folder = tmp_path_factory.mktemp("trained")
     recordings = folder / "recordings"
     recordings.mkdir()
@@ -60,25 +48,24 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writer.finish(session.outcome)
     options = ExportOptions(repo_id="local/cubes", action="joint_increment", privileged=True)
     export_lerobot((recordings,), folder / "dataset", options)
-    lerobot(
-        "lerobot-train",
-        *("--dataset.repo_id=local/cubes", f"--dataset.root={folder / 'dataset'}", *ACT),
-        *(*PLUGIN, "--env.action=joint_increment", "--env.episode_length=12"),
-        *("--steps=2", "--save_freq=2", "--env_eval_freq=2", "--eval.n_episodes=1", "--eval.batch_size=1"),
-        *("--batch_size=4", "--num_workers=0", "--wandb.enable=false", f"--output_dir={folder / 'train'}"),
-        cwd=folder,
+    train = ["--dataset.repo_id=local/cubes", f"--dataset.root={folder / 'dataset'}", *ACT, *PLUGIN]
+    train += ["--env.episode_length=12", "--steps=2", "--save_freq=2", "--env_eval_freq=2", "--eval.n_episodes=1"]
+    train += ["--eval.batch_size=1", "--batch_size=4", "--num_workers=0", "--wandb.enable=false"]
+    policy = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    test = [f"--policy.path={policy}", *PLUGIN, "--env.episode_length=10", "--env.render_width=64"]
+    test += ["--env.render_height=48", "--eval.n_episodes=4", "--eval.batch_size=2"]
+    run_commands(
+        [
+            Command(command="lerobot_train", args=[*train, f"--output_dir={folder / 'train'}"]),
+            Command(command="lerobot_eval", args=[*test, f"--output_dir={folder / 'eval'}"]),
+        ],
+        folder,
     )
+    assert find_checkpoint(folder / "train") == policy
     return folder
 
 
 def test_lerobot_eval_runs_the_environment_and_writes_videos(trained: Path) -> None:
-    lerobot(
-        "lerobot-eval",
-        f"--policy.path={find_checkpoint(trained / 'train')}",
-        *(*PLUGIN, "--env.action=joint_increment", "--env.episode_length=10", "--env.render_width=64"),
-        *("--env.render_height=48", "--eval.n_episodes=4", "--eval.batch_size=2", f"--output_dir={trained / 'eval'}"),
-        cwd=trained,
-    )
     result = json.loads((trained / "eval" / "eval_info.json").read_text())
     assert result["overall"]["n_episodes"] == 4
     assert result["overall"]["pc_success"] == 0.0

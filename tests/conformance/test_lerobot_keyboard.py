@@ -87,6 +87,7 @@ def test_keys_do_a_pick_place(teleoperator: Any, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_keys_do_nineteen_of_twenty(teleoperator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = [operated(teleoperator, tmp_path, scene, monkeypatch) for scene in range(20)]
     assert sum(done) >= 19

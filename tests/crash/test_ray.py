@@ -154,6 +154,7 @@ def test_two_nodes_make_the_same_run(tmp_path: Path, cluster: object, reference:
     assert {name.split("-")[2] for name in seen} == {"1"}
 
 
+@pytest.mark.long
 def test_a_node_that_is_killed_changes_nothing(tmp_path: Path, cluster: object, reference: str) -> None:
     heard, killer = Remembers(), Killer(tmp_path / "run")
     killer.node_at(10, cluster, add_node(cluster))
@@ -188,6 +189,7 @@ def test_the_real_job_is_the_same_in_every_way(tmp_path: Path, cluster: object) 
     assert [a.sha256 for a in ray.run.attempts] == [a.sha256 for a in one.run.attempts]
 
 
+@pytest.mark.long
 def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path: Path) -> None:
     """A node ends with its agent (of the dashboard), which is among the first that a lack of memory takes."""
     number = 40
