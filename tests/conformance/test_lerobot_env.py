@@ -89,7 +89,9 @@ def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> No
     assert "environment_state" not in cameras.features
 
 
-def test_evaluate_records_every_rollout_and_goes_on(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_records_every_rollout_goes_on_and_refuses_another(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     policy = trained / "train"
     assert trained_action(find_checkpoint(policy)) == "joint_increment"
     settings = settings_for(policy, GenerateConfig(split="eval", cameras=()), episode_length=9)
@@ -116,6 +118,19 @@ def test_evaluate_records_every_rollout_and_goes_on(trained: Path, capsys: pytes
     assert exit_code("evaluate", "--compare", trained / "a", trained / "b") == 0
     assert "0/3 = 0.0 %" in capsys.readouterr().out
 
+    other = settings_for(policy, GenerateConfig(split="eval", cameras=(), seed=5), episode_length=9)
+    with pytest.raises(ConfigError, match="config seed is 0 there and 5 here"):
+        evaluate(other, trained / "b", num_episodes=1, workers=1)
+    assert len(list((trained / "b" / "failed").iterdir())) == 3
+    replaced = evaluate(other, trained / "b", num_episodes=1, workers=1, overwrite=True)
+    assert replaced.settings.config.seed == 5
+    assert len(list((trained / "b" / "failed").iterdir())) == 1
+    (trained / "mine").mkdir()
+    (trained / "mine" / "thesis.txt").write_text("precious")
+    with pytest.raises(ConfigError, match="no evaluation"):
+        evaluate(other, trained / "mine", num_episodes=1, workers=1, overwrite=True)
+    assert (trained / "mine" / "thesis.txt").read_text() == "precious"
+
 
 @pytest.mark.long
 def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,22 +148,6 @@ def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.
         assert "policy" not in phases[9:]
     assert exit_code(*words, "--num-episodes", "2", "--stuck-seconds", "1", "--out", trained / "corrections") == 2
     assert "takeover stuck_seconds is 2.0 there and 1.0 here" in capsys.readouterr().err
-
-
-def test_another_evaluation_in_the_folder_is_refused(trained: Path) -> None:
-    settings = settings_for(trained / "train", GenerateConfig(split="eval", cameras=()), episode_length=4)
-    evaluate(settings, trained / "c", num_episodes=1, workers=1)
-    other = settings_for(trained / "train", GenerateConfig(split="eval", cameras=(), seed=5), episode_length=4)
-    with pytest.raises(ConfigError, match="config seed is 0 there and 5 here"):
-        evaluate(other, trained / "c", num_episodes=1, workers=1)
-    assert len(list((trained / "c" / "failed").iterdir())) == 1
-    replaced = evaluate(other, trained / "c", num_episodes=1, workers=1, overwrite=True)
-    assert replaced.settings.config.seed == 5
-    (trained / "mine").mkdir()
-    (trained / "mine" / "thesis.txt").write_text("precious")
-    with pytest.raises(ConfigError, match="no evaluation"):
-        evaluate(other, trained / "mine", num_episodes=1, workers=1, overwrite=True)
-    assert (trained / "mine" / "thesis.txt").read_text() == "precious"
 
 
 def test_what_is_no_policy_is_refused(tmp_path: Path) -> None:

@@ -59,6 +59,7 @@ def result(process: subprocess.Popen[str]) -> tuple[dict[str, Any], str]:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_processes_that_start_at_once_share_the_first_start(tmp_path: Path) -> None:
     together = [result(process) for process in [start(tmp_path) for _ in range(PROCESSES)]]
