@@ -11,7 +11,7 @@ from demorec.check.base import Measurement, sidecar_check
 from demorec.check.dataset import Dataset, DescribedEpisode
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import read_json, read_table
+from demorec.datasets.lerobot.files import column_numbers, read_json, read_table
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.episode.features import STATE
 from demorec.episode.scene import SceneCamera
@@ -94,15 +94,11 @@ def _alike(found: Any, expected: Any, tolerance: float) -> bool:
 
 
 def _camera_poses(dataset: Dataset) -> Iterator[tuple[int, Mapping[str, Array]]]:
-    """(episode, (camera -> (T, 7) world_from_camera, and frame_index (T,))) of the cameras that move."""
+    """(episode, (camera -> (T, 7) world_from_camera, and frame_index (T, 1))) of the cameras that move."""
     for path in sorted((dataset.path / SIDECAR_DIR / "camera_poses").glob("*/*.parquet")):
         table = read_table(path)
-        episodes = table.column("episode_index").to_numpy()
-        columns = {
-            name: np.array(table.column(name).to_pylist(), dtype=np.float64)
-            for name in table.column_names
-            if name != "episode_index"
-        }
+        columns = {name: column_numbers(table.column(name).combine_chunks()) for name in table.column_names}
+        episodes = columns.pop("episode_index")[:, 0]
         for number in np.unique(episodes).tolist():
             yield number, {name: values[episodes == number] for name, values in columns.items()}
 
@@ -118,7 +114,7 @@ def _wrong_poses(
     if (poses := poses_of.get(each.number)) is None:
         yield "the poses of its moving cameras are missing"
         return
-    if not np.array_equal(poses["frame_index"], np.arange(len(state))):
+    if not np.array_equal(poses["frame_index"][:, 0], np.arange(len(state))):
         yield "the poses of its cameras are not those of its frames"
         return
     model = dataset.robot_digests[each.number]

@@ -202,10 +202,20 @@ def column_numbers(column: pa.Array) -> NDArray[Any]:
     """(T, D) numbers of a data column, D = 1 for a scalar one; those of arrays of several dimensions row by row."""
     flat = plain_column(column)
     if not pa.types.is_list(flat.type) and not pa.types.is_fixed_size_list(flat.type):
-        return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(-1, 1)
+        return _numbers(flat).reshape(-1, 1)
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = _elements(flat)
-    return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(len(column), -1)
+    return _numbers(flat).reshape(len(column), -1)
+
+
+def _numbers(flat: pa.Array) -> NDArray[Any]:
+    """Of a plain column. PyArrow's own `to_numpy` would load pandas first, which takes a quarter of a second."""
+    if not flat.null_count and (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)):
+        return np.from_dlpack(flat)
+    if not flat.null_count and pa.types.is_boolean(flat.type):
+        bits = np.unpackbits(np.frombuffer(flat.buffers()[1], np.uint8), bitorder="little")
+        return bits[flat.offset : flat.offset + len(flat)].astype(bool)
+    return np.asarray(flat.to_numpy(zero_copy_only=False))
 
 
 def _elements(lists: pa.Array) -> pa.Array:
