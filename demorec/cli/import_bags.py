@@ -45,8 +45,8 @@ class Import:
       demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
       demorec import bags/ --mapping robot.toml --out runs/robot --skip-bad
       demorec import lerobot datasets/cups --out runs/cups
-      demorec import hdf5 demo.hdf5 --suggest > demo.toml
-      demorec import hdf5 demo.hdf5 --mapping demo.toml --out runs/demo
+      demorec import hdf5 demo.hdf5 --suggest > mapping.toml
+      demorec import hdf5 demo.hdf5 --mapping mapping.toml --out runs/demo
     """
 
     bags: Annotated[Positional[tuple[Path, ...]], arg(help=f"{_BAGS} Or a word in front of what is no bag: {_WORDS}.")]
@@ -119,7 +119,7 @@ class Import:
             say(*form.suggest(paths[0]))
             return 0
         if form.mapping is not None and (self.mapping is None or self.out is None):
-            raise _incomplete(f"{word} {paths[0]} --suggest > demo.toml")
+            raise _incomplete(f"{word} {paths[0]} --suggest > mapping.toml")
         if self.out is None:
             raise ConfigError(f"An import needs --out: {example}.")
         self.video.validate()

@@ -80,7 +80,7 @@ _ROWS = (
     SourceFormat(
         kind="hdf5",
         name="HDF5 files",
-        example="demo.hdf5 --mapping demo.toml --out runs/demo",
+        example="demo.hdf5 --mapping mapping.toml --out runs/demo",
         read=_read_hdf5,
         mapping="hdf5",
         suggest=_suggest_hdf5,

@@ -85,6 +85,8 @@ def test_an_error_of_lerobot_is_one_sentence(instead: Any, capsys: pytest.Captur
         "lerobot-train with the same flags to see where.\n"
     )
     assert factory.LeRobotDataset is LeRobotDataset
+    assert ends("--policy.path=outputs/eye") == 1
+    assert "); --policy.path=outputs/eye names no folder here, so the Hub was asked for it." in capsys.readouterr().err
 
 
 def parsed(*words: str) -> Any:

@@ -61,9 +61,17 @@ def train(
         except Exception as error:  # whatever a foreign program raises
             if isinstance(error, DemorecError) or resource_error(error) is not None:
                 raise
-            raise TrainingError(
-                f"{PROGRAM} stopped ({type(error).__name__}: {error}); run {PROGRAM} with the same flags to see where."
-            ) from error
+            missing = [word for word in arguments if word.startswith("--policy.path=") and not _is_here(word)]
+            advice = (
+                f"{missing[0]} names no folder here, so the Hub was asked for it."
+                if missing
+                else f"run {PROGRAM} with the same flags to see where."
+            )
+            raise TrainingError(f"{PROGRAM} stopped ({type(error).__name__}: {error}); {advice}") from error
+
+
+def _is_here(argument: str) -> bool:
+    return Path(argument.partition("=")[2]).expanduser().exists()
 
 
 def check_settings_file(arguments: Sequence[str]) -> None:
