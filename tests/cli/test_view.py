@@ -144,7 +144,7 @@ def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.viewer
-@pytest.mark.parametrize("codec", [pytest.param("av1", marks=pytest.mark.slow), "jpeg"])
+@pytest.mark.parametrize("codec", [pytest.param("av1", marks=pytest.mark.long), "jpeg"])
 def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "jpeg"], tmp_path: Path) -> None:
     """H.264 is left out: Rerun 0.41 takes it for BT.709 whatever the stream says."""
     need_vulkan()

@@ -189,6 +189,7 @@ def assert_readable(root: Path, lengths: tuple[int, ...]) -> Any:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
     from lerobot.datasets.dataset_tools import merge_datasets

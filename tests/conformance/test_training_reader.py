@@ -199,7 +199,14 @@ def test_transforms_draw_the_same_random_numbers(roots: dict[str, Path]) -> None
     assert_same_item(fast[5], slow[5])
 
 
-@pytest.mark.parametrize("start_method", [None, *(pytest.param(m, marks=pytest.mark.slow) for m in ("fork", "spawn"))])
+@pytest.mark.parametrize(
+    "start_method",
+    [
+        None,
+        pytest.param("fork", marks=pytest.mark.slow),
+        pytest.param("spawn", marks=(pytest.mark.slow, pytest.mark.long)),
+    ],
+)
 def test_batches_of_a_loader_are_equal(start_method: str | None, roots: dict[str, Path]) -> None:
     import torch
 

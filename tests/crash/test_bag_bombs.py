@@ -226,7 +226,7 @@ BAGS = (
     images_of_nothing, lists_in_every_message, many_messages,
 )  # fmt: skip
 LONG = [
-    pytest.param(make, marks=pytest.mark.slow)
+    pytest.param(make, marks=(pytest.mark.slow, pytest.mark.long))
     for make in (a_definition_of_empty_lines, a_definition_in_brackets, many_names)
 ]
 
