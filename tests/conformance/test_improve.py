@@ -21,6 +21,8 @@ from support.training import SMALL_ACT
 from demorec.cli import generate_dataset_main, main
 from demorec.learn.evaluate import improvement
 
+pytestmark = pytest.mark.usefixtures("without_lerobot")  # which would verify each dataset, for seconds
+
 SETTINGS: dict[str, Any] = {
     "policy": SMALL_ACT,
     "batch_size": 4,
@@ -151,6 +153,7 @@ def told_rounds(told: str) -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_it_goes_from_demonstrations_to_a_corrected_policy(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = place / "whole"

@@ -46,7 +46,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for frame in session.run(ScriptAgent(prepared)):
             writer.write(frame)
         writer.finish(session.outcome)
-    options = ExportOptions(repo_id="local/cubes", action="joint_increment", privileged=True)
+    options = ExportOptions(repo_id="local/cubes", action="joint_increment", privileged=True, verify=False)
     export_lerobot((recordings,), folder / "dataset", options)
     train = ["--dataset.repo_id=local/cubes", f"--dataset.root={folder / 'dataset'}", *ACT, *PLUGIN]
     train += ["--env.episode_length=12", "--steps=2", "--save_freq=2", "--env_eval_freq=2", "--eval.n_episodes=1"]
