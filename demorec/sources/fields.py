@@ -274,6 +274,9 @@ def _quaternions(labels: Sequence[str]) -> tuple[int, ...]:
     return tuple(starts)
 
 
+_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+
+
 class SourceReader:
     """Reads the vector of a source from message after message.
 
@@ -297,8 +300,10 @@ class SourceReader:
             OtherPublisherError: It has none of the joints.
         """
         found = follow(values, self.layout.steps)
-        parts = [found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)]
-        vector = _joined(parts)
+        if isinstance(found, np.ndarray) and found.ndim == 1 and found.dtype in _FLOATS:
+            vector: NDArray[np.floating[Any]] = found  # as it is in most messages, of which there are many
+        else:
+            vector = _joined([found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)])
         source = self._source
         if self.layout.joints:
             assert self.layout.names_steps is not None
