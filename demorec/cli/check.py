@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from demorec.cli.replay import demonstrations, describe_replay
-from demorec.cli.shared.flags import Allow, MappingFile, Readable, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import need_paths, reading, tell_unfinished
+from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, OptionError, describe_error
 from demorec.robots.motors import MotorUnits

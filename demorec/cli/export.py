@@ -10,9 +10,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
-from demorec.cli.shared.flags import MappingFile, Readable
 from demorec.cli.shared.output import counted, say
-from demorec.cli.shared.paths import reading, refuse_inside
+from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError
 from demorec.core.tables import EXPORTERS

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.cli.shared.flags import MappingFile, Readable
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
-from demorec.cli.shared.paths import need_paths, reading
+from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading
 from demorec.core.errors import ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX

@@ -8,9 +8,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.flags import WHAT_IS_READ, Allow, MappingFile, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, size_in_words
-from demorec.cli.shared.paths import places_read, reading, refuse_inside
+from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import REPORT, check_replaceable

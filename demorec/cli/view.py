@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.flags import WHAT_IS_READ, Allow, MappingFile, allowed_modules
+from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
-from demorec.cli.shared.paths import places_read, reading, refuse_inside, tell_unfinished
+from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside, tell_unfinished
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
 from demorec.robots.assets import allow_models

@@ -22,7 +22,7 @@ from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import UseAppendAction, arg
 from tyro.constructors import (
     MISSING_NONPROP,
     ConstructorRegistry,
@@ -35,7 +35,6 @@ from tyro.constructors import (
 from demorec.cli.shared.output import say, tell
 from demorec.core.errors import ConfigError
 from demorec.core.registry import is_module_name, split_name
-from demorec.sources.formats import FORMATS
 
 FLAG_TYPES = ConstructorRegistry()
 
@@ -193,19 +192,6 @@ def _kind_beside_none(kind: Any) -> Any:
 
 Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_behavior_hint="(may be given again)")]
 """One module or package each time, since paths may follow."""
-
-
-WHAT_IS_READ = (
-    f"recordings, runs, {', '.join(form.name for form in FORMATS.values())}, bags, folders of recordings or bags"
-)
-Readable = Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}.")]
-MappingFile = Annotated[
-    Path | None,
-    arg(
-        help="Mapping file, as demorec import takes it, for bags and other formats that need one (auto: the one that "
-        "demorec import --suggest writes, if it leaves nothing to decide)."
-    ),
-]
 
 
 def allowed_modules(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,10 +1,13 @@
-"""Where commands must not write, since they read it; and how they read what is no recording."""
+"""What commands read, recordings or not; and where they must not write, since they read it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
 
 from demorec.cli.shared.output import renamed, tell
 from demorec.core.errors import ConfigError, DemorecError
@@ -13,8 +16,19 @@ from demorec.core.replacing import use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
-from demorec.sources.formats import IMPORTED
+from demorec.sources.formats import FORMATS, IMPORTED
 
+WHAT_IS_READ = (
+    f"recordings, runs, {', '.join(form.name for form in FORMATS.values())}, bags, folders of recordings or bags"
+)
+Readable = Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}.")]
+MappingFile = Annotated[
+    Path | None,
+    arg(
+        help="Mapping file, as demorec import takes it, for bags and other formats that need one (auto: the one that "
+        "demorec import --suggest writes, if it leaves nothing to decide)."
+    ),
+]
 _PARTS = (EPISODES, FAILED, UNFINISHED)
 
 
