@@ -91,6 +91,7 @@ def test_what_cannot_be_shown_is_said(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.viewer
 def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     need_vulkan()

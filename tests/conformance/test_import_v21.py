@@ -149,6 +149,7 @@ def test_its_copy_in_the_new_format_is_the_same(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_export_that_would_append_names_the_command_that_converts_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

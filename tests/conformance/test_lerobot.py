@@ -238,6 +238,7 @@ def lerobot_command(name: str, *arguments: str, timeout: float = 280) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_lerobots_editing_command_deletes_and_splits(dataset: Path, tmp_path: Path) -> None:
     root = tmp_path / "d"
     shutil.copytree(dataset, root)

@@ -158,6 +158,7 @@ def test_a_policy_that_reads_can_be_saved_from_a_gpu(tmp_path: Path, monkeypatch
     assert (tmp_path / "policy/model.safetensors").exists()
 
 
+@pytest.mark.long
 def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, pretrained: Path, tmp_path: Path) -> None:
     from demorec.learn.training import pretrain as pretraining
     from demorec.learn.training.command import training_config

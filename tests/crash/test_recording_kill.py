@@ -69,7 +69,6 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
     ("codec", "kills"),
     [
         ("h264", 8),
-        pytest.param("av1", 8, marks=pytest.mark.slow),
         pytest.param("h264", 50, marks=LONG),
         pytest.param("av1", 20, marks=LONG),
     ],

@@ -397,6 +397,7 @@ def test_random_shapes_are_closed_and_lie_flat() -> None:
         assert float(shape.extents[2]) < 0.07
 
 
+@pytest.mark.long
 def test_the_random_shelf_has_those_of_pybullet_that_a_hand_gets_around() -> None:
     """About every third of a thousand; which ones, by trimesh's boxes, whichever side they lie on."""
     (kind,) = OBJECTS.load("random").kinds
