@@ -72,9 +72,9 @@ for folder in plugins/*/; do plugins+=(-e "$folder"); done
 rm -f .venv/.stamp*
 # Both have the same files: one that is there would take those of the other along when it goes.
 quietly "$uv" pip uninstall -p .venv $other
-# Python's own flags have -g: debugging information is a quarter of the compiler's time and 100 MB, and no other code.
+# Python's own flags have -g: debugging information takes a quarter of the compiler's time and 100 MB, and changes no code.
 flags=$(.venv/bin/python -c "import sysconfig; print(sysconfig.get_config_var('CFLAGS'))")
-export CFLAGS="${CFLAGS-$flags} -g0" CXXFLAGS="${CXXFLAGS-$flags} -g0"
+export CFLAGS="${CFLAGS-$flags -g0}" CXXFLAGS="${CXXFLAGS-$flags -g0}"
 quietly "$uv" pip install -p .venv -c constraints.txt -e . --group dev "${arguments[@]}" "${plugins[@]}"
 quietly .venv/bin/python -c "import pybullet"
 echo "Compiling the renderer for this machine"

@@ -85,6 +85,17 @@ def test_an_error_of_lerobot_is_one_sentence(instead: Any, capsys: pytest.Captur
         "lerobot-train with the same flags to see where.\n"
     )
     assert factory.LeRobotDataset is LeRobotDataset
+    assert ends("--output_dir=outputs/x", "--policy.path=lerobot/act") == 1
+    assert "); run lerobot-train with" in capsys.readouterr().err
+
+
+def test_a_policy_that_is_nowhere_is_named(instead: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    def lerobot_train() -> None:
+        raise LocalEntryNotFoundError("the Hub was not reached.")
+
+    instead(lerobot_train)
     assert ends("--policy.path=outputs/eye") == 1
     assert "); --policy.path=outputs/eye names no folder here, so the Hub was asked for it." in capsys.readouterr().err
 

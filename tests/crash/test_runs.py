@@ -286,9 +286,7 @@ def test_two_runs_into_one_folder_exclude_each_other_until_the_owner_dies(tmp_pa
     assert attempts_of(run_fake(out, num_episodes=4)) == expected_attempts(4)
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(signal.SIGINT, marks=(pytest.mark.slow, pytest.mark.long)), signal.SIGTERM]
-)
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_the_first_interrupt_lets_current_episodes_end(
     tmp_path: Path, reference: RunResult, number: signal.Signals
 ) -> None:

@@ -22,7 +22,7 @@ COLUMNS = {
 
 
 @pytest.mark.parametrize("name", COLUMNS)
-@pytest.mark.parametrize(("first", "count"), [(0, 11), (3, 5), (8, 3)])
+@pytest.mark.parametrize(("first", "count"), [(0, 11), (3, 5), (8, 3), (4, 0)])
 def test_columns(name: str, first: int, count: int) -> None:
     column = COLUMNS[name].slice(first, count)
     found = column_numbers(column)

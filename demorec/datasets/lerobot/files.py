@@ -205,7 +205,7 @@ def column_numbers(column: pa.Array) -> NDArray[Any]:
         return _numbers(flat).reshape(-1, 1)
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = _elements(flat)
-    return _numbers(flat).reshape(len(column), -1)
+    return _numbers(flat).reshape(len(column), -1 if len(column) else 0)
 
 
 def _numbers(flat: pa.Array) -> NDArray[Any]:

@@ -61,12 +61,11 @@ def train(
         except Exception as error:  # whatever a foreign program raises
             if isinstance(error, DemorecError) or resource_error(error) is not None:
                 raise
-            missing = [word for word in arguments if word.startswith("--policy.path=") and not _is_here(word)]
-            advice = (
-                f"{missing[0]} names no folder here, so the Hub was asked for it."
-                if missing
-                else f"run {PROGRAM} with the same flags to see where."
-            )
+            asked = [word for word in arguments if word.startswith("--policy.path=") and not _is_here(word)]
+            if asked and type(error).__module__.startswith("huggingface_hub"):
+                advice = f"{asked[0]} names no folder here, so the Hub was asked for it."
+            else:
+                advice = f"run {PROGRAM} with the same flags to see where."
             raise TrainingError(f"{PROGRAM} stopped ({type(error).__name__}: {error}); {advice}") from error
 
 
