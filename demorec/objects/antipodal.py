@@ -16,6 +16,7 @@ import numpy as np
 
 from demorec.core.geometry import Array
 from demorec.episode.mesh import SolidMesh, decode_mesh
+from demorec.robots.robot import Gripper
 
 CANDIDATES, CLOUD = 300, 3000
 KEPT = 40
@@ -30,29 +31,14 @@ _SKIN = 0.0015
 """Surface points that are so near to the outermost one touch the finger, metres."""
 LEAST_FACING = math.cos(math.radians(25.0))
 """Cosine of the angle between a finger's motion and what it touches, in the mean."""
+TIP_CLEARANCE = 0.005
+"""Air between the finger tips and the support, metres (of an arm of task_scale 1)."""
+LEAST_WIDTH = 0.015
+"""Of what is gripped, beyond the closed gripper's own, metres (of such an arm): the expert takes less for nothing."""
 PLAY = 0.01
 """How much narrower than the opening what is gripped has to be, metres."""
 _STEEP = 0.5
 """Largest vertical part of the normal where a finger may touch."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Hand:
-    """What of a gripper decides what it can grasp; lengths in metres as of `demorec.robots.robot.ParallelGripper`.
-
-    Attributes:
-        max_width: Full opening.
-        finger_depth: From the TCP to the finger tips.
-        palm_clearance: From the TCP back to the palm.
-        tip_clearance: Air between the finger tips and the support.
-        least_width: Of what is gripped: the expert takes less for nothing.
-    """
-
-    max_width: float
-    finger_depth: float
-    palm_clearance: float
-    tip_clearance: float = 0.005
-    least_width: float = 0.015
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,12 +61,15 @@ class Grasp:
 
 
 @functools.lru_cache(maxsize=256)
-def antipodal_grasps(text: str, hand: Hand, *, scale: float = 1.0, up: tuple[float, float, float]) -> tuple[Grasp, ...]:
+def antipodal_grasps(
+    text: str, gripper: Gripper, *, task_scale: float = 1.0, scale: float = 1.0, up: tuple[float, float, float]
+) -> tuple[Grasp, ...]:
     """The best grasps of a solid with the hand pointing down, best first; none when nothing fits.
 
     Args:
         text: As of `Shape.mesh`.
-        hand: The gripper.
+        gripper: Of the hand.
+        task_scale: As of `RobotSpec`.
         scale: Of the solid.
         up: The world's vertical in the solid's axes.
     """
@@ -90,7 +79,7 @@ def antipodal_grasps(text: str, hand: Hand, *, scale: float = 1.0, up: tuple[flo
     points, normals = _turned(standing, scale * points), _turned(standing, normals)
     steep = np.flatnonzero(np.abs(normals[:, 2]) < _STEEP)
     chosen = steep[:: max(1, len(steep) // CANDIDATES)]
-    found = [_grasp(points, normals, row, hand) for row in chosen.tolist()]
+    found = [_grasp(points, normals, row, gripper, task_scale) for row in chosen.tolist()]
     best = sorted((grasp for grasp in found if grasp is not None), key=lambda grasp: grasp.cost)
     return tuple(best[:KEPT])
 
@@ -104,7 +93,7 @@ def standing_rotation(up: tuple[float, float, float]) -> Array:
     return np.array([[1 - share * x * x, -share * x * y, -x], [-share * x * y, 1 - share * y * y, -y], [x, y, z]])
 
 
-def _grasp(points: Array, normals: Array, row: int, hand: Hand) -> Grasp | None:
+def _grasp(points: Array, normals: Array, row: int, gripper: Gripper, task_scale: float) -> Grasp | None:
     """The grasp that closes along the normal at a point of the cloud; None when it does not hold or fit."""
     length = math.hypot(*normals[row, :2].tolist())
     across = normals[row, :2] / -length  # (2,) in the direction of which the first finger moves
@@ -112,18 +101,18 @@ def _grasp(points: Array, normals: Array, row: int, hand: Hand) -> Grasp | None:
     u = points[:, 0] * along[0] + points[:, 1] * along[1]
     v = points[:, 0] * across[0] + points[:, 1] * across[1]
     w, at = points[:, 2], float(points[row, 2])
-    low = float(w.min()) + hand.finger_depth + hand.tip_clearance
-    z = max(at, low, float(w.max()) - (hand.palm_clearance - 0.007))
-    if at < z - hand.finger_depth + 0.002:
+    depth, clearance, opening = gripper.finger_depth, TIP_CLEARANCE * task_scale, gripper.open_width
+    z = max(at, float(w.min()) + depth + clearance, float(w.max()) - (gripper.palm_clearance - 0.007))
+    if at < z - depth + 0.002:
         return None  # the pads end above it
     middle = float(u[row])
-    pad = (np.abs(u - middle) < PAD) & (w > z - hand.finger_depth) & (w < z + PAD_ABOVE)
+    pad = (np.abs(u - middle) < PAD) & (w > z - depth) & (w < z + PAD_ABOVE)
     first, last = float(v[pad].min()), float(v[pad].max())
     width, centre = last - first, (first + last) / 2
-    if not hand.least_width <= width <= hand.max_width - PLAY:
+    if not gripper.min_width + LEAST_WIDTH * task_scale <= width <= opening - PLAY:
         return None
-    swept = (np.abs(u - middle) < FINGER) & (w > z - hand.finger_depth - hand.tip_clearance / 2)
-    if float(np.abs(v[swept] - centre).max()) > hand.max_width / 2 - 0.003:
+    swept = (np.abs(u - middle) < FINGER) & (w > z - depth - clearance / 2)
+    if float(np.abs(v[swept] - centre).max()) > opening / 2 - 0.003:
         return None  # a finger would come down on it
     facing = normals[:, 0] * across[0] + normals[:, 1] * across[1]
     near, far = pad & (v < first + _SKIN), pad & (v > last - _SKIN)
@@ -134,7 +123,7 @@ def _grasp(points: Array, normals: Array, row: int, hand: Hand) -> Grasp | None:
     height = max(float(w[near].mean()), float(w[far].mean()))
     # Off the centre of mass it turns about the fingers when it is lifted; below it, it may topple.
     off = math.hypot(middle, centre)
-    tight = max(0.0, width - hand.max_width + 0.02)
+    tight = max(0.0, width - opening + 0.02)
     cost = 4 * (1 - least) + 60 * off + 60 * apart + 10 * max(0.0, -height) + 20 * tight
     x, y = (middle * along + centre * across).tolist()
     return Grasp(x=x, y=y, z=z, yaw=math.atan2(along[1], along[0]), width=width, cost=cost)

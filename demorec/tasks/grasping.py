@@ -9,7 +9,7 @@ import numpy as np
 
 from demorec.core.geometry import Array, Pose, angle_between, wrap_angle
 from demorec.episode.scene import Body, Shape, yaw_of
-from demorec.objects.antipodal import Grasp, Hand, antipodal_grasps, standing_rotation
+from demorec.objects.antipodal import TIP_CLEARANCE, Grasp, antipodal_grasps, standing_rotation
 from demorec.robots.robot import RobotSpec
 from demorec.tasks.script import Behaviour
 from demorec.tasks.success import resting_half_height
@@ -111,7 +111,7 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
     gripper, half = robot.gripper, resting_half_height(body, pose)
     top, bottom = pose.position[2] + half, pose.position[2] - half
     # At the centre, but no deeper than the palm allows, and with the finger tips above the support.
-    above_support = gripper.finger_depth + 0.005 * robot.task_scale
+    above_support = gripper.finger_depth + TIP_CLEARANCE * robot.task_scale
     z = max(pose.position[2], top - (gripper.palm_clearance - 0.007), bottom + above_support)
     found = []
     yaws = nearest_first(grasp_yaws(body, pose, now, gripper.open_width), now)
@@ -127,17 +127,10 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
 
 def found_grasps(shape: Shape, robot: RobotSpec, up: Array) -> tuple[Grasp, ...]:
     """The grasps of a solid that stands with the direction `up` (3,) of its own axes upward, best first."""
-    gripper = robot.gripper
-    hand = Hand(
-        max_width=gripper.open_width,
-        finger_depth=gripper.finger_depth,
-        palm_clearance=gripper.palm_clearance,
-        tip_clearance=0.005 * robot.task_scale,
-        least_width=gripper.min_width + 0.015 * robot.task_scale,
-    )
     x, y, z = np.round(up, 2).tolist()
     length = math.hypot(x, y, z)
-    return antipodal_grasps(shape.mesh, hand, scale=shape.scale, up=(x / length, y / length, z / length))
+    upward = x / length, y / length, z / length
+    return antipodal_grasps(shape.mesh, robot.gripper, task_scale=robot.task_scale, scale=shape.scale, up=upward)
 
 
 def _grasps_of_mesh(body: Body, pose: Pose, *, now: float, robot: RobotSpec) -> list[Pose]:

@@ -19,11 +19,11 @@ from support.sim import body_index, episode, run
 
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Pose
-from demorec.core.tables import OBJECTS, RENDERERS
+from demorec.core.tables import OBJECTS, RENDERERS, ROBOTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.episode.variation import Ranges
 from demorec.loop import ScriptAgent, Session, make_world
-from demorec.objects.antipodal import Hand, antipodal_grasps
+from demorec.objects.antipodal import antipodal_grasps
 from demorec.objects.folder import load_shelf, on_steadiest_side, read_solid
 from demorec.objects.shelf import Kind
 from demorec.objects.solids import dish
@@ -35,7 +35,7 @@ from demorec.tasks.grasping import hand_down, hand_yaw, places_of
 
 pytestmark = pytest.mark.slow
 
-PANDA_HAND = Hand(max_width=0.08, finger_depth=0.007, palm_clearance=0.035)
+PANDA_HAND = ROBOTS.load("panda").gripper
 UP = (0.0, 0.0, 1.0)
 KINDS = {kind.noun: kind for name in ("household", "blocks") for kind in OBJECTS.load(name).kinds}
 
