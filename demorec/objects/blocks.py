@@ -8,7 +8,7 @@ import numpy as np
 
 from demorec.episode.mesh import SolidMesh
 from demorec.objects.shelf import Kind, Shelf, by_seed
-from demorec.objects.solids import arc, board, rounded
+from demorec.objects.solids import arc, board
 
 Rng = np.random.Generator
 
@@ -94,7 +94,7 @@ def _arch(rng: Rng) -> SolidMesh:
 
 @by_seed
 def _hexagon(rng: Rng) -> SolidMesh:
-    outline = rounded(arc((0.0, 0.0), rng.uniform(0.02, 0.032), 0.0, 2 * math.pi, 7))[:-1]
+    outline = arc((0.0, 0.0), rng.uniform(0.02, 0.032), 0.0, 2 * math.pi, 7)[:-1]
     return board(outline, [tuple(range(6))], rng.uniform(0.025, 0.045))
 
 

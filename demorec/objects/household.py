@@ -8,7 +8,7 @@ import numpy as np
 
 from demorec.episode.mesh import SolidMesh
 from demorec.objects.shelf import Kind, Shelf, by_seed
-from demorec.objects.solids import arc, board, joined, lathe, rod, rounded
+from demorec.objects.solids import arc, board, joined, lathe, rod
 
 Rng = np.random.Generator
 
@@ -108,7 +108,7 @@ def _lemon(rng: Rng) -> SolidMesh:
 @by_seed
 def _banana(rng: Rng) -> SolidMesh:
     radius, bend = rng.uniform(0.011, 0.014), rng.uniform(0.055, 0.07)
-    spine = rounded(arc((0.0, -bend), bend, math.radians(145), math.radians(35), 9))
+    spine = arc((0.0, -bend), bend, math.radians(145), math.radians(35), 9)
     thick = [radius * share for share in (0.45, 0.75, 0.95, 1.0, 1.0, 1.0, 0.95, 0.75, 0.4)]
     # It lies on its whole length: the ends are bent upward by as much as they are thinner.
     return rod([(x, y, r) for (x, y), r in zip(spine, thick, strict=True)], thick, (0.0, 0.0, 1.0))

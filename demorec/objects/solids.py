@@ -12,9 +12,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from demorec.core.geometry import Array
 from demorec.episode.mesh import SolidMesh
 
 Point2 = tuple[float, float]
@@ -156,12 +154,7 @@ def _convex_runs(profile: Sequence[Point2]) -> list[tuple[int, int]]:
     return [*runs, (first, len(profile) - 1)]
 
 
-def arc(centre: Point2, radius: float, start: float, end: float, count: int) -> NDArray[np.float64]:
-    """(count, 2) points of a circle's arc between two angles, rad, both ends among them."""
+def arc(centre: Point2, radius: float, start: float, end: float, count: int) -> list[Point2]:
+    """So many points of a circle's arc between two angles, rad, both ends among them."""
     angles = [start + (end - start) * k / (count - 1) for k in range(count)]
-    return np.array([(centre[0] + radius * math.cos(a), centre[1] + radius * math.sin(a)) for a in angles])
-
-
-def rounded(points: Array) -> list[Point2]:
-    """Rows of (n, 2) as pairs."""
-    return [(x, y) for x, y in points.tolist()]
+    return [(centre[0] + radius * math.cos(a), centre[1] + radius * math.sin(a)) for a in angles]
