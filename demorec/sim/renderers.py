@@ -12,7 +12,7 @@ import importlib.util
 import subprocess
 import sys
 import tempfile
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +33,14 @@ _NOTHING_HIT = 1.0 - 1e-7
 """Depth buffer value of the background (TinyRenderer's is one float32 step below 1)."""
 
 
-class _ClientRenderer:
-    """Draws the shapes of a setup in a client of its own; a context manager."""
+class TinyRenderer:
+    """PyBullet's own CPU renderer, in a client without a window: slow, hard shadows, always there; a context manager.
 
-    constant: ClassVar[str]
+    It samples half a pixel up and to the left of the pixels' centres, and its depth is about a millimetre too small at
+    a metre. Both are left as they are: the images are PyBullet's.
+    """
+
+    constant = "ER_TINY_RENDERER"
     """PyBullet's name of the renderer that draws."""
 
     def __init__(self) -> None:
@@ -172,17 +176,7 @@ def _metric_depth(buffer: NDArray[np.float32], camera: SceneCamera) -> NDArray[n
     return np.where(buffer >= _NOTHING_HIT, 0.0, metres).astype(np.float32)
 
 
-class TinyRenderer(_ClientRenderer):
-    """PyBullet's own CPU renderer, in a client without a window: slow, hard shadows, always there.
-
-    It samples half a pixel up and to the left of the pixels' centres, and its depth is about a millimetre too small at
-    a metre. Both are left as they are: the images are PyBullet's.
-    """
-
-    constant = "ER_TINY_RENDERER"
-
-
-class EglRenderer(_ClientRenderer):
+class EglRenderer(TinyRenderer):
     """PyBullet's OpenGL renderer without a window (EGL plugin): fast on a GPU, needs libEGL.
 
     One per process, or a client's images are silently wrong.
@@ -214,13 +208,13 @@ class EglRenderer(_ClientRenderer):
         return client
 
     def close(self) -> None:
-        """As `_ClientRenderer.close`."""
+        """As `TinyRenderer.close`."""
         if self._client is not None:
             self._client.unloadPlugin(self._plugin)
         super().close()
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
-        """As `_ClientRenderer.render`."""
+        """As `TinyRenderer.render`."""
         if self._is_first_image:  # it differs from all later ones in some pixels
             super().render(poses)
             self._is_first_image = False
