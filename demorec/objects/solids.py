@@ -16,21 +16,22 @@ import numpy as np
 from demorec.episode.mesh import SolidMesh
 
 Point2 = tuple[float, float]
+SIDES = 24
+"""Of each ring of a solid of revolution."""
 
 
-def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = (), sides: int = 24) -> SolidMesh:
+def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = ()) -> SolidMesh:
     """A solid of revolution about z.
 
     Args:
         profile: (radius, z) of the outside from below to above, metres; radius 0 at an end is a point on the axis.
         cavity: The same of the inside of a vessel, from the rim down to its floor. As physics has it, it is filled:
             fingers that cannot grip a wall do not go in.
-        sides: Of each ring.
     """
     points: list[tuple[float, float, float]] = []
     rings: list[list[int]] = []
     for radius, z in (*profile, *cavity):
-        around = [2 * math.pi * k / sides for k in range(sides)] if radius > 0 else [0.0]
+        around = [2 * math.pi * k / SIDES for k in range(SIDES)] if radius > 0 else [0.0]
         rings.append(list(range(len(points), len(points) + len(around))))
         points += [(radius * math.cos(a), radius * math.sin(a), z) for a in around]
     faces = [face for below, above in pairwise(rings) for face in _band(below, above)]
@@ -38,18 +39,17 @@ def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = (), sides: in
     return _solid(points, _with_ends(faces, rings[0], rings[-1]), parts)
 
 
-def dish(floor: float, rim: float, height: float, *, thickness: float, sides: int = 24) -> SolidMesh:
+def dish(floor: float, rim: float, height: float, *, thickness: float) -> SolidMesh:
     """A vessel with a flat floor and a wall that leans outward, hollow as physics has it too, standing on z = 0.
 
     Args:
         floor, rim: Inner radii of its floor and of its rim, metres.
         height: Of the rim, metres.
         thickness: Of floor and wall, metres.
-        sides: Of each ring.
     """
-    solid = lathe([(floor, 0.0), (rim, height)], cavity=[(rim - thickness, height), (floor, thickness)], sides=sides)
-    rings = np.arange(4 * sides).reshape(4, sides)
-    wall = [np.concatenate([rings[:, k], rings[:, (k + 1) % sides]]) for k in range(sides)]
+    solid = lathe([(floor, 0.0), (rim, height)], cavity=[(rim - thickness, height), (floor, thickness)])
+    rings = np.arange(4 * SIDES).reshape(4, SIDES)
+    wall = [np.concatenate([rings[:, k], rings[:, (k + 1) % SIDES]]) for k in range(SIDES)]
     return replace(solid, parts=(np.concatenate([rings[0], rings[3]]), *wall))
 
 
