@@ -33,7 +33,7 @@ class SolidMesh:
         points: (V, 3) metres.
         faces: (F, 3) rows of `points`, counter-clockwise from outside.
         parts: Rows of `points`; the hull of each is one convex part of the solid as physics has it. Of a mesh that has
-            just been read from a file, none: `demorec.sim.parts` finds them.
+            just been read from a file, none: `demorec.sim.solids` finds them.
     """
 
     points: Array

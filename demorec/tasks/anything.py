@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape, Texture
 from demorec.objects.shelf import MATERIALS, Kind, Material
 from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
-from demorec.sim.parts import with_parts
-from demorec.sim.resting import ROLLING_FRICTION, at_rest
+from demorec.sim.solids import ROLLING_FRICTION, at_rest, with_parts
 from demorec.tasks.furniture import COLORS, mark, walls, words_for
 from demorec.tasks.grasping import found_grasps
 from demorec.tasks.placing import Layout, TableTask
@@ -43,26 +42,8 @@ DRAWS = 50
 """Of a thing until one rests on a table and can be grasped."""
 NEUTRAL_COLORS: Mapping[str, Rgba] = {"grey": (0.5, 0.5, 0.51, 1.0), "black": (0.15, 0.15, 0.16, 1.0)}
 """Of what lies about: no colour that an instruction names."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dish:
-    """A round vessel that stands still, white.
-
-    Attributes:
-        floor, rim: Radii of its flat floor and of its rim, metres.
-        height: Of the rim, metres.
-    """
-
-    floor: float
-    rim: float
-    height: float
-
-
-DISHES: Mapping[str, Dish] = {
-    "bowl": Dish(floor=0.085, rim=0.115, height=0.03),
-    "plate": Dish(floor=0.08, rim=0.105, height=0.012),
-}
+DISHES = {"bowl": (0.085, 0.115, 0.03), "plate": (0.08, 0.105, 0.012)}
+"""Round white vessels that stand still: radii of the flat floor and of the rim, and height of the rim, metres."""
 DISH_FLOOR = 0.004
 """Height of a dish's floor above its lower face, metres."""
 BESIDE_THING = 0.015
@@ -153,7 +134,7 @@ def radius_of(body: Body) -> float:
 def _targets(wanted: Body) -> list[str]:
     """What a thing can be put to: it has to stand on the flat floor of a dish."""
     room = radius_of(wanted) + BESIDE_THING
-    return ["mark", "mark", "tray", *(name for name, dish in DISHES.items() if room < dish.floor)]
+    return ["mark", "mark", "tray", *(name for name, (floor, *_) in DISHES.items() if room < floor)]
 
 
 def _things(sampler: Sampler, count: int, *, neutral: bool = False) -> list[Body]:
@@ -244,7 +225,7 @@ def _container_and_goal(sampler: Sampler, wanted: Body, onto: str) -> tuple[Body
     if onto == "tray":
         target, floor, area = tray("blue_tray", point, yaw, color_name="blue"), TRAY_FLOOR, IN_TRAY
     else:
-        half = DISHES[onto].floor / math.sqrt(2)  # of the square within the round floor
+        half = DISHES[onto][0] / math.sqrt(2)  # of the square within the round floor
         target, floor, area = _dish_body(onto, point, yaw), DISH_FLOOR, (-half, -half, half, half)
     pose = _resting(wanted, (0.0, 0.0), floor)
     return target, Goal(object=wanted.name, onto=target.name, onto_from_goal=pose, yaw_symmetry=0, area=area)
@@ -252,8 +233,7 @@ def _container_and_goal(sampler: Sampler, wanted: Body, onto: str) -> tuple[Body
 
 def _dish_body(noun: str, point: tuple[float, float], yaw: float) -> Body:
     """A white bowl or plate, its origin in its lower face."""
-    dimensions = DISHES[noun]
-    mesh = dish(dimensions.floor, dimensions.rim, dimensions.height, thickness=DISH_FLOOR)
+    mesh = dish(*DISHES[noun], thickness=DISH_FLOOR)
     x, y, z = mesh.extents.tolist()
     return Body(
         name=f"white_{noun}",

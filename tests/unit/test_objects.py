@@ -29,8 +29,7 @@ from demorec.objects.shelf import Kind
 from demorec.objects.solids import dish
 from demorec.render.painter import Painter
 from demorec.robots.assets import data_folder
-from demorec.sim.parts import with_parts
-from demorec.sim.resting import at_rest
+from demorec.sim.solids import at_rest, with_parts
 from demorec.tasks.grasping import hand_down, hand_yaw, places_of
 
 pytestmark = pytest.mark.slow
