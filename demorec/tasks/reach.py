@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Goal, Scene
-from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.motion import MotionLimits, plan_joints, plan_straight
 from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import arm_kinematics
@@ -29,31 +27,32 @@ _CONTROL_STEP = 1 / 30
 """Seconds between the points at which the arm has to follow a line."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Reach:
-    """Where the hand of an arm gets to.
+    """Where the hand of a scene's arm gets to.
+
+    Args:
+        scene: As it is at the start.
+        robot: At the scene's scale.
 
     Attributes:
         arm: Its kinematics.
-        world_from_base: Pose of its base.
         home: (n,) home configuration, rad.
+        start: (n,) configuration at the start, rad.
         limits: What its motions keep to: less than its joints' own limits, with which noise on the way stays in them.
     """
 
-    arm: ArmKinematics
-    world_from_base: Pose
-    home: Array
-    limits: MotionLimits
-
-    @classmethod
-    def of(cls, arm: ArmKinematics, scene: Scene, robot: RobotSpec) -> Reach:
-        """That of a scene's robot."""
-        limits = MotionLimits(
+    def __init__(self, scene: Scene, robot: RobotSpec) -> None:
+        self.arm = arm_kinematics(robot, scale=scene.robot.scale)
+        self.home, self.start = np.array(robot.home_q), np.array(scene.robot.joint_position)
+        self.limits = MotionLimits(
             joint_velocity=0.6 * np.array(robot.velocity_limit),
             joint_acceleration=0.8 * np.array(robot.acceleration_limit),
         )
-        home = np.array(robot.home_q)
-        return cls(arm=arm, world_from_base=scene.robot.world_from_base, home=home, limits=limits)
+        self._world_from_base = scene.robot.world_from_base
+
+    def tcp(self, joint_position: Array) -> Pose:
+        """`world_from_tcp` at (n,) joint positions, rad."""
+        return self._world_from_base @ self.arm.forward(joint_position)
 
     def rest_for(self, world_from_tcp: Pose) -> Array:
         """The home configuration turned towards a pose: what the goal configuration is pulled to."""
@@ -121,7 +120,7 @@ class Reach:
         return self.arm.why_unreachable(self._in_base(world_from_tcp), start=start, rest=rest)
 
     def _in_base(self, world_from_tcp: Pose) -> Pose:
-        return self.world_from_base.inverse() @ world_from_tcp
+        return self._world_from_base.inverse() @ world_from_tcp
 
 
 def within(reaches: Callable[[Pose], bool], poses: Iterable[Pose], *, up_to: float) -> Iterator[Pose]:
@@ -138,9 +137,8 @@ def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Beh
         robot: At the scene's scale.
         behaviour: How the expert does it.
     """
-    reach = Reach.of(arm_kinematics(robot, scale=scene.robot.scale), scene, robot)
-    start = np.array(scene.robot.joint_position)
-    now = hand_yaw(reach.world_from_base @ reach.arm.forward(start))
+    reach = Reach(scene, robot)
+    now = hand_yaw(reach.tcp(reach.start))
     approach, lift, least = (
         robot.task_scale * height for height in (behaviour.approach_height, behaviour.lift_height, LEAST_ABOVE_GOAL)
     )
@@ -153,7 +151,9 @@ def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Beh
         for grasp in within(reach.at_all, grasps_of(body, pose, now=now, robot=robot, behaviour=behaviour), up_to=lift):
             places = places_of(body, pose, wanted, hand=grasp, yaw_symmetry=goal.yaw_symmetry or ANY_YAW)
             height = max(float(grasp.position[2]) + lift - float(places[0].position[2]), least)
-            if reach.descends(grasp, by=approach, start=start) and any(within(reach.at_all, places, up_to=height)):
+            if reach.descends(grasp, by=approach, start=reach.start) and any(
+                within(reach.at_all, places, up_to=height)
+            ):
                 return True
         return False
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from demorec.tasks.grasping import (
 )
 from demorec.tasks.reach import ANY_YAW, DESCEND_SPEED, LEAST_ABOVE_GOAL, Reach, within
 from demorec.tasks.script import Behaviour, Step, steady_width
-from demorec.tasks.success import goal_pose, is_at_rest, on_support, placement_checks
+from demorec.tasks.success import goal_pose, on_support, placement_checks, rest_checks
 
 MAX_TRIES = 3
 FREE_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.3, 0.08
@@ -87,15 +86,14 @@ class Expert:
 
     def __post_init__(self) -> None:
         robot = self.world.robot
-        self.arm = self.world.arm.kinematics
+        self.reach = Reach(self.world.scene, robot)
         self.joint_target = self.world.arm.target.copy()
         self.gripper_target = self.world.arm.gripper_target
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
         # Recordings of arms of six joints and more are made again byte for byte: what was learnt later is not for them.
-        self._keeps_bytes = self.arm.freedom == WHOLE_POSE
+        self._keeps_bytes = self.reach.arm.freedom == WHOLE_POSE
         # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
         self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
-        self.reach = Reach.of(self.arm, self.world.scene, robot)
 
     @property
     def open_width(self) -> float:
@@ -107,9 +105,7 @@ class Expert:
 
         Of arms that need no freedom the text stays as it was: recordings are made again byte for byte.
         """
-        why = ""
-        for pose in poses[:1] if not self._keeps_bytes else ():
-            why = self.reach.why_not(pose, self.joint_target)
+        why = self.reach.why_not(poses[0], self.joint_target) if poses and not self._keeps_bytes else ""
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
         return GaveUp(self.phase, "unreachable")
 
@@ -132,11 +128,11 @@ class Expert:
 
     def tcp(self) -> Pose:
         """`world_from_tcp` as sensed."""
-        return self.world.arm.world_from_base @ self.arm.forward(self.world.arm.arm_position())
+        return self.reach.tcp(self.world.arm.arm_position())
 
     def tcp_target(self) -> Pose:
         """`world_from_tcp` as commanded."""
-        return self.world.arm.world_from_base @ self.arm.forward(self.joint_target)
+        return self.reach.tcp(self.joint_target)
 
     def reaches(self, world_from_tcp: Pose) -> bool:
         """Whether the arm can get there from where it is."""
@@ -147,16 +143,16 @@ class Expert:
 
         From where it is, or failing that at all.
         """
-        found = chain(within(self.reaches, grasps, up_to=above_by), within(self.reach.at_all, grasps, up_to=above_by))
-        return next(
-            (
-                grasp
-                for grasp in found
-                if self.reach.descends(grasp, by=above_by, start=self.joint_target)
-                and self.reach.at_all(raised(grasp, lift_by))
-            ),
-            None,
-        )
+        for grasp in self._nearest(grasps, up_to=above_by):
+            descends = self.reach.descends(grasp, by=above_by, start=self.joint_target)
+            if descends and self.reach.at_all(raised(grasp, lift_by)):
+                return grasp
+        return None
+
+    def _nearest(self, poses: Sequence[Pose], *, up_to: float, others: Sequence[Pose] = ()) -> Iterator[Pose]:
+        """Poses that are reached from where the arm is, so many metres higher too; then those, and others, at all."""
+        yield from within(self.reaches, poses, up_to=up_to)
+        yield from within(self.reach.at_all, (*poses, *others), up_to=up_to)
 
     def move(
         self,
@@ -271,7 +267,7 @@ class Expert:
         """
         now = hand_yaw(self.tcp())
         places = [hand_down(position, yaw) for yaw in nearest_first(symmetric_yaws(now, 24), now)]
-        found = chain(filter(self.reaches, places), filter(self.reach.at_all, places))
+        found = self._nearest(places, up_to=0.0)
         place = next((place for place in found if self._path(place, speed=FREE_SPEED) is not None), None)
         if place is None:
             raise self._out_of_reach(f"{np.round(position, 3).tolist()}", places)
@@ -300,14 +296,11 @@ class Expert:
         self.phase = "close"
         seconds = max(1.5, self._stroke_seconds)
         yield from self.set_gripper(self._closed_width, max_seconds=seconds, done=steady_width(world))
-        held = self.holds(name)
-        if held:
+        if self.holds(name):
             self.phase = "lift"
             yield from self.move(raised(grasp, lift), speed=LIFT_SPEED)
-            risen = world.pose(name).position[2] - start_height
-            held = self.holds(name) and risen > 0.5 * lift
-        if held:
-            return True
+            if self.holds(name) and world.pose(name).position[2] - start_height > 0.5 * lift:
+                return True
         deliberate, self._missing = self._missing, False
         self.note("miss", f"missed {name}" + (" on purpose" if deliberate else ""), trouble=not deliberate)
         yield from self._recover(raised(grasp, above_by))
@@ -362,19 +355,14 @@ class Expert:
         except GaveUp:  # so much is enough to be clear of what was put down
             yield from self.move(least, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
-        if not self._keeps_bytes:
-            yield from self._until_at_rest(name)
+        for _ in range(0 if self._keeps_bytes else round(ROCKING_SECONDS * world.fps)):
+            if all(check.passed for check in rest_checks(world, name)):
+                break
+            yield self.step()
         failed = [check.name for check in placement_checks(world, goal) if not check.passed]
         if failed:
             self.note(f"misplaced_{failed[0]}", f"{name} lies badly: {', '.join(failed)}", trouble=True)
         return not failed
-
-    def _until_at_rest(self, name: str) -> Iterator[Step]:
-        """Hold still while an object that was let go of rocks, for half a second at most."""
-        for _ in range(round(ROCKING_SECONDS * self.world.fps)):
-            if is_at_rest(self.world, name):
-                return
-            yield self.step()
 
     def _transport_height(self, place: Pose) -> float:
         """Height of the TCP, m, on the way to a place: never lower than now."""
@@ -418,11 +406,10 @@ class Expert:
         wanted, hand = goal_pose(self.world, goal), self.tcp()
         places = places_of(body, pose, wanted, hand=hand, yaw_symmetry=symmetry)
         height = self._transport_height(places[0]) - float(places[0].position[2])
-        others = places
+        others: list[Pose] = []
         if not (keep_yaw or goal.yaw_symmetry):
-            others = [*places, *places_of(body, pose, wanted, hand=hand, yaw_symmetry=ANY_YAW)]
-        found = chain(within(self.reaches, places, up_to=height), within(self.reach.at_all, others, up_to=height))
-        place = next(found, None)
+            others = places_of(body, pose, wanted, hand=hand, yaw_symmetry=ANY_YAW)
+        place = next(self._nearest(places, up_to=height, others=others), None)
         if place is None:
             raise self._out_of_reach(f"the goal of {goal.object}", places)
         return place

@@ -7,14 +7,7 @@ import math
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.conditions import (
-    MAX_DISTANCE,
-    MAX_HEIGHT_ERROR,
-    MAX_SPEED,
-    MAX_SPIN,
-    MAX_TILT,
-    MIN_OPENING,
-)
+from demorec.episode.conditions import MAX_DISTANCE, MAX_HEIGHT_ERROR, MAX_SPEED, MAX_SPIN, MAX_TILT, MIN_OPENING
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal
 from demorec.sim.world import World
@@ -64,10 +57,13 @@ def on_support(world: World, name: str, onto: str) -> bool:
     )
 
 
-def is_at_rest(world: World, name: str) -> bool:
-    """Whether a body moves no faster than what counts as lying still."""
+def rest_checks(world: World, name: str, suffix: str = "") -> tuple[SuccessCheck, SuccessCheck]:
+    """That a body moves no faster than what counts as lying still; the suffix ends the checks' names."""
     linear, angular = world.velocity(name)
-    return math.hypot(*linear.tolist()) <= MAX_SPEED and math.hypot(*angular.tolist()) <= MAX_SPIN
+    return (
+        at_most(f"speed{suffix}", math.hypot(*linear.tolist()), MAX_SPEED, "m/s"),
+        at_most(f"spin{suffix}", math.hypot(*angular.tolist()), MAX_SPIN, "rad/s"),
+    )
 
 
 def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
@@ -79,7 +75,6 @@ def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
     pose, wanted = world.pose(goal.object), goal_pose(world, goal)
     distance = goal.distance(_support_pose(world, goal), pose)
     body = world.body(goal.object)
-    linear, angular = world.velocity(goal.object)
     # The wanted height is that of the resting face that was meant; a cube may rest on any face.
     height = wanted.position[2] + resting_half_height(body, pose) - resting_half_height(body, wanted)
     return (
@@ -88,8 +83,7 @@ def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
         at_least(f"on_support{suffix}", on_support(world, goal.object, goal.onto), 1.0, ""),
         # A box may rest on any face, a bottle may not.
         at_most(f"tilt{suffix}", lean_of(pose) if body.shape.mesh else tilt_of(pose), MAX_TILT, "rad"),
-        at_most(f"speed{suffix}", math.hypot(*linear.tolist()), MAX_SPEED, "m/s"),
-        at_most(f"spin{suffix}", math.hypot(*angular.tolist()), MAX_SPIN, "rad/s"),
+        *rest_checks(world, goal.object, suffix),
         at_most(f"touched_by_robot{suffix}", world.touches_robot(goal.object), 0.0, ""),
     )
 

@@ -10,12 +10,11 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.conditions import MAX_SPEED, MAX_SPIN, MAX_TILT
+from demorec.episode.conditions import MAX_TILT
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.render.cameras import FRONT, TOP, WORKSPACE, CameraPreset
 from demorec.robots.robot import RobotSpec
-from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.furniture import COLORS, floor
@@ -24,12 +23,7 @@ from demorec.tasks.reach import Reach, within
 from demorec.tasks.sampling import Sampler, wording
 from demorec.tasks.script import Behaviour, Step, lasting, steady_width
 from demorec.tasks.skills import Expert
-from demorec.tasks.success import (
-    at_least,
-    at_most,
-    gripper_open_check,
-    tilt_of,
-)
+from demorec.tasks.success import at_least, at_most, gripper_open_check, rest_checks, tilt_of
 
 ROBOT_SCALE = 1.3
 BASE = (1.0, 0.0, 0.1)
@@ -135,13 +129,12 @@ class Tutorial(Task):
 
     def is_in_reach(self, scene: Scene, robot: RobotSpec, behaviour: Behaviour) -> bool:
         """A grasp of the cube where it falls to, from 25 cm above it."""
-        reach = Reach.of(arm_kinematics(robot, scale=ROBOT_SCALE), scene, robot)
-        start, cube = np.array(scene.robot.joint_position), scene.body(scene.goals[0].object)
-        now = hand_yaw(reach.world_from_base @ reach.arm.forward(start))
+        reach, cube = Reach(scene, robot), scene.body(scene.goals[0].object)
         fallen = raised(cube.world_from_body, CUBE_SIDE / 2 - SINKS - CUBE_START[2])
+        now = hand_yaw(reach.tcp(reach.start))
         grasps = grasps_of(cube, fallen, now=now, robot=robot, behaviour=behaviour)
         found = within(reach.at_all, grasps, up_to=ABOVE_CUBE)
-        return any(reach.descends(grasp, by=ABOVE_CUBE, start=start) for grasp in found)
+        return any(reach.descends(grasp, by=ABOVE_CUBE, start=reach.start) for grasp in found)
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
         """What to do, in words."""
@@ -168,21 +161,18 @@ class Tutorial(Task):
         expert.phase = "release"
         # For a while: at the moment of landing the cube can be as slow as at rest. The last state has no frame; at rest
         # are that one and two recorded ones, at any rate.
-        rests = lasting(lambda: self._rests(world), steps=max(3, round(REST_SECONDS * world.fps)))
+        rests = lasting(
+            lambda: all(check.passed for check in self.evaluate(world)), steps=max(3, round(REST_SECONDS * world.fps))
+        )
         yield from expert.set_gripper(expert.open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
         """The cube lies on the table."""
         name = world.scene.goals[0].object
-        linear, angular = world.velocity(name)
         return (
             at_least("on_table", world.touches(name, "table"), 1.0, ""),
-            at_most("speed", math.hypot(*linear.tolist()), MAX_SPEED, "m/s"),
-            at_most("spin", math.hypot(*angular.tolist()), MAX_SPIN, "rad/s"),
+            *rest_checks(world, name),
             at_most("tilt", tilt_of(world.pose(name)), MAX_TILT, "rad"),
             at_most("touched_by_robot", world.touches_robot(name), 0.0, ""),
             gripper_open_check(world),
         )
-
-    def _rests(self, world: World) -> bool:
-        return all(check.passed for check in self.evaluate(world))

@@ -82,7 +82,7 @@ def wave(world: World, expert: Expert) -> Iterator[Step]:
     velocity: Array = np.zeros(7)
     for _ in range(45):
         velocity = 0.9 * velocity + random.normal(0.0, 0.012, 7)
-        expert.joint_target = np.clip(expert.joint_target + velocity, expert.arm.lower, expert.arm.upper)
+        expert.joint_target = np.clip(expert.joint_target + velocity, expert.reach.arm.lower, expert.reach.arm.upper)
         expert.gripper_target = 0.0
         yield expert.step()
 
