@@ -17,7 +17,7 @@ from demorec.objects.shelf import MATERIALS, Kind, Material
 from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
 from demorec.sim.solids import ROLLING_FRICTION, at_rest, with_parts
-from demorec.tasks.furniture import COLORS, mark, walls, words_for
+from demorec.tasks.furniture import COLORS, OTHER_COLORS, green_target, walls, words_for
 from demorec.tasks.grasping import found_grasps
 from demorec.tasks.placing import Layout, TableTask
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
@@ -145,7 +145,7 @@ def _things(sampler: Sampler, count: int, *, neutral: bool = False) -> list[Body
     kinds = [kind for shelf in sampler.shelves for kind in shelf.kinds if kind.numbers(sampler.object_split)]
     if not kinds:
         raise SceneError(f"The shelves have nothing for --object-split {sampler.object_split}.")
-    left = [(kind, color) for kind in kinds for color in (NEUTRAL_COLORS if neutral else kind.colors or _COLORS)]
+    left = [(kind, color) for kind in kinds for color in (NEUTRAL_COLORS if neutral else kind.colors or OTHER_COLORS)]
     things: dict[str, Body] = {}
     for _ in range(DRAWS * count):
         if not left or len(things) == count:
@@ -164,7 +164,6 @@ def _things(sampler: Sampler, count: int, *, neutral: bool = False) -> list[Body
     return list(things.values())
 
 
-_COLORS = tuple(name for name in COLORS if name != "green")
 _ALL_COLORS = {**COLORS, **NEUTRAL_COLORS}
 
 
@@ -216,7 +215,7 @@ def _resting(thing: Body, point: Sequence[float], floor: float = 0.0) -> Pose:
 
 def _mark_and_goal(sampler: Sampler, wanted: Body, start: tuple[float, float]) -> tuple[Body, Goal]:
     place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.16, what="the target")
-    target = mark("green_target", place, sampler.yaw(), side=0.10, color_name="green")
+    target = green_target(place, sampler.yaw(), side=0.10)
     return target, Goal(object=wanted.name, onto="", onto_from_goal=_resting(wanted, place), yaw_symmetry=0)
 
 

@@ -27,6 +27,8 @@ COLORS: Mapping[str, Rgba] = {
     "purple": (0.48, 0.22, 0.62, 1.0),
 }
 """Colours that have a name in instructions."""
+OTHER_COLORS = tuple(name for name in COLORS if name != "green")
+"""Of things that go to a green target."""
 
 
 def floor(height: float) -> Body:
@@ -87,6 +89,11 @@ def mark(name: str, point: tuple[float, float], yaw: float, *, side: float, colo
         collides=False,
         yaw_symmetry=4,
     )
+
+
+def green_target(point: tuple[float, float], yaw: float, *, side: float = 0.08) -> Body:
+    """The mark to which instructions send things."""
+    return mark("green_target", point, yaw, side=side, color_name="green")
 
 
 def cube(

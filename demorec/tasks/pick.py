@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from demorec.episode.scene import Body
-from demorec.tasks.furniture import COLORS, THINGS, make_thing, mark
-from demorec.tasks.placing import Layout, TableTask, on_table, random_cube
-from demorec.tasks.sampling import WORKSPACE, Region, Sampler
+from demorec.tasks.furniture import OTHER_COLORS, THINGS, green_target, make_thing
+from demorec.tasks.placing import Layout, TableTask, on_table, random_cube, start_and_target
+from demorec.tasks.sampling import Region, Sampler
 
 CLUTTER = Region(x=(0.33, 0.68), y=(-0.30, 0.30))
 OTHER_KINDS = ("block", "cylinder", "cube", "cube")
@@ -33,13 +33,9 @@ class PickPlace(TableTask):
 
     def layout(self, sampler: Sampler) -> Layout:
         """Draw it."""
-        start = sampler.point(WORKSPACE, what="the cube")
-        cube_yaw = sampler.yaw()
-        place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.12, what="the target")
-        place_yaw = sampler.yaw()
-        body = random_cube(sampler, "red", start, cube_yaw, sides=(0.03, 0.06))
-        target = mark("green_target", place, place_yaw, side=0.08, color_name="green")
-        return [target, body], [on_table(body, place, place_yaw)]
+        start, yaw, place, place_yaw = start_and_target(sampler, "the cube", apart=0.12)
+        body = random_cube(sampler, "red", start, yaw, sides=(0.03, 0.06))
+        return [green_target(place, place_yaw), body], [on_table(body, place, place_yaw)]
 
 
 class PickFromClutter(TableTask):
@@ -61,13 +57,8 @@ class PickFromClutter(TableTask):
 
     def layout(self, sampler: Sampler) -> Layout:
         """Draw it."""
-        colors = [name for name in COLORS if name != "green"]
-        order = sampler.rng.permutation(len(colors))
-        colors = [colors[i] for i in order]
-        start = sampler.point(WORKSPACE, what="the wanted cube")
-        yaw = sampler.yaw()
-        place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.14, what="the target")
-        place_yaw = sampler.yaw()
+        colors = [OTHER_COLORS[i] for i in sampler.rng.permutation(len(OTHER_COLORS))]
+        start, yaw, place, place_yaw = start_and_target(sampler, "the wanted cube")
         wanted = make_thing(sampler, "cube", f"{colors[0]}_cube", start, yaw, color_name=colors[0], role="object")
         taken, others = [start, place], list[Body]()
         for index in range(int(sampler.rng.integers(3, 6))):
@@ -77,8 +68,7 @@ class PickFromClutter(TableTask):
             color = colors[1 + index % (len(colors) - 1)]
             name = f"{color}_{kind}" if index < len(OTHER_KINDS) else f"other_{color}_{kind}"
             others.append(make_thing(sampler, kind, name, point, sampler.yaw(), color_name=color, role="distractor"))
-        target = mark("green_target", place, place_yaw, side=0.08, color_name="green")
-        return [target, wanted, *others], [on_table(wanted, place, place_yaw)]
+        return [green_target(place, place_yaw), wanted, *others], [on_table(wanted, place, place_yaw)]
 
 
 class PickShapes(TableTask):
@@ -101,12 +91,9 @@ class PickShapes(TableTask):
     def layout(self, sampler: Sampler) -> Layout:
         """Draw it."""
         kind = sampler.choice(KINDS)
-        color = sampler.choice([name for name in COLORS if name != "green"])
-        start = sampler.point(WORKSPACE, what="the thing")
-        yaw = sampler.yaw()
-        place = sampler.point(WORKSPACE, away_from=[start], min_distance=0.14, what="the target")
-        place_yaw = sampler.yaw()
+        color = sampler.choice(OTHER_COLORS)
+        start, yaw, place, place_yaw = start_and_target(sampler, "the thing")
         name = f"{color}_{kind}" if THINGS[kind].painted else kind
         thing = make_thing(sampler, kind, name, start, yaw, color_name=color, role="object")
-        target = mark("green_target", place, place_yaw, side=0.10, color_name="green")
+        target = green_target(place, place_yaw, side=0.10)
         return [target, thing], [on_table(thing, place, place_yaw, yaw_symmetry=0)]

@@ -21,7 +21,7 @@ from demorec.tasks.base import Task
 from demorec.tasks.furniture import cube, robot_at_origin, table_and_floor, words_for
 from demorec.tasks.reach import serves
 from demorec.tasks.recovery import finish, put_back
-from demorec.tasks.sampling import Sampler, wording
+from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
 from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import at_most, gripper_open_check, placement_checks
@@ -161,6 +161,15 @@ def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
         for body in world.scene.movable
         if body.name not in moved
     )
+
+
+def start_and_target(
+    sampler: Sampler, what: str, *, apart: float = 0.14, region: Region = WORKSPACE
+) -> tuple[tuple[float, float], float, tuple[float, float], float]:
+    """Point and yaw of where a thing is, and of where it shall go, so many metres away or more."""
+    start, yaw = sampler.point(region, what=what), sampler.yaw()
+    place = sampler.point(WORKSPACE, away_from=[start], min_distance=apart, what="the target")
+    return start, yaw, place, sampler.yaw()
 
 
 def random_cube(

@@ -71,12 +71,8 @@ class PlaceInTray(TableTask):
         point = sampler.point(CUBES, what="the cube")
         yaw = sampler.yaw()
         body = random_cube(sampler, "red", point, yaw, sides=(0.03, 0.06))
-        target = tray(
-            "blue_tray",
-            sampler.point(TRAYS, what="the tray"),
-            sampler.uniform(-0.25, 0.25),
-            color_name="blue",
-        )
+        place = sampler.point(TRAYS, what="the tray")
+        target = tray("blue_tray", place, sampler.uniform(-0.25, 0.25), color_name="blue")
         return [target, body], [into_tray(body, target)]
 
 
@@ -107,9 +103,7 @@ class SortByColor(TableTask):
             tray(f"{color}_tray", (sampler.uniform(0.36, 0.44), side * TRAY_Y), 0.0, color_name=color)
             for color, side in zip(colors, (1, -1), strict=True)
         ]
-        cubes: list[Body] = []
-        goals: list[Goal] = []
-        points: list[tuple[float, float]] = []
+        cubes, goals, points = list[Body](), list[Goal](), list[tuple[float, float]]()
         for color, count, target in zip(colors, counts, trays, strict=True):
             for slot in range(count):
                 point = sampler.point(SORTED_CUBES, away_from=points, min_distance=0.12, what="a cube")
