@@ -6,8 +6,7 @@ is named by stream, field and frame. So nothing can be wrong with a recording of
 other than what the program itself does wrong each time.
 """
 
-from demorec.replay.deep.check import DeepReport, deep_check, deep_checks
-from demorec.replay.deep.dataset import deep_dataset_checks
-from demorec.replay.deep.difference import Difference
+from demorec.replay.deep.check import DeepReport, deep_check, deep_checks, deep_dataset_checks
+from demorec.replay.deep.contents import Difference
 
 __all__ = ["DeepReport", "Difference", "deep_check", "deep_checks", "deep_dataset_checks"]

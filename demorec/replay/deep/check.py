@@ -1,4 +1,4 @@
-"""The deep check: a recording is made again, and everything in it must come out as it is recorded."""
+"""The deep check: a recording, or an episode of a dataset, is made again, and all of it must come out the same."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from demorec.check.dataset import Dataset
+from demorec.check.run_dataset import DatasetEpisode, dataset_episodes, episode_differences, export_options
 from demorec.core.config import deciding_versions
-from demorec.core.errors import DemorecError, resource_error
+from demorec.core.errors import ConfigError, DemorecError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.processes import in_turn
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import SimulatorCache
 from demorec.mcap import Recording, open_recording
-from demorec.replay.deep.contents import Contents, coded_topics, content_differences
-from demorec.replay.deep.difference import Difference
+from demorec.replay.deep.contents import Contents, Difference, coded_topics, content_differences
 from demorec.replay.deep.images import image_differences
-from demorec.replay.deep.remake import recorded_config, recorded_painter, remake
+from demorec.replay.deep.remake import generate_again, recorded_config, recorded_painter, remake
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
 from demorec.replay.drive import replay
 
@@ -86,9 +88,14 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
                 report = replace(report, replay=_replayed(recording, simulators, allowed))
             return replace(report, differences=differences)
     except DemorecError as error:
-        if (lack := resource_error(error)) is not None:
-            raise lack from error
-        return replace(report, error=str(error))
+        return _impossible(report, error)
+
+
+def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
+    """The report that it could not be made again; ResourceError where this machine cannot do it."""
+    if (lack := resource_error(error)) is not None:
+        raise lack from error
+    return replace(report, error=str(error))
 
 
 def versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
@@ -137,3 +144,51 @@ def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[st
                 yield deep_check(path, simulators, allowed)
         return
     yield from in_turn(partial(deep_check, allowed=tuple(allowed)), paths, workers)
+
+
+def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
+    """One report for each episode that the sidecar knows, in order; a single one where that cannot be done.
+
+    Each episode is made again from what the sidecar says of it, exported, and compared.
+
+    Raises:
+        ResourceError: This machine cannot do it, which says nothing about the dataset.
+    """
+    with closing(SimulatorCache()) as simulators:
+        try:
+            dataset = Dataset(path)
+            if not dataset.sidecar:
+                raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
+            dataset.check_simulated()
+            options = export_options(path)
+            infos = {each.number: each.info for each in dataset.described()}
+            for episode in dataset_episodes(dataset):
+                info = infos[episode.number]
+                report = DeepReport(
+                    path=path / f"episode {episode.number}",
+                    versions=version_differences(info.versions, versions_here(info, allowed)),
+                    num_frames=len(episode.rows["index"]),
+                )
+                try:
+                    found = tuple(_episode_differences(episode, info, options, simulators, allowed))
+                    yield replace(report, differences=found)
+                except DemorecError as error:
+                    yield _impossible(report, error)
+        except DemorecError as error:
+            yield _impossible(DeepReport(path=path), error)
+
+
+def _episode_differences(
+    episode: DatasetEpisode,
+    info: EpisodeInfo,
+    options: ExportOptions,
+    simulators: SimulatorCache,
+    allowed: Sequence[str],
+) -> Iterator[Difference]:
+    if info.origin:
+        raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
+    with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
+        again = Path(folder) / "again.mcap"
+        generate_again(info, again, simulators, allowed)
+        for what, frames in episode_differences(again, options, episode):
+            yield Difference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")

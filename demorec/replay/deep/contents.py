@@ -6,11 +6,12 @@ bytes in every message. Coded images that differ are left to `images`, which loo
 
 from __future__ import annotations
 
+import math
+import reprlib
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from demorec.mcap.channels import camera_topic
 from demorec.mcap.container import Container
 from demorec.mcap.messages import Value, message_fields
 from demorec.mcap.metadata import EPISODE
-from demorec.replay.deep.difference import Difference, Differences
 
 CODED = ("h264", "video", "image/compressed", "depth", "segmentation")
 """Streams of a camera whose messages hold a coded image in the field `data`."""
@@ -29,8 +29,59 @@ _SEAL = "crc32"
 _VERSIONS = "info.versions"
 """Reported by themselves, before all else."""
 
-Messages = Mapping[str, Mapping[int, list[bytes]]]
-"""Topic -> time in ns -> messages."""
+_SHOWN = reprlib.Repr(maxstring=80, maxother=80)
+
+Differing = tuple[str, str, int | None, Value | None, Value | None]
+"""Two values that differ: stream, field, frame if it belongs to one, what is recorded and what comes out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """One field of one stream that is not what it is when the recording is made again.
+
+    Attributes:
+        stream: A topic, or "metadata NAME", "attachment NAME".
+        field: Of its messages, as `pose.position.x`, or of the metadata, as `info.scene.bodies[1].mass`; "image" for
+            what a camera shows.
+        frames: In which, ascending; empty for what belongs to no frame.
+        recorded, again: What is recorded and what comes out, at the first of these frames, in words; `again` is ""
+            where `recorded` says it all.
+        largest: Largest absolute difference over these frames; None of what is no number.
+        is_coding: Whether an image is coded otherwise, but shows the same within the coder's own error.
+    """
+
+    stream: str
+    field: str
+    frames: tuple[int, ...] = ()
+    recorded: str
+    again: str
+    largest: float | None = None
+    is_coding: bool = False
+
+    @property
+    def first_frame(self) -> int:
+        """For the order: what belongs to no frame comes first."""
+        return self.frames[0] if self.frames else -1
+
+    def __str__(self) -> str:
+        where = f"{self.stream} {self.field}"
+        if self.frames:
+            where += f" at frame {self.frames[0]}"
+            if len(self.frames) > 1:
+                where += f" (and {len(self.frames) - 1} more, the last is {self.frames[-1]})"
+        if not self.again:
+            return f"{where}: {self.recorded}"
+        text = f"{where}: {self.recorded} is recorded, made again it is {self.again}"
+        return text if self.largest is None or len(self.frames) < 2 else f"{text}; at most {self.largest:.3g} apart"
+
+
+def difference_in_words(value: Value | None) -> str:
+    """A value as a person reads it; None is what is missing."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    return repr(value) if isinstance(value, bool | int | float) else _SHOWN.repr(value)
 
 
 @dataclass(kw_only=True)
@@ -104,34 +155,60 @@ def content_differences(
         info: Of the one made again.
         fps: Of the recording.
     """
-    found = Differences()
+    found: list[Differing] = []
     for name in recorded.attachments.keys() | again.attachments.keys():
         a, b = recorded.attachments.get(name), again.attachments.get(name)
         if a != b:
-            found.add(f"attachment {name}", "data", None, a, b)
+            found.append((f"attachment {name}", "data", None, a, b))
     for name in dict.fromkeys((*again.metadata, *recorded.metadata)):
-        for path, values in _metadata_differences(recorded.metadata.get(name), again.metadata.get(name)):
+        for path, a, b in _metadata_differences(recorded.metadata.get(name), again.metadata.get(name)):
             if not (name == EPISODE and path.startswith(_VERSIONS)):
-                found.add(f"metadata {name}", path, None, *values)
+                found.append((f"metadata {name}", path, None, a, b))
     images: dict[str, list[int]] = {}
     coded = coded_topics(info)
     for topic in dict.fromkeys((*again.channels, *recorded.channels)):
         if topic not in recorded.channels or topic not in again.channels:
-            counts = [sum(map(len, c.messages.get(topic, {}).values())) for c in (recorded, again)]
-            found.add(topic, "messages", None, *(count if count else None for count in counts))
+            ours, theirs = (sum(map(len, c.messages.get(topic, {}).values())) for c in (recorded, again))
+            found.append((topic, "messages", None, ours or None, theirs or None))
             continue
-        for name, values in _differing(recorded.channels[topic], again.channels[topic]):
-            found.add(topic, name, None, *values)
-        differing = _topic_differences(found, topic, recorded, again, fps=fps, is_coded=topic in coded)
-        if differing:
-            images[topic] = differing
-    return list(found), images
+        for name, a, b in _differing(recorded.channels[topic], again.channels[topic]):
+            found.append((topic, name, None, a, b))
+        for name, frame, a, b in _topic_differences(topic, recorded, again, fps):
+            if topic in coded and name == "data":
+                images.setdefault(topic, []).append(frame)
+            else:
+                found.append((topic, name, frame, a, b))
+    return list(_gathered(found)), images
 
 
-def _differing(a: Mapping[str, Value], b: Mapping[str, Value]) -> Iterator[tuple[str, tuple[Any, Any]]]:
+def _gathered(found: Iterable[Differing]) -> Iterator[Difference]:
+    """Those of one field over all frames as one."""
+    groups: dict[tuple[str, str], list[Differing]] = {}
+    for each in found:
+        groups.setdefault(each[:2], []).append(each)
+    for (stream, name), group in groups.items():
+        *_, recorded, again = group[0]
+        apart = [by for *_, a, b in group if (by := _apart(a, b)) is not None]
+        yield Difference(
+            stream=stream,
+            field=name,
+            frames=tuple(dict.fromkeys(frame for _, _, frame, *_ in group if frame is not None)),
+            recorded=difference_in_words(recorded),
+            again=difference_in_words(again),
+            largest=max(apart, default=None),
+        )
+
+
+def _apart(a: Value | None, b: Value | None) -> float | None:
+    if isinstance(a, bool) or isinstance(b, bool) or not isinstance(a, int | float) or not isinstance(b, int | float):
+        return None
+    return abs(a - b) if math.isfinite(a) and math.isfinite(b) else math.inf
+
+
+def _differing(a: Mapping[str, Value], b: Mapping[str, Value]) -> Iterator[tuple[str, Any, Any]]:
     for name in dict.fromkeys((*b, *a)):
         if not _is_same(a.get(name), b.get(name)):
-            yield name, (a.get(name), b.get(name))
+            yield name, a.get(name), b.get(name)
 
 
 def _is_same(a: Value | None, b: Value | None) -> bool:
@@ -142,45 +219,35 @@ def _is_same(a: Value | None, b: Value | None) -> bool:
 
 
 def _topic_differences(
-    found: Differences, topic: str, recorded: Contents, again: Contents, *, fps: int, is_coded: bool
-) -> list[int]:
-    """Add what differs in a topic; return the frames whose coded images differ."""
+    topic: str, recorded: Contents, again: Contents, fps: int
+) -> Iterator[tuple[str, int, Any, Any]]:
+    """(field, frame, recorded, made again) of what differs in a topic."""
     ours, theirs, schema = recorded.messages[topic], again.messages[topic], again.schemas[topic]
-    if ours == theirs:
-        return []
-    images = []
-    for time_ns in sorted(ours.keys() | theirs.keys()):
+    for time_ns in sorted(ours.keys() | theirs.keys()) if ours != theirs else ():
         a_messages, b_messages = ours.get(time_ns, []), theirs.get(time_ns, [])
         frame = round(time_ns * fps / 1e9)
         if len(a_messages) != len(b_messages):
-            found.add(topic, "messages", frame, len(a_messages) or None, len(b_messages) or None)
-        for a, b in zip_longest(a_messages, b_messages):
-            if a is None or b is None or a == b:
+            yield "messages", frame, len(a_messages) or None, len(b_messages) or None
+        for a, b in zip(a_messages, b_messages, strict=False):
+            if a == b:
                 continue
             try:
                 a_fields = message_fields(schema, a)
             except (ValueError, KeyError) as error:
-                found.add(topic, "message", frame, f"{len(a)} bytes that are none ({error})", b)
+                yield "message", frame, f"{len(a)} bytes that are none ({error})", b
                 continue
-            b_fields = message_fields(schema, b)
-            differing = dict(_differing(a_fields, b_fields))
-            if is_coded and differing.pop("data", None) is not None:
-                images.append(frame)
-            for name, values in differing.items():
-                found.add(topic, name, frame, *values)
-            if not differing and not (is_coded and images and images[-1] == frame):
-                found.add(topic, "padding", frame, a, b)
-    return images
+            differing = list(_differing(a_fields, message_fields(schema, b)))
+            for name, ours_now, theirs_now in differing or [("padding", a, b)]:
+                yield name, frame, ours_now, theirs_now
 
 
 def _metadata_differences(
     recorded: Mapping[str, str] | None, again: Mapping[str, str] | None
-) -> Iterator[tuple[str, tuple[Any, Any]]]:
+) -> Iterator[tuple[str, Any, Any]]:
     if recorded is None or again is None:
-        yield "record", (None if recorded is None else "a record", None if again is None else "a record")
+        yield "record", None if recorded is None else "a record", None if again is None else "a record"
         return
-    a, b = dict(_leaves(recorded)), dict(_leaves(again))
-    yield from _differing(a, b)
+    yield from _differing(dict(_leaves(recorded)), dict(_leaves(again)))
 
 
 def _leaves(values: Mapping[str, str]) -> Iterator[tuple[str, Value]]:

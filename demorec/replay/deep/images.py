@@ -24,8 +24,7 @@ from demorec.mcap.messages import message_fields
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 from demorec.render.painter import Painter
 from demorec.render.recorded import RecordedWorld
-from demorec.replay.deep.contents import Contents
-from demorec.replay.deep.difference import Difference
+from demorec.replay.deep.contents import Contents, Difference
 
 _BLOCK = 8
 """Pixels a side: those of a transform in H.264."""
