@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,6 @@ MAX_NORMALIZATIONS = 10
 """Two are usual; a world settles for more steps than this before its first frame."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Link:
     """A link below the base, and how it hangs on its parent.
 
@@ -45,13 +43,15 @@ class _Link:
         link_from_inertial: Its centre of mass.
     """
 
-    joint: UrdfJoint
-    parent: int
-    parent_from_pivot: Floats
-    pivot_from_centre: Floats
-    rest: Floats
-    axis: Floats
-    link_from_inertial: Transform
+    def __init__(self, joint: UrdfJoint, parent: int, parent_inertial: Transform, inertial: Transform) -> None:
+        parent_from_joint = _compose(_invert(parent_inertial), _of_origin(joint.parent_from_joint))
+        inertial_from_link = _invert(inertial)
+        turn = _quaternion(inertial_from_link[0])
+        self.joint, self.parent, self.link_from_inertial = joint, parent, inertial
+        self.parent_from_pivot = parent_from_joint[1]
+        self.pivot_from_centre = -inertial_from_link[1]
+        self.rest = _multiply(turn, _quaternion(_invert(parent_from_joint)[0]))
+        self.axis = _rotate(turn, np.array(joint.axis))
 
 
 class BulletBody:
@@ -77,7 +77,7 @@ class BulletBody:
         self._base_from_inertial = inertial[urdf.root]
         self.base_from_inertial = _pose(self._base_from_inertial)
         self._links = tuple(
-            _link(joint, self.link_names.index(joint.parent), inertial[joint.parent], inertial[joint.child])
+            _Link(joint, self.link_names.index(joint.parent), inertial[joint.parent], inertial[joint.child])
             for joint in joints
         )
 
@@ -123,21 +123,6 @@ def origin_as_told(pose: Pose) -> Pose:
 
 def _of_origin(pose: Pose) -> Transform:
     return _matrix(_normalized(pose.quat_xyzw)), pose.position
-
-
-def _link(joint: UrdfJoint, parent: int, parent_inertial: Transform, inertial: Transform) -> _Link:
-    parent_from_joint = _compose(_invert(parent_inertial), _of_origin(joint.parent_from_joint))
-    inertial_from_link = _invert(inertial)
-    turn = _quaternion(inertial_from_link[0])
-    return _Link(
-        joint=joint,
-        parent=parent,
-        parent_from_pivot=parent_from_joint[1],
-        pivot_from_centre=-inertial_from_link[1],
-        rest=_multiply(turn, _quaternion(_invert(parent_from_joint)[0])),
-        axis=_rotate(turn, np.array(joint.axis)),
-        link_from_inertial=inertial,
-    )
 
 
 def _move(link: _Link, position: Array) -> tuple[Floats, Floats]:

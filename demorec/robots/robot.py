@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import ClassVar
@@ -70,10 +69,6 @@ class ParallelGripper:
     def contact_force(self, width: Array) -> Array:
         """Sum (...), N, of the forces of all fingers on what keeps them at openings (...), metres, apart."""
         return np.full(np.shape(width), len(self.joints) * self.force)
-
-    def grip_force(self, finger_forces: Sequence[float]) -> float:
-        """With what force, N, an object is gripped on which the fingers press so, in the order of `finger_links`."""
-        return min(finger_forces)
 
     def object_offset(self, object_width: float) -> float:
         """From the TCP along its y to the middle of an object of this width, metres, before the fingers close on it."""
@@ -169,10 +164,6 @@ class JawGripper:
         """As of `ParallelGripper`: the jaw's force is its torque over d opening / d angle, the fixed finger's equal."""
         slope = np.abs(self._slope(self.joint_position(width)[..., 0]))
         return np.asarray(2 * self.force / np.maximum(slope, 1e-6))
-
-    def grip_force(self, finger_forces: Sequence[float]) -> float:
-        """As of `ParallelGripper`."""
-        return min(finger_forces)
 
     def object_offset(self, object_width: float) -> float:
         """As of `ParallelGripper`: the object begins a little beside the fixed finger, against which it is pushed."""

@@ -224,7 +224,7 @@ class World:
 
     def grip_force(self, name: str) -> float:
         """With what force (N) the hand grips a body of the scene; 0 when a finger does not touch it."""
-        return self.robot.gripper.grip_force(self.finger_forces(name))
+        return min(self.finger_forces(name))
 
     def pressed_from_above(self, name: str, *, force: float = 3.0) -> bool:
         """Whether the hand pushes down on a body with more than `force` N (at a contact steeper than 45 degrees)."""
