@@ -19,19 +19,20 @@ import numpy as np
 from demorec.core.config import deciding_versions
 from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Action, Columns, Frame, Observation, SuccessCheck, gave_up
+from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Physics, RobotPlacement, Scene
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.recording import frames_of
-from demorec.mcap.streams import action_at
+from demorec.mcap.streams import action_at, observation_at
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
     from demorec.check.evidence import Motion
 
+_EE_POSE = "the EE pose"
 _LEAST_HZ = Physics.hz
 """Of the physics of a real arm's replay, which takes whole steps between frames."""
 
@@ -148,6 +149,9 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
     # As the export does: where the arm shall be when the next observation is taken.
     sent = np.minimum(rows + stride - 1, columns.num_frames - 1)
     outcome = recording.outcome
+    sensed = [sensed_of(observation_at(columns, int(row))) for row in rows]
+    # Without physics only what follows from the states.
+    compared = [name for name in sensed[0] if name == _EE_POSE or not options.states]
     return Demonstration(
         name=recording.path.name,
         info=info,
@@ -156,7 +160,7 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         joint_position=columns.joint_position[rows],
         gripper_width=columns.gripper_width[rows],
         object_poses={name: poses[rows] for name, poses in columns.object_poses.items()},
-        sensed={name: table[rows] for name, table in _sensed(columns, is_moved=not options.states).items()},
+        sensed={name: np.array([values[name] for values in sensed]) for name in compared},
         recorded_success=None if outcome is None else outcome.success,
         final_state_digest="" if outcome is None or stride > 1 else outcome.final_state_digest,
         # Placing a body normalises its quaternion once more.
@@ -168,26 +172,13 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
     )
 
 
-def _sensed(columns: Columns, *, is_moved: bool) -> dict[str, Array]:
-    """What is recorded beside the states that a world can be put in; without physics only what follows from these."""
-    if not is_moved:
-        return {"the EE pose": columns.base_from_tcp}
-    return {
-        "joint velocities": columns.joint_velocity,
-        "joint efforts": columns.joint_effort,
-        "the contact force": columns.contact_force[:, None],
-        "the EE pose": columns.base_from_tcp,
-        **{f"the {name}": table for name, table in columns.sensed.items()},
-    }
-
-
-def sensed_now(observation: Observation) -> dict[str, Array]:
-    """The same words -> (D,) of what is sensed in a replay."""
+def sensed_of(observation: Observation) -> dict[str, Array]:
+    """Words -> (D,) of what is sensed beside the states that a world can be put in."""
     return {
         "joint velocities": observation.joint_velocity,
         "joint efforts": observation.joint_effort,
         "the contact force": np.array([observation.contact_force]),
-        "the EE pose": observation.base_from_tcp.vector(),
+        _EE_POSE: observation.base_from_tcp.vector(),
         **{f"the {name}": values for name, values in observation.sensed.items()},
     }
 

@@ -14,7 +14,6 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.files import make_folder
 from demorec.core.geometry import Array
-from demorec.core.plain import from_plain
 from demorec.core.seeding import generator
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Action, Frame, Observation, Outcome, SuccessCheck
@@ -23,8 +22,8 @@ from demorec.loop.actions import ActionDecoder
 from demorec.mcap import EpisodeWriter
 from demorec.mcap.streams import pose_of
 from demorec.render.painter import Painter
-from demorec.replay.demonstration import Demonstration, ReplayOptions, sensed_now
-from demorec.replay.rerender import recorded_view, view_behaviour, view_painter
+from demorec.replay.demonstration import Demonstration, ReplayOptions, sensed_of
+from demorec.replay.rerender import config_as, recorded_view, view_behaviour, view_painter
 from demorec.robots.assets import allow_models
 from demorec.sim.world import World
 
@@ -269,7 +268,7 @@ def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Arr
         "gripper opening": (np.array([now.gripper_width for now in seen]) - d.gripper_width[:num_steps])[:, None],
     }
     for name, recorded in d.sensed.items():
-        off[name] = np.array([sensed_now(now)[name] for now in seen]) - recorded[:num_steps]
+        off[name] = np.array([sensed_of(now)[name] for now in seen]) - recorded[:num_steps]
     for name, poses in d.object_poses.items():
         off[f"the pose of {name}"] = np.array([now.object_poses[name].vector() for now in seen]) - poses[:num_steps]
     return off
@@ -341,7 +340,7 @@ def record_replay(
     make_folder(out)
     behaviour = view_behaviour(d.info, view)
     info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}").with_simulation(behaviour=behaviour)
-    video = from_plain(d.info.config.get("video", {}), VideoConfig)
+    video = config_as(d.info.config.get("video", {}), VideoConfig)
     world, renderer = simulators.acquire(info)
     painter = view_painter(renderer, view, d.info.config) if renderer else None
     with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:

@@ -112,7 +112,7 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
     """
     if not info.origin and any(name.startswith("calibration_") for name in info.behaviour):
         try:
-            config = from_plain(info.config, GenerateConfig)
+            config = config_as(info.config, GenerateConfig)
             config.check_names(allowed)
             plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
             episode = prepare(plan)
@@ -122,14 +122,14 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
             episode = None
         if episode is not None and episode.info.scene == info.scene:
             return SceneView(
-                scene=info.scene, true_cameras=episode.cameras, true_from_recorded=dict(episode.true_from_recorded)
+                scene=info.scene, true_cameras=episode.cameras, true_from_recorded=episode.true_from_recorded
             )
-    stated = {camera.name: stated_error(camera.name, info.behaviour) for camera in info.scene.cameras}
-    errors = {name: error for name, error in stated.items() if error is not None}
-    true_cameras = tuple(
-        true_camera(camera, errors[camera.name]) if camera.name in errors else camera for camera in info.scene.cameras
-    )
-    return SceneView(scene=info.scene, true_cameras=true_cameras, true_from_recorded=errors)
+    cameras, errors = [], dict[str, Pose]()
+    for camera in info.scene.cameras:
+        if (error := stated_error(camera.name, info.behaviour)) is not None:
+            errors[camera.name], camera = error, true_camera(camera, error)
+        cameras.append(camera)
+    return SceneView(scene=info.scene, true_cameras=tuple(cameras), true_from_recorded=errors)
 
 
 def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
@@ -194,6 +194,14 @@ def _check_size(camera: SceneCamera) -> None:
             raise ConfigError(f"The {what} of the camera {camera.name!r} is {value}: it must be even, 16 to 8192.")
 
 
+def config_as[T](config: object, kind: type[T]) -> T:
+    """A recorded config, or a part of it; ConfigError for what is none of this version."""
+    try:
+        return from_plain(config, kind)
+    except ValueError as error:
+        raise ConfigError(f"The recorded config is none of this version ({error}).") from error
+
+
 def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any]) -> Painter:
     """A painter that draws worlds in a view's scene as the view and the config of a recording ask for.
 
@@ -256,7 +264,7 @@ def rerender(
             raise RecordingError(f"The recording has no frames: {source}")
         view, config = new_view(info, options), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
-        video = from_plain(config.get("video", {}), VideoConfig)
+        video = config_as(config.get("video", {}), VideoConfig)
         new_info = replace(info, origin=f"render of {recording.digest()[:16]}").with_simulation(
             scene=view.scene, behaviour=view_behaviour(info, view), config=config, config_digest=digest(config)
         )

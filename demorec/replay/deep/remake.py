@@ -7,8 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.core.errors import ConfigError
-from demorec.core.plain import digest, from_plain
+from demorec.core.plain import digest
 from demorec.core.tables import RENDERERS
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
@@ -17,7 +16,7 @@ from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
 from demorec.replay.drive import replay
-from demorec.replay.rerender import recorded_view, view_painter
+from demorec.replay.rerender import config_as, recorded_view, view_painter
 from demorec.robots.assets import allow_models
 
 
@@ -28,7 +27,7 @@ def recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConf
         ConfigError: It is none.
         NotAllowedError: It names something of a module that is not among those `allowed`.
     """
-    config = _recorded(info.config, GenerateConfig)
+    config = config_as(info.config, GenerateConfig)
     config.check_names(allowed)
     config.validate()
     return config
@@ -77,7 +76,7 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
     painter = recorded_painter(info, renderer, allowed)
-    with EpisodeWriter(path, info, video=_recorded(info.config.get("video", {}), VideoConfig)) as writer:
+    with EpisodeWriter(path, info, video=config_as(info.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
             recorded = recording.outcome
@@ -89,14 +88,6 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
                 success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
             )
         writer.finish(outcome)
-
-
-def _recorded[T](config: object, kind: type[T]) -> T:
-    """The recorded config, or a part of it."""
-    try:
-        return from_plain(config, kind)
-    except ValueError as error:
-        raise ConfigError(f"The recorded config is none of this version ({error}).") from error
 
 
 def recorded_painter(info: EpisodeInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
