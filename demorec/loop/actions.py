@@ -7,7 +7,7 @@ from typing import get_args
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose, wrap_angle
+from demorec.core.geometry import Array, Pose
 from demorec.episode import features
 from demorec.episode.episode import Action
 from demorec.episode.features import ActionKind
@@ -88,7 +88,9 @@ class ActionDecoder:
             self._tcp_target = features.pose_from_delta(self._tcp_target, values)
         else:
             self._tcp_target = _pose(values[:7], otherwise=self._tcp_target)
-        rest = self._rest() if self._is_limited else None
+        rest = None
+        if self._is_limited:
+            rest = self._kinematics.turned_towards(np.array(self._robot.home_q), self._tcp_target.position)
         found = self._kinematics.inverse(self._tcp_target, start=self._joint_target, rest=rest, null_gain=NULL_GAIN)
         if found is None:
             self.num_unreachable += 1
@@ -96,14 +98,6 @@ class ActionDecoder:
             if self._is_limited:
                 self._tcp_target = self._kinematics.forward(found)
         return found
-
-    def _rest(self) -> Array:
-        """The home configuration turned towards the TCP target, as the expert's."""
-        rest = np.array(self._robot.home_q)
-        home = self._kinematics.forward(rest).position
-        x, y, _ = self._tcp_target.position
-        rest[0] += wrap_angle(math.atan2(y, x) - math.atan2(home[1], home[0]))
-        return rest
 
 
 def _pose(values: Array, *, otherwise: Pose) -> Pose:
