@@ -36,7 +36,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError
 from demorec.core.processes import in_turn
 from demorec.episode.episode import Action
-from demorec.loop import Decision, ScriptAgent, Session, SimulatorCache, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, Step, prepare
 from demorec.sim.world import World
 
 SIMULATED = ("slip", "detour", "hesitation")
@@ -73,15 +73,15 @@ class Clumsy:
     def failure(self, failed: Sequence[str]) -> tuple[str, str]:
         return self._inner.failure(failed)
 
-    def decide(self, world: World) -> Iterator[Decision]:
+    def decide(self, world: World) -> Iterator[Step]:
         count, held, friction = 0, -1, 0.0
-        for decision in self._inner.decide(world):
-            yield decision
-            count += decision.phase == self._phase or count >= self._after
+        for step in self._inner.decide(world):
+            yield step
+            count += step.phase == self._phase or count >= self._after
             if self._kind != "slip":
                 if count == self._after:
                     self.happened = True
-                    yield from self._fault(world, decision)
+                    yield from self._fault(world, step)
             elif count == self._after:
                 held = world._bodies[max((body.name for body in world.scene.movable), key=world.grip_force)]
                 friction = world.client.getDynamicsInfo(held, -1)[1]
@@ -92,7 +92,7 @@ class Clumsy:
                 self.happened = not world.client.getContactPoints(world.arm.body, held)
                 world.client.resetBaseVelocity(held, linearVelocity=[0.0, 0.0, -0.3])
 
-    def _fault(self, world: World, decision: Decision) -> Iterator[Decision]:
+    def _fault(self, world: World, step: Step) -> Iterator[Step]:
         rng, hold = self._rng, world.hold()
         seconds = float(rng.uniform(*self._pause) if self._kind == "hesitation" else rng.uniform(1.2, 2.5))
         way = np.zeros(len(hold.joint_target))
@@ -105,7 +105,7 @@ class Clumsy:
                 gripper_target=hold.gripper_target,
                 base_from_tcp_target=world.arm.kinematics.forward(target),
             )
-            yield replace(decision, action=action, command=action, events=())
+            yield replace(step, action=action, command=action, events=())
 
 
 def simulate(job: tuple[str, int, str, str]) -> Path:

@@ -30,7 +30,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.episode.variation import Preset
-from demorec.loop import Decision, Episode, Session, SimulatorCache, prepare
+from demorec.loop import Episode, Session, SimulatorCache, Step, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
 from demorec.render.painter import Painter, WarmRenderer
 from demorec.sim.world import World
@@ -237,8 +237,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     def step(self, action: NDArray[np.floating]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One control step; ValueError for an action of a wrong shape or with a value that is no number."""
-        command = self.command_for(action)
-        return self.act(Decision(action=command, command=command, phase=POLICY_PHASE))
+        return self.act(Step(action=self.command_for(action), phase=POLICY_PHASE))
 
     def command_for(self, action: NDArray[np.floating]) -> Action:
         """What `step` would send now; errors as there. Deltas go on from here, unless `act` sends something else."""
@@ -248,11 +247,11 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             raise ValueError(f"An action has shape {self.action_space.shape} and finite values, found {values!r}.")
         return self._decoder.command(values)
 
-    def act(self, decision: Decision) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def act(self, step: Step) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One control step as `step` makes it, whoever decided it; its command is sent as it is."""
         session = _after_reset(self._session)
-        self._decoder.follow(decision.command)
-        frame = session.frame(decision)
+        frame = session.frame(step)
+        self._decoder.follow(frame.command)
         session.step(frame.command)
         self._situation = self._look(session, frame)
         success = self._situation.is_success

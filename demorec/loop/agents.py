@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.episode.episode import Action, Event
+from demorec.episode.episode import Action
 from demorec.episode.features import NOISE_DECAY
 from demorec.loop.prepare import Episode
 from demorec.sim.world import World
@@ -51,23 +51,6 @@ class ActionNoise:
         return self._arm.action(target, step.action.gripper_target)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Decision:
-    """What an agent wants done in one control step; recorded in the `Frame` of that step.
-
-    Attributes:
-        action: The label, what a policy shall learn to say.
-        command: What is sent to the motors.
-        phase, events, is_deliberate_miss: As of `Frame`.
-    """
-
-    action: Action
-    command: Action
-    phase: str = ""
-    events: tuple[Event, ...] = ()
-    is_deliberate_miss: bool = False
-
-
 class Agent(Protocol):
     """Acts in a run of a session."""
 
@@ -75,8 +58,8 @@ class Agent(Protocol):
     def num_retries(self) -> int:
         """How often something had to be tried again."""
 
-    def decide(self, world: World) -> Iterator[Decision]:
-        """One decision a control step, from a reset world on; the world has advanced when the iterator resumes."""
+    def decide(self, world: World) -> Iterator[Step]:
+        """What to do, step by step, from a reset world on; the world has advanced when the iterator resumes."""
 
     def failure(self, failed: Sequence[str]) -> tuple[str, str]:
         """Phase and reason of a failure, ("", "") for a success.
@@ -99,19 +82,13 @@ class ScriptAgent:
         """See `Agent`."""
         return 0 if self._expert is None else self._expert.num_retries
 
-    def decide(self, world: World) -> Iterator[Decision]:
+    def decide(self, world: World) -> Iterator[Step]:
         """See `Agent`."""
         behaviour = self._episode.behaviour
         self._expert, self._gave_up = Expert(world, behaviour), None
         noise = ActionNoise(world, sigma=behaviour.action_noise, rng=self._episode.rng("noise"), fps=world.fps)
         for step in self._steps(self._expert):
-            yield Decision(
-                action=step.action,
-                command=noise.command(step),
-                phase=step.phase,
-                events=step.events,
-                is_deliberate_miss=step.is_deliberate_miss,
-            )
+            yield replace(step, command=noise.command(step))
 
     def _steps(self, expert: Expert) -> Iterator[Step]:
         """The script; when the expert gives up, one step more, which carries the events that say why.

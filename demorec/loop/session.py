@@ -18,12 +18,13 @@ from demorec.episode.episode import (
     frame_time_ns,
 )
 from demorec.episode.scene import Scene
-from demorec.loop.agents import Agent, Decision
+from demorec.loop.agents import Agent
 from demorec.loop.prepare import Episode
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.sim.world import World
 from demorec.tasks.base import Task
+from demorec.tasks.script import Step
 
 
 class Session:
@@ -115,11 +116,11 @@ class Session:
         """
         self.reset()
         stopped = ("", "")
-        for decision in agent.decide(self.world):
+        for step in agent.decide(self.world):
             if self.frame_index == self._max_frames:
-                stopped = (decision.phase, TIME_LIMIT)
+                stopped = (step.phase, TIME_LIMIT)
                 break
-            frame = self.frame(decision)
+            frame = self.frame(step)
             yield frame
             self.step(frame.command)
         checks = self.checks()
@@ -142,19 +143,19 @@ class Session:
         self._outcome = None
         self._arrive(0)
 
-    def frame(self, decision: Decision) -> Frame:
-        """The present frame: what is seen now, and what was decided on it."""
+    def frame(self, step: Step) -> Frame:
+        """The present frame: what is seen now, and what is wanted then."""
         return Frame(
             frame_index=self.frame_index,
             time_ns=frame_time_ns(self.frame_index, self.world.fps),
             observation=self.observation,
-            action=decision.action,
-            command=decision.command,
-            phase=decision.phase,
-            events=decision.events,
+            action=step.action,
+            command=step.action if step.command is None else step.command,
+            phase=step.phase,
+            events=step.events,
             images=self.images,
             joint_samples=self.world.joint_samples,
-            is_deliberate_miss=decision.is_deliberate_miss,
+            is_deliberate_miss=step.is_deliberate_miss,
         )
 
     def step(self, command: Action) -> None:

@@ -17,7 +17,7 @@ from demorec.core.geometry import Array
 from demorec.core.seeding import generator
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Action, Frame, Observation, Outcome, SuccessCheck
-from demorec.loop import Decision, Session, SimulatorCache
+from demorec.loop import Session, SimulatorCache, Step
 from demorec.loop.actions import ActionDecoder
 from demorec.mcap import EpisodeWriter
 from demorec.mcap.streams import pose_of
@@ -122,11 +122,11 @@ class DemonstrationAgent:
         """Steps whose pose inverse kinematics did not reach, or whose target is not a number."""
         return self._num_held + (0 if self._decoder is None else self._decoder.num_unreachable)
 
-    def decide(self, world: World) -> Iterator[Decision]:
+    def decide(self, world: World) -> Iterator[Step]:
         """See `demorec.loop.Agent`; label, phase and events are those of the recorded frame, if there is one."""
         recorded = chain(self._demonstration.recorded, repeat(None))
         for command in self._sent(world):
-            yield _decision(command, next(recorded))
+            yield _step(command, next(recorded))
 
     def _sent(self, world: World) -> Iterator[Action]:
         d, options = self._demonstration, self._options
@@ -155,10 +155,10 @@ class DemonstrationAgent:
         return ("replay", failed[0]) if failed else ("", "")
 
 
-def _decision(command: Action, recorded: Frame | None) -> Decision:
+def _step(command: Action, recorded: Frame | None) -> Step:
     if recorded is None:
-        return Decision(action=command, command=command)
-    return Decision(
+        return Step(action=command)
+    return Step(
         action=recorded.action,
         command=command,
         phase=recorded.phase,
@@ -187,7 +187,7 @@ def _placed(session: Session, d: Demonstration) -> Iterator[Frame]:
             object_poses={name: pose_of(poses[step]) for name, poses in d.object_poses.items()},
         )
         command = session.world.hold() if recorded is None else recorded.command
-        yield session.frame(_decision(command, recorded))
+        yield session.frame(_step(command, recorded))
 
 
 def _recorded_outcome(d: Demonstration, world: World) -> Outcome:

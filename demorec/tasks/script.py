@@ -48,10 +48,11 @@ class Behaviour:
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """One control step of a script.
+    """What is wanted in one control step, of a script or of any other agent; recorded in the `Frame` of that step.
 
     Attributes:
-        action: What the expert wants.
+        action: The label, what a policy shall learn to say.
+        command: What is sent to the motors; None: the action.
         phase: "approach", "lift", ...
         noise_allowed: Whether exploration noise does no harm now (free motion, away from objects).
         events: What happened since the step before.
@@ -59,7 +60,8 @@ class Step:
     """
 
     action: Action
-    phase: str
+    command: Action | None = None
+    phase: str = ""
     noise_allowed: bool = False
     events: tuple[Event, ...] = ()
     is_deliberate_miss: bool = False

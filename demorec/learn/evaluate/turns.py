@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from demorec.gym_env import SUCCESS_FRAMES, DemorecEnv
 from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.policy import Policy
 from demorec.learn.evaluate.watch import Watch, correcting_behaviour
-from demorec.loop.agents import ActionNoise, Decision
+from demorec.loop.agents import ActionNoise
 from demorec.mcap import open_recording
 from demorec.sim.world import World
 from demorec.tasks.recovery import TAKE_OVER
@@ -99,7 +99,7 @@ class Turns:
             reason = "" if self._watch is None else self._watch.reason(env.situation, command)
             if reason:
                 return reason
-            yield self._step(Decision(action=command, command=command, phase=POLICY_PHASE, events=events))
+            yield self._step(Step(action=command, phase=POLICY_PHASE, events=events))
             events = ()
             if self.success or (self._watch is None and self._is_out_of_time):
                 return ""
@@ -115,7 +115,7 @@ class Turns:
             is_back = step.phase not in _RECOVERY
             if self._hands_back and is_back and self._watch and not self._watch.is_over(self._env.situation):
                 return True
-            yield self._step(Decision(action=step.action, command=command, phase=step.phase, events=step.events))
+            yield self._step(replace(step, command=command))
             self.num_retries = retries + expert.num_retries
             if self.success:
                 return False
@@ -134,13 +134,13 @@ class Turns:
         for _ in range(SUCCESS_FRAMES):
             yield expert.step()
 
-    def _step(self, decision: Decision) -> Frame:
-        self._observation, _, self.success, self._is_out_of_time, _ = self._env.act(decision)
-        self._commands.append(decision.command)
+    def _step(self, step: Step) -> Frame:
+        self._observation, _, self.success, self._is_out_of_time, _ = self._env.act(step)
         goals = self._env.info.scene.goals
         self._stages = [max(stage, self._reached(goal, stage)) for goal, stage in zip(goals, self._stages, strict=True)]
         frame = self._env.situation.last_frame
         assert frame is not None  # since there was a step
+        self._commands.append(frame.command)
         return frame
 
     def _reached(self, goal: Goal, stage: int) -> int:
