@@ -30,7 +30,7 @@ from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode, spoken_of
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, RowStream, episode_places, read_tasks
+from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot, robot_of_motors
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.episode.features import (
@@ -125,8 +125,8 @@ class Dataset:
         missing = [name for name in AUTOMATIC_FEATURES if name not in self.info.features]
         if missing:
             raise ExportError(f"info.json has no feature {', '.join(missing)}: {self.path}")
-        reader = RowReader(self.path, self.info)
-        return [self._usable(place, reader.read(place)) for place in self.places]
+        reader = RowStream(self.info)
+        return [self._usable(place, reader.numbers(place)) for place in self.places]
 
     def _usable(self, place: EpisodePlace, rows: Rows) -> Rows:
         if place.length == 0:
@@ -177,7 +177,7 @@ class Dataset:
     def images(self, key: str) -> list[EpisodeImages]:
         """What is decoded of a camera in each episode, kept from the first call on."""
         if key not in self._images:
-            self._images[key] = episode_images(self.path, self.info, self.places, key)
+            self._images[key] = episode_images(self.info, self.places, key)
         return self._images[key]
 
     @cached_property
@@ -257,7 +257,7 @@ class Dataset:
         """What the language columns of each episode hold; empty for a dataset without them."""
         if not set(COLUMNS) <= set(self.info.features):
             return []
-        stream = RowStream(self.path, self.info, COLUMNS)
+        stream = RowStream(self.info, COLUMNS)
         return [spoken_of(stream.batches(place), self.path) for place in self.places]
 
     @cached_property

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from demorec.core.errors import ExportError, MissingDependencyError, ResourceErr
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.layout import EPISODES_PATH, TASKS_PATH, VIDEO_PATH, FilePosition
+from demorec.datasets.lerobot.layout import EPISODES_PATH, TASKS_PATH, FilePosition
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
 
@@ -91,13 +92,12 @@ def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
 
 def _stray_rows(dataset: Dataset) -> Iterator[str]:
     """Rows of the data files that belong to no episode."""
-    used: dict[str, int] = {}
+    used: dict[Path, int] = {}
     for place in dataset.places:
-        path = place.data.path(dataset.info.data_path)
-        used[path] = used.get(path, 0) + place.length
+        used[place.data] = used.get(place.data, 0) + place.length
     for file in sorted((dataset.path / "data").glob("*/*.parquet")):
         found = open_table(file).metadata.num_rows
-        if (count := used.get(file.relative_to(dataset.path).as_posix(), 0)) != found:
+        if (count := used.get(file, 0)) != found:
             yield f"{file.name} has {found} rows, {count} of them of episodes"
 
 
@@ -133,10 +133,9 @@ def dataset_strays(dataset: Dataset) -> Measurement | None:
     """
     if dataset.info.is_old:
         return None
-    template = dataset.info.video_path or VIDEO_PATH
-    used = {position.path(template, key) for place in dataset.places for key, (position, _) in place.videos.items()}
-    found = {path.relative_to(dataset.path).as_posix() for path in (dataset.path / "videos").rglob("*.mp4")}
-    strays = [*sorted(found - used), *_said_elsewhere(dataset)]
+    used = {path for place in dataset.places for path, _ in place.videos.values()}
+    found = sorted(set((dataset.path / "videos").rglob("*.mp4")) - used)
+    strays = [*(path.relative_to(dataset.path).as_posix() for path in found), *_said_elsewhere(dataset)]
     return Measurement(value=len(strays), detail=", ".join(strays[:3]))
 
 
@@ -164,12 +163,12 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
         return None
     wrong = []
     for key in dataset.info.video_keys:
-        reader = PacketReader(dataset.path, dataset.info, key)
-        ends: dict[object, int] = {}
+        reader = PacketReader(key)
+        ends: dict[Path, int] = {}
         try:
             for place in dataset.places:
-                position, first = place.videos[key]
-                end, ends[position] = ends.get(position, 0), first + place.length
+                path, first = place.videos[key]
+                end, ends[path] = ends.get(path, 0), first + place.length
                 for number, _ in enumerate(reader.read(place)):
                     # Between two episodes there is nothing but what the second one is decoded from.
                     if number == 0 and first != end and reader.keyframe != end:

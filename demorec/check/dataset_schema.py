@@ -14,7 +14,7 @@ from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import check_video, open_table, read_json
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, VIDEO_PATH, DatasetFeature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX
 from demorec.episode.features import ACTION, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, observation_names
@@ -99,9 +99,7 @@ def _videos(dataset: Dataset) -> Iterator[str]:
         said: dict[str, Any] = {"height": height, "width": width}
         said |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
         said |= {"sound": info["has_audio"]} if isinstance(info.get("has_audio"), bool) else {}
-        positions = dict.fromkeys(place.videos[key][0] for place in dataset.places)
-        for position in positions:
-            path = dataset.path / position.path(dataset.info.video_path or VIDEO_PATH, key)
+        for path in dict.fromkeys(place.videos[key][0] for place in dataset.places):
             found, rate = _stream(path)
             for quantity, value in found.items():
                 if quantity in said and said[quantity] != value:

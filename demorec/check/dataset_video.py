@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import check_video
-from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
+from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.reader import EpisodePlace
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class EpisodeImages:
     detail: Array
 
 
-def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace], key: str) -> list[EpisodeImages]:
+def episode_images(info: DatasetInfo, places: Sequence[EpisodePlace], key: str) -> list[EpisodeImages]:
     """Of every episode, in order, one episode in memory at a time.
 
     Raises:
@@ -57,8 +57,7 @@ def episode_images(root: Path, info: DatasetInfo, places: Sequence[EpisodePlace]
     ends: dict[Path, int] = {}
     found = []
     for place in places:
-        position, first = place.videos[key]
-        path = root / position.path(info.video_path or VIDEO_PATH, key)
+        path, first = place.videos[key]
         if path not in files:
             files[path] = _decoded(path, info.features[key].shape)
         lead, ends[path] = max(0, first - ends.get(path, 0)), first + place.length

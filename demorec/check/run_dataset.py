@@ -75,10 +75,7 @@ def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:
     """Every episode that the sidecar knows, in order; ExportError when a file cannot be read."""
     details = read_rows(dataset.path / SIDECAR_DIR, EPISODE_SCHEMA.names)
     with ExitStack() as stack:
-        readers = {
-            key: stack.enter_context(closing(PacketReader(dataset.path, dataset.info, key)))
-            for key in dataset.info.video_keys
-        }
+        readers = {key: stack.enter_context(closing(PacketReader(key))) for key in dataset.info.video_keys}
         for row in sorted(details, key=lambda row: int(row["episode_index"])):
             if (number := int(row["episode_index"])) in range(len(dataset.rows)):
                 place = dataset.places[number]

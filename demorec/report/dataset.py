@@ -19,7 +19,7 @@ from demorec.core.errors import ConfigError, ExportError, describe_error, withou
 from demorec.datasets.lerobot.files import read_json, read_table
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import EpisodePlace, RowReader, episode_places
+from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.episode.episode import Outcome, SuccessCheck
@@ -46,25 +46,25 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
     rows, left_out, configs = _read_sidecar(root)
     missing = list(_missing(info, has_sidecar=bool(rows)))
     key = _camera_key(info, camera, root)
-    stored = None if key is None or info.features[key].is_video else StoredImages(root, info, key)
+    stored = None if key is None or info.features[key].is_video else StoredImages(info, key)
     wanted = {
         name: item
         for name, item in info.features.items()
         if name in (STATE, ACTION, _SUCCESS) and item.dtype in _NUMBERS and len(item.shape) == 1
     }
-    reader = RowReader(root, replace(info, features=wanted)) if wanted else None
+    reader = RowStream(info, list(wanted)) if wanted else None
     total = info.total_episodes + len(left_out) + (checks is not None)
     stride = max(1, -(-info.total_episodes // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
     flags = {} if checks is None else _flags(root, info, missing, images=checks.images)
     for number, place in enumerate(episode_places(root, info)):
-        columns = {} if reader is None else reader.read(place)
+        columns = {} if reader is None else reader.numbers(place)
         _count_components(components, root, info, columns)
         strip, problem = None, ""
         odd = flags.get(place.episode_index, ())
         if key is not None and (odd or number % stride == 0):
-            images_at = partial(stored.read, place) if stored else EpisodeVideo(root, info, key, place).images_at
+            images_at = partial(stored.read, place) if stored else EpisodeVideo(info, key, place).images_at
             strip, problem = _strip(root, info, key, place, images_at)
         episode = _episode(place, info.fps, columns, rows.get(place.episode_index))
         episodes.append(replace(episode, filmstrip=strip, problem=problem, flags=odd))

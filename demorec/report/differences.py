@@ -91,8 +91,8 @@ def _image(source: Source, name: str, number: int, frame: int) -> NDArray[Any]:
     """Of a frame of an episode (H, W, 3) uint8 RGB, or (H, W) codes of depth."""
     place, feature = source.places[number], source.info.features[name]
     if not feature.is_video:
-        return next(StoredImages(source.root, source.info, name).read(place, [frame]))
-    video = EpisodeVideo(source.root, source.info, name, place)
+        return next(StoredImages(source.info, name).read(place, [frame]))
+    video = EpisodeVideo(source.info, name, place)
     return next(video.codes(frame) if feature.is_depth else video.images(frame))
 
 

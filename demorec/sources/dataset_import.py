@@ -103,12 +103,8 @@ def _cameras(dataset: LeRobotDataset) -> tuple[dict[str, Camera], dict[str, str]
 def _info(recording: DatasetRecording, cameras: dict[str, Camera], digest: Callable[[Path], str]) -> EpisodeInfo:
     """What the recording shall say of an episode."""
     dataset, place = recording.dataset, recording.place
-    names = [INFO_PATH, place.data.path(dataset.info.data_path)]
-    names += [
-        dataset.video(key, place).path.relative_to(dataset.root).as_posix()
-        for key in dataset.keys.values()
-        if key in place.videos
-    ]
+    videos = [place.videos[key][0] for key in dataset.keys.values() if key in place.videos]
+    names = [INFO_PATH, *(path.relative_to(dataset.root).as_posix() for path in (place.data, *videos))]
     return replace(
         recording.info,
         cameras=tuple(replace(camera, kept=cameras[camera.name].kept) for camera in recording.info.cameras),

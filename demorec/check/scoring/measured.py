@@ -80,7 +80,7 @@ def _opened(root: Path) -> LeRobotDataset:
 
 
 def _rows(dataset: LeRobotDataset, number: int) -> dict[str, NDArray[Any]]:
-    return dataset.rows.read(dataset.places[number])
+    return dataset.rows.numbers(dataset.places[number])
 
 
 def _motion(dataset: LeRobotDataset, rows: Mapping[str, NDArray[Any]]) -> Motion | None:

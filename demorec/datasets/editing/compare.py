@@ -68,7 +68,7 @@ class EpisodeComparer:
     ) -> None:
         self._sources, self._readers, self._shared = sources, readers, shared
         self._stored = [
-            {name: StoredImages(source.root, source.info, own) for name in shared.cameras
+            {name: StoredImages(source.info, own) for name in shared.cameras
              if not source.info.features[own := shared.own(side, name)].is_video} for side, source in enumerate(sources)
         ]  # fmt: skip
 
@@ -166,7 +166,7 @@ class EpisodeComparer:
         place, feature = source.places[number], source.info.features[own]
         if not feature.is_video:
             return islice(self._stored[side][name].read(place), start, None)
-        video = EpisodeVideo(source.root, source.info, own, place)
+        video = EpisodeVideo(source.info, own, place)
         return video.codes(start) if feature.is_depth else video.images(start)
 
 

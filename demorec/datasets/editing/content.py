@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.editing.packets import PacketCutter, VideoFiles
+from demorec.datasets.editing.packets import video_files
 from demorec.datasets.editing.plan import Source
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
@@ -107,13 +107,8 @@ class ContentReader:
         features = source.info.features
         self._stored = [name for name in shared.cameras if not features[self._own[name]].is_video]
         columns = [self._own[name] for name in (*shared.columns, *self._stored)]
-        self._rows = RowStream(source.root, source.info, columns)
-        files = VideoFiles()
-        self._cutters = {
-            name: PacketCutter(source.root, source.info, self._own[name], files)
-            for name in shared.cameras
-            if features[self._own[name]].is_video
-        }
+        self._rows = RowStream(source.info, columns)
+        self._open_video = video_files()
 
     def __len__(self) -> int:
         return len(self._source.places)
@@ -158,7 +153,8 @@ class ContentReader:
 
     def _packets(self, name: str, place: EpisodePlace) -> bytes | None:
         try:
-            video = self._cutters[name].cut(place, 0, place.length)
+            path, _ = place.videos[self._own[name]]
+            video = self._open_video(path, self._source.info.fps).cut(place, self._own[name], 0, place.length)
             sets = video.parameter_sets()
         except ExportError:  # packets that cannot be told apart by episode; whether there are any, decoding shows
             return None

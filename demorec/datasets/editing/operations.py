@@ -115,7 +115,7 @@ def trim_idle(source: Source, feature: str, threshold: float, margin: int) -> Pl
     if not threshold > 0 or margin < 0:
         raise ConfigError("The threshold is a share above 0, the margin a number of frames of at least 0.")
     plan = Plan.whole(source)
-    rows = RowStream(source.root, source.info, [feature])
+    rows = RowStream(source.info, [feature])
 
     def numbers() -> Any:
         for cut in plan.cuts:

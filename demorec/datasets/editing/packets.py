@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo
 from demorec.datasets.lerobot.mp4 import EncodedVideo, Stored
 from demorec.datasets.lerobot.mp4_index import mp4_index
 from demorec.datasets.lerobot.reader import EpisodePlace
@@ -21,13 +22,20 @@ _MOST_REORDERED = 32
 """Images by which one is stored before it is shown; codecs allow 16."""
 _MOST_FILES = 16
 """Of which the tables are kept: a file of 15 minutes has one MB of them."""
+OpenVideo = Callable[[Path, float], "VideoFile"]
 
 
-class _VideoFile:
-    """One mp4 file, opened.
+def video_files() -> OpenVideo:
+    """What opens the mp4 files of any number of datasets, with their rate, and keeps some for episodes in any order."""
+    return lru_cache(maxsize=_MOST_FILES)(VideoFile)
+
+
+class VideoFile:
+    """What an mp4 file contains; ExportError when it cannot be read.
 
     Attributes:
         path: Of it.
+        fps: Frames a second.
         offsets, sizes, is_keyframe: (N,) of its images.
         frames: (N,) int64, number of the frame at which each is shown.
         order: (N,) by which these rise.
@@ -35,8 +43,8 @@ class _VideoFile:
         codec, size, pixels: As libav describes it; size is (width, height).
     """
 
-    def __init__(self, path: Path, fps: int) -> None:
-        self.path = path
+    def __init__(self, path: Path, fps: float) -> None:
+        self.path, self.fps = path, fps
         index = mp4_index(path)
         self.offsets, self.sizes, self.is_keyframe = index.offsets, index.sizes, index.is_keyframe
         self.frames: NDArray[np.int64] = np.rint(index.times * fps).astype(np.int64)
@@ -52,12 +60,7 @@ class _VideoFile:
                 raise ExportError(f"The video has lengths of less than four bytes, which are not copied: {path}")
         self._head = b""
 
-    def shown(self, begin: int, end: int) -> NDArray[np.intp]:
-        """The images of the frames from one to before another."""
-        first, last = np.searchsorted(self.frames, (begin, end), sorter=self.order)
-        return self.order[first:last]
-
-    def first_image(self, begin: int, size: int) -> bytes:
+    def _first_image(self, begin: int, size: int) -> bytes:
         """A first image as it was encoded: behind the parameter sets, which of H.264 and HEVC are those of the file."""
         if self.codec != "av1" and self._head:
             return self._head
@@ -69,84 +72,52 @@ class _VideoFile:
                 self._head = access_units(stream, self.codec)(av.Packet(sample))
         return self._head
 
-
-class VideoFiles:
-    """The mp4 files of any number of datasets; what some of them contain is kept, for episodes in any order."""
-
-    def __init__(self) -> None:
-        self._files: dict[Path, _VideoFile] = {}
-
-    def open(self, path: Path, fps: int) -> _VideoFile:
-        """One of them; ExportError when it cannot be read."""
-        file = self._files.pop(path) if path in self._files else _VideoFile(path, fps)
-        self._files[path] = file
-        if len(self._files) > _MOST_FILES:
-            del self._files[next(iter(self._files))]
-        return file
-
-
-class PacketCutter:
-    """The videos of one camera feature of a dataset."""
-
-    def __init__(self, root: Path, info: DatasetInfo, key: str, files: VideoFiles) -> None:
-        self._root, self._info, self._key, self._files = root, info, key, files
-
-    def _open(self, place: EpisodePlace) -> _VideoFile:
-        position, _ = place.videos[self._key]
-        return self._files.open(
-            self._root / position.path(self._info.video_path or VIDEO_PATH, self._key), self._info.fps
-        )
-
-    def stream_info(self, place: EpisodePlace) -> dict[str, Any]:
+    def stream_info(self) -> dict[str, Any]:
         """What a dataset states about how its images are encoded."""
-        file = self._open(place)
         return {
-            "video.height": file.size[1],
-            "video.width": file.size[0],
-            "video.codec": _MP4_NAMES.get(file.codec, file.codec),
-            "video.pix_fmt": file.pixels,
-            "video.fps": int(self._info.fps),
+            "video.height": self.size[1],
+            "video.width": self.size[0],
+            "video.codec": _MP4_NAMES.get(self.codec, self.codec),
+            "video.pix_fmt": self.pixels,
+            "video.fps": int(self.fps),
             "video.channels": 3,
             "has_audio": False,
             "is_depth_map": False,
         }
 
-    def cut(self, place: EpisodePlace, first: int, last: int) -> EncodedVideo:
-        """The images of the frames from `first` to before `last`, with all from which these are decoded.
+    def cut(self, place: EpisodePlace, key: str, first: int, last: int) -> EncodedVideo:
+        """The images of an episode's frames from `first` to before `last`, with all from which these are decoded.
 
         Raises:
             ExportError: They are not there, or cannot be taken out without encoding them again.
         """
-        file = self._open(place)
-        path, begin, end = file.path, place.videos[self._key][1] + first, place.videos[self._key][1] + last
-        wanted = file.shown(begin, end)
+        begin, end = place.videos[key][1] + first, place.videos[key][1] + last
+        wanted = self.order[slice(*np.searchsorted(self.frames, (begin, end), sorter=self.order))]
         if len(wanted) != last - first:
-            raise ExportError(
-                f"Episode {place.episode_index} has {len(wanted)} images for {last - first} frames of {self._key}: "
-                f"{path}"
-            )
-        keys = file.keys[: np.searchsorted(file.keys, wanted.min(), side="right")]
-        keys = keys[file.frames[keys] <= begin]
+            count = f"{len(wanted)} images for {last - first} frames of {key}"
+            raise ExportError(f"Episode {place.episode_index} has {count}: {self.path}")
+        keys = self.keys[: np.searchsorted(self.keys, wanted.min(), side="right")]
+        keys = keys[self.frames[keys] <= begin]
         if not len(keys):
-            raise ExportError(f"Episode {place.episode_index} does not begin behind a keyframe of {self._key}: {path}")
-        part = _without_gaps(file.frames, int(keys[-1]), int(wanted.max()) + 1)
-        places = file.frames[part] - file.frames[keys[-1]]
+            raise ExportError(f"Episode {place.episode_index} does not begin behind a keyframe of {key}: {self.path}")
+        keyframe = int(self.frames[keys[-1]])
+        part = _without_gaps(self.frames, int(keys[-1]), int(wanted.max()) + 1)
+        places = self.frames[part] - keyframe
         if not np.array_equal(np.sort(places), np.arange(len(places))):
-            raise ExportError(f"Two images of {self._key} are shown at one time, or none at some: {path}")
-        lead, count = begin - int(file.frames[keys[-1]]), last - first
+            raise ExportError(f"Two images of {key} are shown at one time, or none at some: {self.path}")
         shifts = places - np.arange(len(places))
-        sizes = file.sizes[part]
-        spans = _spans(file.offsets[part], sizes)
+        sizes = self.sizes[part]
+        spans = _spans(self.offsets[part], sizes)
         return EncodedVideo(
-            codec=_MP4_NAMES.get(file.codec, file.codec),
-            width=file.size[0],
-            height=file.size[1],
-            first=file.first_image(spans[0][0], int(sizes[0])),
-            samples=Stored(path=path, spans=spans),
+            codec=_MP4_NAMES.get(self.codec, self.codec),
+            width=self.size[0],
+            height=self.size[1],
+            first=self._first_image(spans[0][0], int(sizes[0])),
+            samples=Stored(path=self.path, spans=spans),
             sizes=sizes,
-            is_keyframe=file.is_keyframe[part],
-            lead=lead,
-            tail=len(places) - lead - count,
+            is_keyframe=self.is_keyframe[part],
+            lead=begin - keyframe,
+            tail=len(places) - (end - keyframe),
             shifts=shifts if shifts.any() else None,
         )
 

@@ -18,7 +18,7 @@ from demorec.core.errors import ExportError
 from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import Beside
 from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
-from demorec.datasets.editing.packets import PacketCutter, VideoFiles
+from demorec.datasets.editing.packets import OpenVideo, video_files
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
@@ -83,8 +83,8 @@ def write_plan(
     """
     roots = [source.root for source in plan.sources]
     with staged_folder(out, _RESULT, replace=overwrite, sources=roots) as folder:
-        videos = VideoFiles()
-        readers = [_Reader(plan, number, videos, decode=decode) for number in range(len(plan.sources))]
+        open_video = video_files()
+        readers = [_Reader(plan, number, open_video, decode=decode) for number in range(len(plan.sources))]
         with (
             DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
             Beside(plan, folder) as beside,
@@ -122,7 +122,7 @@ def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
 class _Reader:
     """The episodes of one source as the plan wants them."""
 
-    def __init__(self, plan: Plan, number: int, videos: VideoFiles, *, decode: bool) -> None:
+    def __init__(self, plan: Plan, number: int, open_video: OpenVideo, *, decode: bool) -> None:
         self.source: Source = plan.sources[number]
         self.num_decoded = 0
         self._features, self._fps = plan.info.features, plan.info.fps
@@ -131,11 +131,10 @@ class _Reader:
         info = self.source.info
         names = {take.feature for take in self._takes.values() if take.feature}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
-        self._rows = RowStream(self.source.root, info, [*self._names, "task_index"])
-        keys = [key for key in info.video_keys if key in names]
-        self._cutters = {key: PacketCutter(self.source.root, info, key, videos) for key in keys}
+        self._rows = RowStream(info, [*self._names, "task_index"])
+        self._open_video = open_video
         stored = [name for name in self._names if info.features[name].dtype == "image"]
-        self._stored = {key: StoredImages(self.source.root, info, key) for key in stored}
+        self._stored = {key: StoredImages(info, key) for key in stored}
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
         tables = self.source.episode_tables if self.source.fact_types else ()
         self._facts_beside = EpisodeRows(tables, schema, rows=_EPISODES_AT_ONCE)
@@ -160,9 +159,10 @@ class _Reader:
                 language = self._language(rows, cut)
                 continue
             if feature.is_video:
-                video = self._cutters[take.feature].cut(place, cut.first, cut.last)
+                file = self._open_video(place.videos[take.feature][0], self.source.info.fps)
+                video = file.cut(place, take.feature, cut.first, cut.last)
                 videos[name] = video.with_digest() if self._has_digests else video
-                video_info[name] = feature.info or self._cutters[take.feature].stream_info(place)
+                video_info[name] = feature.info or file.stream_info()
             else:
                 columns[name] = self._column(rows, take, feature)
                 if take.feature in _OF_THE_END and cut.last != place.length:
@@ -188,7 +188,7 @@ class _Reader:
         """Every pixel of a camera in a cut, whose rows have been read."""
         place, feature = self.source.places[cut.episode], self.source.info.features[key]
         if feature.is_video:
-            video = EpisodeVideo(self.source.root, self.source.info, key, place)
+            video = EpisodeVideo(self.source.info, key, place)
             return _video_histogram(video, feature, cut.first, cut.last)
         return _histogram(self._stored[key].decode(place, rows.column(key).chunks))
 

@@ -291,7 +291,7 @@ def write_thumbnails(root: Path, info: DatasetInfo) -> bool:
         label = f"episode {place.episode_index}, camera {key.removeprefix(IMAGE_PREFIX)}: {', '.join(place.tasks)}"
         draw.text((4, top + 1), printable(label), fill="black", font=font)
         moments = np.linspace(0, place.length - 1, _MOMENTS).round().astype(int).tolist()
-        for column, picture in enumerate(EpisodeVideo(root, info, key, place).images_at(moments)):
+        for column, picture in enumerate(EpisodeVideo(info, key, place).images_at(moments)):
             corner = column * (size[0] + _GAP), top + _LABEL
             sheet.paste(Image.fromarray(picture).resize(size, reducing_gap=1.0), corner)
             time = f"{moments[column] / info.fps:.1f} s"

@@ -12,7 +12,6 @@ where it is there. Memory is that of an episode's numbers.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -27,7 +26,7 @@ from demorec.datasets.lerobot.files import column_numbers, open_table, table_bat
 from demorec.datasets.lerobot.language import COLUMNS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, RowReader, RowStream, episode_places, read_tasks
+from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, RowStream, episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages, codec_of, opened_video
@@ -147,17 +146,17 @@ class LeRobotDataset:
         return read_tasks(self.root)
 
     @cached_property
-    def rows(self) -> RowReader:
+    def rows(self) -> RowStream:
         """Of the features, of times, tasks and outcomes."""
         names = [*(feature.name for feature in self.features), "timestamp", "task_index"]
         names += [name for name in (_SUCCESS, "episode_index") if name in self.info.features]
-        return RowReader(self.root, replace(self.info, features={name: self.info.features[name] for name in names}))
+        return RowStream(self.info, names)
 
     @cached_property
     def language_stream(self) -> RowStream | None:
         """The language columns; None in a dataset without them."""
         spoken = {name for name, feature in self.info.features.items() if feature.dtype == "language"}
-        return RowStream(self.root, self.info, COLUMNS) if spoken >= set(COLUMNS) else None
+        return RowStream(self.info, COLUMNS) if spoken >= set(COLUMNS) else None
 
     @cached_property
     def known(self) -> Mapping[int, dict[str, Any]]:
@@ -200,7 +199,7 @@ class LeRobotDataset:
             with opened_video(self.video(key, place).path) as (_, stream):
                 kept, width, height = codec_of(stream), stream.codec_context.width, stream.codec_context.height
         else:
-            height, width = next(StoredImages(self.root, self.info, key).read(place)).shape[:2]
+            height, width = next(StoredImages(self.info, key).read(place)).shape[:2]
         return Camera(name=name, width=width, height=height, kept=kept, source=key)
 
     def robot(self, digest: str) -> DatasetRobot:
@@ -213,13 +212,13 @@ class LeRobotDataset:
         """The images of a video feature in an episode."""
         found = self._videos.get((key, place.episode_index))
         if found is None:
-            found = self._videos[key, place.episode_index] = EpisodeVideo(self.root, self.info, key, place)
+            found = self._videos[key, place.episode_index] = EpisodeVideo(self.info, key, place)
         return found
 
     def stored_images(self, key: str, place: EpisodePlace, frames: Collection[int] | None = None) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of some frames of an episode, of all by default, of an image feature."""
         if key not in self._stored:
-            self._stored[key] = StoredImages(self.root, self.info, key)
+            self._stored[key] = StoredImages(self.info, key)
         return self._stored[key].read(place, frames)
 
 

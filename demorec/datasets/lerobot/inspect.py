@@ -9,9 +9,9 @@ from pathlib import Path
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.files import check_video, open_table, read_json, read_table
-from demorec.datasets.lerobot.layout import STATS_PATH, VIDEO_PATH, DatasetInfo, combined_digest, episode_digest
+from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.reader import RowReader, episode_places, read_tasks
+from demorec.datasets.lerobot.reader import RowStream, episode_places, read_tasks
 from demorec.datasets.lerobot.videos import PacketReader
 
 
@@ -52,14 +52,9 @@ def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
     with _noted(problems, path):
         check_tables(path)
     with _noted(problems, path):
-        videos = {
-            position.path(info.video_path or VIDEO_PATH, key)
-            for place in episode_places(path, info)
-            for key, (position, _) in place.videos.items()
-        }
-        for name in sorted(videos):
+        for video in sorted({video for place in episode_places(path, info) for video, _ in place.videos.values()}):
             with _noted(problems, path):
-                check_video(path / name)
+                check_video(video)
     return list(dict.fromkeys(problems))
 
 
@@ -114,12 +109,12 @@ def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
     if unknown := _without_digest(info):
         raise ExportError(f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {path}")
     tasks = read_tasks(path)
-    rows = RowReader(path, info)
-    cameras = {key: PacketReader(path, info, key) for key in info.video_keys}
+    rows = RowStream(info)
+    cameras = {key: PacketReader(key) for key in info.video_keys}
     result = []
     try:
         for place in episode_places(path, info):
-            columns = rows.read(place)
+            columns = rows.numbers(place)
             videos = {}
             for key, packets in cameras.items():
                 images = hashlib.sha256()

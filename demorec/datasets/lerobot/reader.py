@@ -6,6 +6,7 @@ import math
 import reprlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,14 @@ from demorec.datasets.lerobot.files import (
     table_batches,
 )
 from demorec.datasets.lerobot.language import column_digests
-from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, OLD_TASKS_PATH, TASKS_PATH, DatasetInfo, FilePosition
+from demorec.datasets.lerobot.layout import (
+    OLD_EPISODES_PATH,
+    OLD_TASKS_PATH,
+    TASKS_PATH,
+    VIDEO_PATH,
+    DatasetInfo,
+    FilePosition,
+)
 
 _MOST = 1 << 40
 """Above all rows, frames and seconds of any dataset."""
@@ -39,16 +47,16 @@ class EpisodePlace:
         data: File of its rows.
         first_row: Of its rows in that file.
         from_index: Of its first row over the whole dataset.
-        videos: Camera feature -> (file, first image in it).
+        videos: Camera feature -> (mp4 file, first image in it).
     """
 
     episode_index: int
     length: int
     tasks: tuple[str, ...]
-    data: FilePosition
+    data: Path
     first_row: int
     from_index: int
-    videos: dict[str, tuple[FilePosition, int]]
+    videos: dict[str, tuple[Path, int]]
 
 
 def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
@@ -61,10 +69,15 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     else:
         files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
         rows = ((path, row) for path in files for row in read_table(path, columns).to_pylist())
-    ends: dict[FilePosition, int] = {}
+    ends: dict[Path, int] = {}
+
+    @cache  # many episodes share a file
+    def file(template: str, key: str, chunk: int, number: int) -> Path:
+        return root / FilePosition(chunk=chunk, file=number).path(template, key)
+
     for path, row in rows:
         _check_place(row, path)
-        data = FilePosition(chunk=row["data/chunk_index"], file=row["data/file_index"])
+        data = file(info.data_path, "", row["data/chunk_index"], row["data/file_index"])
         first = ends.get(data, 0)
         ends[data] = first + row["length"]
         yield EpisodePlace(
@@ -76,7 +89,12 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
             from_index=row["dataset_from_index"],
             videos={
                 key: (
-                    FilePosition(chunk=row[f"videos/{key}/chunk_index"], file=row[f"videos/{key}/file_index"]),
+                    file(
+                        info.video_path or VIDEO_PATH,
+                        key,
+                        row[f"videos/{key}/chunk_index"],
+                        row[f"videos/{key}/file_index"],
+                    ),
                     round(row[f"videos/{key}/from_timestamp"] * info.fps),
                 )
                 for key in info.video_keys
@@ -145,17 +163,20 @@ _MOST_FILES = 16
 class RowStream:
     """Some columns of the data files, episode after episode, in any order; one batch is in memory.
 
-    Args:
-        root: The dataset's folder.
-        info: Of it.
+    Attributes:
         names: Of the columns.
+
+    Args:
+        info: Of the dataset.
+        names: All that are in the data files by default.
     """
 
-    def __init__(self, root: Path, info: DatasetInfo, names: Sequence[str]) -> None:
-        self._root, self._info, self._names = root, info, list(names)
-        kinds = {info.features[name].dtype for name in names}
+    def __init__(self, info: DatasetInfo, names: Sequence[str] | None = None) -> None:
+        self.names = [name for name, item in info.features.items() if not item.is_video] if names is None else names
+        self._features = {name: info.features[name] for name in self.names}
+        kinds = {feature.dtype for feature in self._features.values()}
         self._at_once = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
-        self._tables: dict[FilePosition, TableRows] = {}
+        self._tables: dict[Path, TableRows] = {}
 
     def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
         """The rows of an episode; ExportError when they cannot be read."""
@@ -165,22 +186,46 @@ class RowStream:
             yield batch
         if left:
             raise ExportError(
-                f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {self._root}"
+                f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {place.data}"
             )
 
     def read(self, place: EpisodePlace) -> pa.Table:
         """All rows of an episode, as `batches`; ExportError for one without any, too."""
         if not place.length:
-            raise ExportError(f"Episode {place.episode_index} has no frames, drop it: {self._root}")
+            raise ExportError(f"Episode {place.episode_index} has no frames, drop it: {place.data}")
         return pa.Table.from_batches(list(self.batches(place)))
 
-    def _table(self, position: FilePosition) -> TableRows:
-        found = self._tables.pop(position, None)
+    def numbers(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
+        """Feature -> (T, D) of an episode, (T, 1) of texts, of language digests; ExportError as `batches`, or unless
+        they are as info.json says.
+        """
+        parts = [
+            [self._values(name, batch.column(name), place) for name in self.names] for batch in self.batches(place)
+        ]
+        if not parts:
+            return {name: np.zeros((0, 1)) for name in self.names}
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return dict(zip(self.names, columns, strict=True))
+
+    def _values(self, name: str, column: pa.Array, place: EpisodePlace) -> NDArray[Any]:
+        feature = self._features[name]
+        try:
+            values = column_digests(column) if feature.dtype == "language" else column_values(column)
+        except (ValueError, TypeError, pa.ArrowException) as error:
+            raise ExportError(f"The column {name} holds something else than numbers: {place.data}") from error
+        if feature.dtype in _NUMBERS and values.shape[1:] != (math.prod(feature.shape),):
+            raise ExportError(
+                f"The column {name} has {values.shape[1:]} values, expected {feature.shape}: {place.data}"
+            )
+        return values
+
+    def _table(self, path: Path) -> TableRows:
+        found = self._tables.pop(path, None)
         if self._tables and (found is None or len(self._tables) >= _MOST_FILES):
             self._tables[next(reversed(self._tables))].rest()
         if found is None:
-            found = TableRows(self._root / position.path(self._info.data_path), self._names, rows=self._at_once)
-        self._tables[position] = found
+            found = TableRows(path, self.names, rows=self._at_once)
+        self._tables[path] = found
         if len(self._tables) > _MOST_FILES:
             del self._tables[next(iter(self._tables))]
         return found
@@ -245,43 +290,6 @@ class EpisodeRows:
             return pa.RecordBatch.from_arrays(columns, schema=self._schema)
         except (ValueError, pa.ArrowException) as error:
             raise ExportError(f"The table has columns of other types ({describe_error(error)}): {path}") from error
-
-
-class RowReader:
-    """Rows of the data files as numbers, those of language as digests.
-
-    Attributes:
-        names: Of the features.
-    """
-
-    def __init__(self, root: Path, info: DatasetInfo) -> None:
-        self._root = root
-        self._info = info
-        self.names = [name for name, feature in info.features.items() if not feature.is_video]
-        self._stream = RowStream(root, info, self.names)
-
-    def read(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
-        """Feature -> (T, D) of an episode, of language columns digests."""
-        parts = [
-            [self._column(name, batch.column(name)) for name in self.names] for batch in self._stream.batches(place)
-        ]
-        if not parts:
-            return {name: np.zeros((0, 1)) for name in self.names}
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        return dict(zip(self.names, columns, strict=True))
-
-    def _column(self, name: str, column: Any) -> NDArray[Any]:
-        """(N, D) of a feature, (N, 1) digests of language; ExportError unless it is as info.json says."""
-        feature = self._info.features[name]
-        try:
-            values = column_digests(column) if feature.dtype == "language" else column_values(column)
-        except (ValueError, TypeError, pa.ArrowException) as error:
-            raise ExportError(f"The column {name} holds something else than numbers: {self._root}") from error
-        if feature.dtype in _NUMBERS and values.shape[1:] != (math.prod(feature.shape),):
-            raise ExportError(
-                f"The column {name} has {values.shape[1:]} values, expected {feature.shape}: {self._root}"
-            )
-        return values
 
 
 def column_values(column: pa.Array) -> NDArray[Any]:

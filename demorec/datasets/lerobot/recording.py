@@ -119,7 +119,7 @@ class DatasetRecording:
 
     @cached_property
     def _rows(self) -> Mapping[str, NDArray[Any]]:
-        rows, info, number = self.dataset.rows.read(self.place), self.dataset.info, self.place.episode_index
+        rows, info, number = self.dataset.rows.numbers(self.place), self.dataset.info, self.place.episode_index
         if _EPISODE in rows and (rows[_EPISODE] != number).any():
             raise ExportError(
                 f"The rows of episode {number} are those of others, by its place in the table: {self.path}"

@@ -26,7 +26,7 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
 from demorec.datasets.lerobot.files import check_video
-from demorec.datasets.lerobot.layout import VIDEO_PATH, DatasetInfo, FilePosition
+from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream
 
@@ -68,9 +68,9 @@ class PacketReader:
         keyframe: Number, in its file, of the keyframe from which on the image read last can be decoded; -1 for none.
     """
 
-    def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
-        self._root, self._info, self._key = root, info, key
-        self._position: FilePosition | None = None
+    def __init__(self, key: str) -> None:
+        self._key = key
+        self._path: Path | None = None
         self._packets = _samples(None)
         self._next = 0
         self.keyframe = -1
@@ -81,12 +81,11 @@ class PacketReader:
 
     def read(self, place: EpisodePlace) -> Iterator[bytes]:
         """The samples of an episode; episodes must be asked for in order."""
-        position, first = place.videos[self._key]
-        path = self._root / position.path(self._info.video_path or VIDEO_PATH, self._key)
-        if position != self._position:
+        path, first = place.videos[self._key]
+        if path != self._path:
             self.close()
             self._packets = _samples(path)
-            self._position, self._next, self.keyframe = position, 0, -1
+            self._path, self._next, self.keyframe = path, 0, -1
         if first < self._next:
             raise ExportError(f"Episode {place.episode_index} overlaps the one before it: {path}")
         begin, self._next = self._next, first + place.length
@@ -131,17 +130,15 @@ class EpisodeVideo:
         length: T.
 
     Args:
-        root: The dataset's folder.
-        info: Of it.
+        info: Of the dataset.
         key: Name of the feature.
         place: Of the episode.
     """
 
-    def __init__(self, root: Path, info: DatasetInfo, key: str, place: EpisodePlace) -> None:
-        position, self.first = place.videos[key]
-        self.path = root / position.path(info.video_path or VIDEO_PATH, key)
+    def __init__(self, info: DatasetInfo, key: str, place: EpisodePlace) -> None:
+        self.path, self.first = place.videos[key]
         self.length = place.length
-        self._root, self._feature, self._key, self._fps = root, info.features[key], key, int(info.fps)
+        self._feature, self._key, self._fps = info.features[key], key, int(info.fps)
         self._episode = place.episode_index
 
     def _seek(
@@ -204,7 +201,9 @@ class EpisodeVideo:
         try:
             return DepthScale.of(self._feature.info or {})
         except ValueError as error:
-            raise ExportError(f"The depth of {self._key} cannot be read ({error}): {self._root / INFO_PATH}") from error
+            raise ExportError(
+                f"The depth of {self._key} cannot be read by {INFO_PATH} ({error}): {self.path}"
+            ) from error
 
     def codes(self, begin: int = 0) -> Iterator[NDArray[np.uint16]]:
         """(H, W) codes of depth, 0 to 4095, of every frame from one on."""
@@ -308,9 +307,9 @@ that share one image share its bytes."""
 class StoredImages:
     """The images of a camera feature that are in the rows of the data files, PNG or JPEG."""
 
-    def __init__(self, root: Path, info: DatasetInfo, key: str) -> None:
-        self._root, self._info, self._key = root, info, key
-        self._stream = RowStream(root, info, [key])
+    def __init__(self, info: DatasetInfo, key: str) -> None:
+        self._key = key
+        self._stream = RowStream(info, [key])
         self._allowed = _PIXEL_BYTES
         self._counted: set[Path] = set()
 
@@ -321,7 +320,7 @@ class StoredImages:
 
     def decode(self, place: EpisodePlace, columns: Iterable[pa.Array]) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of some rows of an episode, whose column was read already; ExportError as `read`."""
-        path = self._root / place.data.path(self._info.data_path)
+        path = place.data
         if path not in self._counted and path.is_file():
             self._counted.add(path)
             self._allowed += _FILE_RATIO * path.stat().st_size
