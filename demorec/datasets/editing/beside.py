@@ -28,7 +28,6 @@ from demorec.datasets.lerobot.sidecar import (
     EpisodeRecord,
     SidecarWriter,
 )
-from demorec.datasets.lerobot.writer import WrittenEpisode
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "goals", "episode_info")
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
@@ -130,13 +129,12 @@ class Beside:
 
     def __init__(self, plan: Plan, folder: Path) -> None:
         self._plan, self._folder = plan, folder
-        limits: dict[str, Any] = {"limit_mb": plan.info.data_files_size_in_mb, "chunks_size": plan.info.chunks_size}
         configs: dict[str, Any] = {}
         for source in plan.sources:
             if (source.root / CONFIGS_PATH).exists():
                 configs |= read_json(source.root / CONFIGS_PATH)
         has_any = any(source.sidecar_tables for source in plan.sources)
-        self._sidecar = SidecarWriter(folder, configs, **limits) if has_any else None
+        self._sidecar = SidecarWriter(folder, plan.info, configs) if has_any else None
         sources = plan.sources if has_any else ()
         self._rows = [EpisodeRows(source.sidecar_tables, EPISODE_SCHEMA, rows=64) for source in sources]
         self._poses = [CameraPoses(source) for source in (sources if poses_are_kept(plan) else ())]
@@ -158,20 +156,20 @@ class Beside:
         if self._sidecar is not None:
             self._sidecar.__exit__(*exc)
 
-    def add(self, cut: Cut, written: WrittenEpisode) -> None:
-        """What belongs to an episode that was written."""
+    def add(self, cut: Cut, episode_index: int, digest: str) -> None:
+        """What belongs to an episode that was written, and has this digest."""
         boxes = {
             name: file.read(cut.episode, cut.first, cut.last) for name, file in self._stored_boxes[cut.source].items()
         }
         seen = {name: found for name, found in boxes.items() if found is not None}
-        self._boxes.add(written.episode_index, seen, cut.last - cut.first)
+        self._boxes.add(episode_index, seen, cut.last - cut.first)
         if self._sidecar is None:
             return
         source = self._plan.sources[cut.source]
         index = source.places[cut.episode].episode_index
         table = self._rows[cut.source].read(index)
         found: dict[str, Any] = {} if table is None else table.to_pylist()[-1]
-        digest = found.get("robot_digest")
+        robot = found.get("robot_digest")
         row = {name: value for name, value in found.items() if name not in ("episode_index", "content_digest")}
         row.setdefault("source", source.root.name)
         if not self._plan.keeps_scene(cut):
@@ -186,11 +184,9 @@ class Beside:
         record = EpisodeRecord(
             row=row,
             moving_cameras=self._poses[cut.source].of(index, cut) if self._poses else {},
-            config_digest="",
-            config={},
-            robot=None if digest is None else read_robot(source.root, str(digest)),
+            robot=None if robot is None else read_robot(source.root, str(robot)),
         )
-        self._sidecar.add(written, record, attempt)
+        self._sidecar.add(episode_index, digest, record, attempt)
 
     def finish(self) -> None:
         """Complete the files."""

@@ -274,7 +274,7 @@ class Plan:
         features = {**{k: v for k, v in own.items() if k not in spoken}, **AUTOMATIC_FEATURES, **spoken}
         info = replace(
             source.info, features=features, version=CODEBASE_VERSION, data_path=DATA_PATH, video_path=VIDEO_PATH,
-            fps=int(source.info.fps), chunks_size=int(source.info.chunks_size),
+            fps=int(source.info.fps), chunks_size=int(source.info.chunks_size), total_episodes=0, total_frames=0,
             other={} if source.info.is_old else source.info.other,
         )  # fmt: skip
         cuts = tuple(

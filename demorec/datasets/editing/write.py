@@ -86,14 +86,14 @@ def write_plan(
         open_video = video_files()
         readers = [_Reader(plan, number, open_video, decode=decode) for number in range(len(plan.sources))]
         with (
-            DatasetWriter(folder, plan.info, facts=_fact_types(plan)) as writer,
+            DatasetWriter(folder, plan.info, _fact_types(plan)) as writer,
             Beside(plan, folder) as beside,
         ):
             around = 0
             for done, cut in enumerate(plan.cuts, start=1):
                 data = readers[cut.source].episode(cut)
                 around += sum(video.lead + video.tail for video in data.videos.values())
-                beside.add(cut, writer.add(data))
+                beside.add(cut, done - 1, writer.add(data))
                 if progress is not None:
                     progress(done, len(plan.cuts))
             info = writer.finish()

@@ -9,7 +9,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import read_tasks
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import Statistics
-from demorec.datasets.lerobot.writer import WriterStart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,16 +36,18 @@ class Existing:
     Attributes:
         root: Its folder.
         info: What meta/info.json says.
-        writer: Where to go on.
+        tasks: In the order of their indices.
+        statistics: Of the camera features.
         configs: Of the sidecar: config digest -> configuration.
         facts: Which columns of facts its table of episodes has.
     """
 
     root: Path
     info: DatasetInfo
-    writer: WriterStart
+    tasks: tuple[str, ...]
+    statistics: Mapping[str, Statistics]
     configs: Mapping[str, Any]
-    facts: tuple[str, ...] = ()
+    facts: tuple[str, ...]
 
 
 def open_existing(root: Path) -> Existing:
@@ -83,13 +84,8 @@ def open_existing(root: Path) -> Existing:
             f"The dataset is not whole: {INFO_PATH} counts {info.total_episodes} episodes of {info.total_frames} "
             f"frames, its tables have {episodes} of {frames} and {rows} data rows: {root}"
         )
-    writer = WriterStart(
-        num_episodes=episodes,
-        num_frames=frames,
-        tasks=tasks,
-        statistics=statistics,
-    )
-    return Existing(root=root, info=info, writer=writer, configs=configs, facts=facts)
+    info = replace(info, total_episodes=episodes, total_frames=frames)  # other writers have some as 30.0
+    return Existing(root=root, info=info, tasks=tasks, statistics=statistics, configs=configs, facts=facts)
 
 
 def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistics | None:

@@ -30,7 +30,7 @@ from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import dataset_features, episode_boxes, prepare_episode, reasons_to_transcode
 from demorec.datasets.lerobot.sidecar import EpisodeRecord, SidecarWriter, attempt_row
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
-from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData, WriterStart
+from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
 from demorec.datasets.staging import CODED, staged_folder
@@ -109,12 +109,12 @@ class _Export:
         self._intake.check()
         info = self._dataset_info(begun[-1])
         self._is_simulated = begun[-1].is_simulated
-        start = self._existing.writer if self._existing else WriterStart()
-        configs = self._existing.configs if self._existing else {}
-        limits: dict[str, Any] = {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
+        facts, there = fact_types(self._facts(begun[-1])), self._existing
         with (
-            DatasetWriter(self._folder, info, start, fact_types(self._facts(begun[-1]))) as writer,
-            SidecarWriter(self._folder, configs, **limits) as sidecar,
+            DatasetWriter(
+                self._folder, info, facts, there.tasks if there else (), there.statistics if there else {}
+            ) as writer,
+            SidecarWriter(self._folder, info, there.configs if there else {}) as sidecar,
             BoxWriter(self._folder, fps=info.fps) as boxes,
         ):
             for reading in chain(begun, found):
@@ -133,8 +133,8 @@ class _Export:
             path=self._folder,
             num_episodes=finished.total_episodes,
             num_frames=finished.total_frames,
-            new_episodes=finished.total_episodes - start.num_episodes,
-            new_frames=finished.total_frames - start.num_frames,
+            new_episodes=finished.total_episodes - info.total_episodes,
+            new_frames=finished.total_frames - info.total_frames,
             skipped_failures=self._intake.skipped_failures,
             skipped_unknown=self._intake.skipped_unknown,
             skipped_unwanted=self._intake.skipped_unwanted,
@@ -147,7 +147,7 @@ class _Export:
 
     def samples(self) -> list[tuple[int, Path]]:
         """What shall be verified: the new episodes, or some of them, spread evenly, if there are very many."""
-        first = self._existing.writer.num_episodes if self._existing else 0
+        first = self._existing.info.total_episodes if self._existing else 0
         count = len(self._recordings)
         chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_EPISODES)).round().astype(int)).tolist()
         return [(first + index, self._recordings[index]) for index in chosen]
@@ -191,14 +191,14 @@ class _Export:
         if reading.data is None or reading.record is None:
             sidecar.add_attempt(reading.attempt, in_dataset=False)
             return
-        written = writer.add(reading.data)
-        sidecar.add(written, reading.record, reading.attempt)
+        digest = writer.add(reading.data)
+        sidecar.add(writer.num_episodes - 1, digest, reading.record, reading.attempt)
         if self._options.language is not None and not reading.is_simulated and not reading.data.language.persistent:
             self._silent.append(reading.path.name)
         if self._options.progress:
             facts = reading.data.facts
             self._progress.append(EpisodeProgress.from_row(facts, facts["num_goals"]))
-        self._digests.append(written.digest)
+        self._digests.append(digest)
         self._recordings.append(reading.path)
         self._transcoded.update(dict.fromkeys(reading.transcoded))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from demorec.core.files import sync_path
 from demorec.datasets.lerobot.files import plain_column
-from demorec.datasets.lerobot.layout import MEBIBYTE, FilePosition
+from demorec.datasets.lerobot.layout import MEBIBYTE, DatasetInfo, FilePosition
 
 _ROWS_PER_TABLE = 100
 _ROWS_PER_GROUP = 4096
@@ -42,6 +42,10 @@ class RollingParquet:
         num_bytes: Size of the finished files.
 
     Args:
+        root: The dataset's folder.
+        template: Of the files' paths in it.
+        schema: Of the tables.
+        info: Of the dataset: how large files and folders grow.
         repeating: Columns that are worth a dictionary; all by default.
     """
 
@@ -50,19 +54,19 @@ class RollingParquet:
         root: Path,
         template: str,
         schema: pa.Schema,
+        info: DatasetInfo,
         *,
-        limit_mb: float,
-        chunks_size: int,
         compression: str = "snappy",
         repeating: Sequence[str] | None = None,
     ) -> None:
-        self.position = next_position(root / template.partition("/chunk-")[0], chunks_size)
+        self._folder = template.partition("/chunk-")[0]
+        self.position = next_position(root / self._folder, info.chunks_size)
         self.num_bytes = 0
         self._root = root
         self._template = template
         self.schema = schema
-        self._limit = limit_mb * MEBIBYTE
-        self._chunks_size = chunks_size
+        self._limit = info.data_files_size_in_mb * MEBIBYTE
+        self._chunks_size = info.chunks_size
         self._compression = compression
         # A dictionary of numbers that hardly repeat costs time and makes the file larger.
         self._dictionary = True if repeating is None else list(repeating)
@@ -85,15 +89,16 @@ class RollingParquet:
         return self.position
 
     def add_row(self, row: Mapping[str, Any]) -> None:
-        """Append a row: so many make a table."""
+        """Append a row: so many make a table. Columns FOLDER/chunk_index and FOLDER/file_index say where it lies."""
         self._pending.append(row)
         if len(self._pending) >= _ROWS_PER_TABLE:
             self._write_rows()
 
     def _write_rows(self) -> None:
         if self._pending:
-            self.make_room(len(self._pending))
-            self.write(pa.Table.from_pylist(self._pending, schema=self.schema))
+            position = self.make_room(len(self._pending))
+            place = {f"{self._folder}/chunk_index": position.chunk, f"{self._folder}/file_index": position.file}
+            self.write(pa.Table.from_pylist([{**row, **place} for row in self._pending], schema=self.schema))
             self._pending.clear()
 
     def write(self, table: pa.Table) -> None:
@@ -151,12 +156,3 @@ def vector_array(values: NDArray[Any] | pa.Array, arrow_type: pa.DataType) -> pa
         flat = pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type.value_type)
         return pa.FixedSizeListArray.from_arrays(flat, type=arrow_type)
     return pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type)
-
-
-def nested_array(values: NDArray[Any], depth: int) -> pa.Array:
-    """A column of lists: (rows, D) numbers as list<T>, or with depth 3 as list<list<list<T>>> of shape (D, 1, 1)."""
-    rows, width = values.shape
-    array = pa.array(np.ascontiguousarray(values).reshape(-1))
-    for _ in range(depth - 1):
-        array = pa.ListArray.from_arrays(pa.array(np.arange(len(array) + 1, dtype=np.int32)), array)
-    return pa.ListArray.from_arrays(pa.array(np.arange(rows + 1, dtype=np.int32) * width), array)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,11 +30,12 @@ from demorec.datasets.lerobot.layout import (
     SIDECAR_ATTEMPTS_PATH,
     SIDECAR_CAMERAS_PATH,
     SIDECAR_EPISODES_PATH,
+    DatasetInfo,
 )
 from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
-from demorec.datasets.lerobot.writer import WrittenEpisode, write_text
+from demorec.datasets.lerobot.writer import write_text
 
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
@@ -115,9 +116,9 @@ class EpisodeRecord:
 
     row: Mapping[str, Any]
     moving_cameras: Mapping[str, Array]
-    config_digest: str
-    config: Mapping[str, Any]
     robot: DatasetRobot | None
+    config_digest: str = ""
+    config: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, episode: ExportEpisode) -> EpisodeRecord:
@@ -198,28 +199,19 @@ class SidecarWriter:
 
     Args:
         root: Folder of the dataset; what it holds of a sidecar already is gone on with.
+        info: Of it.
         configs: Config digest -> configuration, of the episodes that are there.
-        limit_mb, chunks_size: Of the tables' files.
     """
 
-    def __init__(self, root: Path, configs: Mapping[str, Any], *, limit_mb: float, chunks_size: int) -> None:
-        self._root = root
-        self._limit_mb, self._chunks_size = limit_mb, chunks_size
+    def __init__(self, root: Path, info: DatasetInfo, configs: Mapping[str, Any]) -> None:
+        self._root, self._info = root, info
         self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA)
         self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA)
         self._camera_poses: RollingParquet | None = None
         self._configs: dict[str, Any] = dict(configs)
 
     def _table(self, template: str, schema: pa.Schema, repeating: Sequence[str] | None = None) -> RollingParquet:
-        return RollingParquet(
-            self._root,
-            template,
-            schema,
-            limit_mb=self._limit_mb,
-            chunks_size=self._chunks_size,
-            compression="zstd",
-            repeating=repeating,
-        )
+        return RollingParquet(self._root, template, schema, self._info, compression="zstd", repeating=repeating)
 
     def __enter__(self) -> SidecarWriter:
         return self
@@ -229,11 +221,10 @@ class SidecarWriter:
             if table is not None:
                 table.abort()
 
-    def add(self, written: WrittenEpisode, record: EpisodeRecord, attempt: Mapping[str, Any]) -> None:
-        """What belongs to an episode of the dataset, and the attempt that it was."""
-        episode_index = written.episode_index
+    def add(self, episode_index: int, digest: str, record: EpisodeRecord, attempt: Mapping[str, Any]) -> None:
+        """What belongs to an episode of the dataset with this digest, and the attempt that it was."""
         robot = record.robot
-        added = {"episode_index": episode_index, "content_digest": written.digest}
+        added = {"episode_index": episode_index, "content_digest": digest}
         self._episodes.add_row({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
         if robot is not None:
             write_robot(self._root, robot)

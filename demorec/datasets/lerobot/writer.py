@@ -42,7 +42,7 @@ from demorec.datasets.lerobot.layout import (
     merged_video_info,
 )
 from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
-from demorec.datasets.lerobot.parquet import RollingParquet, nested_array, next_position, vector_array
+from demorec.datasets.lerobot.parquet import RollingParquet, next_position, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import column_values
 from demorec.datasets.lerobot.stats import (
@@ -54,7 +54,8 @@ from demorec.datasets.lerobot.stats import (
     vector_statistics,
 )
 
-_EPISODES_PER_TABLE = 100
+_MOST_UNSEEN = 100
+"""Statistics of images that were not seen, before they are merged."""
 _MAX_SECONDS_PER_VIDEO = 900.0
 """LeRobot compares timestamps as float32, whose step is 6e-5 s beyond 512 s and 1.2e-4 s beyond 1024 s, with a
 tolerance of 1e-4 s: a new mp4 file is begun before that, except for a single episode that is longer."""
@@ -91,76 +92,47 @@ class EpisodeData:
         return len(next(iter(self.columns.values())))
 
 
-@dataclass(frozen=True, kw_only=True)
-class WriterStart:
-    """Where the writer goes on in a dataset that has episodes already; the defaults are those of an empty one.
-
-    Attributes:
-        num_episodes, num_frames: That are there.
-        tasks: In the order of their indices.
-        statistics: Of the camera features over what is there.
-    """
-
-    num_episodes: int = 0
-    num_frames: int = 0
-    tasks: tuple[str, ...] = ()
-    statistics: Mapping[str, Statistics] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class WrittenEpisode:
-    """Where an episode went, and its digest (`demorec.datasets.lerobot.layout`).
-
-    Attributes:
-        episode_index: Its number in the dataset.
-        digest: "" where images are in rows, or its videos have none.
-    """
-
-    episode_index: int
-    digest: str
-
-
 class DatasetWriter:
     """Context manager; `finish` completes the metadata.
 
     Args:
         root: Folder of the dataset; for an appending writer it holds the old files already.
-        info: Features and limits; its counters are taken from `start`.
-        start: Where to go on.
+        info: Features, limits, and how many episodes and frames are there.
         facts: Columns of the episodes' facts in the table of episodes -> type (`demorec.datasets.lerobot.facts`).
+        tasks: That are there, in the order of their indices.
+        statistics: Of the camera features over what is there.
     """
 
     def __init__(
         self,
         root: Path,
         info: DatasetInfo,
-        start: WriterStart | None = None,
-        facts: Mapping[str, pa.DataType] = MappingProxyType({}),
+        facts: Mapping[str, pa.DataType],
+        tasks: Sequence[str] = (),
+        statistics: Mapping[str, Statistics] = MappingProxyType({}),
     ) -> None:
         self._root = root
         self._info = info
         self._facts = dict(facts)
-        self._start = start or WriterStart()
+        self._old_statistics = statistics
         self._schema = data_schema(info.features)
         self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
         arrays = [name for name in self._numeric if len(info.features[name].shape) > 1]
         self._arrays = {name: info.features[name].shape[-1] for name in arrays}
         self._language = [name for name in self._schema.names if info.features[name].dtype == "language"]
-        self._tasks = {task: index for index, task in enumerate(self._start.tasks)}
-        self.num_episodes = self._start.num_episodes
-        self.num_frames = self._start.num_frames
+        self._tasks = {task: index for index, task in enumerate(tasks)}
+        self.num_episodes = info.total_episodes
+        self.num_frames = info.total_frames
         strings = [name for name in self._schema.names if info.features[name].dtype == "string"]
         self._cameras = [name for name, feature in info.features.items() if feature.is_camera]
         self._data = RollingParquet(
             root,
             DATA_PATH,
             self._schema,
+            info,
             repeating=["episode_index", "task_index", *strings, *(REPEATING if self._language else ())],
-            **_sizes(info),
         )
-        self._episodes = RollingParquet(root, EPISODES_PATH, self._episode_schema(), **_sizes(info))
-        self._rows: list[dict[str, Any]] = []
-        self._row_statistics: list[dict[str, Statistics]] = []
+        self._episodes = RollingParquet(root, EPISODES_PATH, self._episode_schema(), info)
         self._videos: dict[str, Mp4Writer] = {}
         self._video_positions = {key: next_position(root / "videos" / key, info.chunks_size) for key in info.video_keys}
         self._video_info = {key: info.features[key].info for key in info.video_keys}
@@ -176,8 +148,10 @@ class DatasetWriter:
         self._data.abort()
         self._episodes.abort()
 
-    def add(self, episode: EpisodeData) -> WrittenEpisode:
-        """Append an episode."""
+    def add(self, episode: EpisodeData) -> str:
+        """Append an episode; return its digest (`demorec.datasets.lerobot.layout`), "" where images are in rows, or its
+        videos have none.
+        """
         frames = episode.num_frames
         if frames == 0:
             raise ExportError("An episode without frames cannot be exported.")
@@ -223,26 +197,21 @@ class DatasetWriter:
             digests[key] = episode.videos[key].digest
             self._video_info[key] = merged_video_info(self._video_info[key] or {}, dict(episode.video_info[key]))
         statistics |= {key: self._count(key, episode.pixels[key]) for key in self._cameras}
-        self._rows.append(row)
-        self._row_statistics.append(statistics)
-        if len(self._rows) >= _EPISODES_PER_TABLE:
-            self._write_episode_rows()
+        row |= {f"stats/{key}/{name}": found.nested(name) for key, found in statistics.items() for name in NAMES}
+        self._episodes.add_row(row)
         self.num_frames += frames
         self.num_episodes += 1
         if spoken:
             values.update(language_digests(episode.language, frames))
         has_digest = len(digests) == len(self._cameras) and all(digests.values())
-        return WrittenEpisode(
-            episode_index=self.num_episodes - 1,
-            digest=episode_digest(episode.task, values, digests) if has_digest else "",
-        )
+        return episode_digest(episode.task, values, digests) if has_digest else ""
 
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
         """The statistics of a camera in an episode, which those of all episodes take in."""
         if isinstance(pixels, Statistics):
             unseen = self._unseen.setdefault(key, [])
             unseen.append(pixels)
-            if len(unseen) >= _EPISODES_PER_TABLE:
+            if len(unseen) >= _MOST_UNSEEN:
                 unseen[:] = [merge_statistics(unseen)]
             return pixels
         self._pixels[key] = self._pixels[key] + pixels if key in self._pixels else pixels
@@ -280,7 +249,6 @@ class DatasetWriter:
         for video in self._videos.values():
             video.close()
         self._data.close()
-        self._write_episode_rows()
         self._episodes.close()
         write_tasks(self._root / TASKS_PATH, list(self._tasks))
         statistics: dict[str, Statistics] = dict(
@@ -288,7 +256,7 @@ class DatasetWriter:
         )
         for key in self._cameras:
             new = self._pixels[key].statistics() if key in self._pixels else None
-            parts = [part for part in (self._start.statistics.get(key), new) if part is not None]
+            parts = [part for part in (self._old_statistics.get(key), new) if part is not None]
             if parts := [*parts, *self._unseen.get(key, ())]:
                 statistics[key] = merge_statistics(parts)
         ordered = {name: statistics[name].to_json() for name in self._info.features if name in statistics}
@@ -320,40 +288,12 @@ class DatasetWriter:
         fields += [("meta/episodes/chunk_index", pa.int64()), ("meta/episodes/file_index", pa.int64())]
         return pa.schema(fields)
 
-    def _write_episode_rows(self) -> None:
-        if not self._rows:
-            return
-        position = self._episodes.make_room(len(self._rows))
-        arrays = []
-        for item in self._episodes.schema:
-            kind, _, rest = item.name.partition("/")
-            if kind == "stats":
-                feature, _, name = rest.rpartition("/")
-                of_rows = [statistics[feature] for statistics in self._row_statistics]
-                if name == "count":
-                    arrays.append(nested_array(np.array([[row.count] for row in of_rows], dtype=np.int64), 1))
-                else:
-                    values = np.stack([row.values[name] for row in of_rows])
-                    arrays.append(nested_array(values, 3 if of_rows[0].is_camera else 1))
-            elif kind == "meta":
-                number = position.chunk if rest.endswith("chunk_index") else position.file
-                arrays.append(pa.array([number] * len(self._rows), item.type))
-            else:
-                arrays.append(pa.array([row[item.name] for row in self._rows], item.type))
-        self._episodes.write(pa.Table.from_arrays(arrays, schema=self._episodes.schema))
-        self._rows.clear()
-        self._row_statistics.clear()
-
 
 def values_of(column: NDArray[Any] | pa.Array) -> NDArray[Any]:
     """Numbers or texts of a column, digests of one of language."""
     if not isinstance(column, pa.Array):
         return column
     return column_digests(column) if is_language(column.type) else column_values(column)
-
-
-def _sizes(info: DatasetInfo) -> dict[str, Any]:
-    return {"limit_mb": info.data_files_size_in_mb, "chunks_size": info.chunks_size}
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
