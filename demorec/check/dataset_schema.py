@@ -13,8 +13,9 @@ from demorec.check.base import Measurement, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.tables import ROBOTS
-from demorec.datasets.lerobot.files import check_video, open_table, read_json
+from demorec.datasets.lerobot.files import open_table, read_json
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
+from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX
 from demorec.episode.features import ACTION, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, observation_names

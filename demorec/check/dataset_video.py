@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.reader import EpisodePlace
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from support.mcap import chunk_record, message_record, record, rewritten
 from support.recording import write_episode
 
 from demorec.core.errors import ConfigError, ExportError, RecordingError
-from demorec.datasets.lerobot.files import check_video
+from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.mcap import Recording
 from demorec.robots.urdf import check_primitives
 

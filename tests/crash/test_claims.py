@@ -21,7 +21,8 @@ from support.fuzz import LimitedCommands, problem_of
 
 from demorec.core.errors import ExportError
 from demorec.datasets.hdf5.foreign import ForeignFile
-from demorec.datasets.lerobot.files import check_video, read_table
+from demorec.datasets.lerobot.files import read_table
+from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.pages import longest_row, pages_of
 
 pytestmark = pytest.mark.slow

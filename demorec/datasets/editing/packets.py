@@ -45,9 +45,8 @@ class VideoFile:
 
     def __init__(self, path: Path, fps: float) -> None:
         self.path, self.fps = path, fps
-        index = mp4_index(path)
-        self.offsets, self.sizes, self.is_keyframe = index.offsets, index.sizes, index.is_keyframe
-        self.frames: NDArray[np.int64] = np.rint(index.times * fps).astype(np.int64)
+        self.offsets, self.sizes, self.is_keyframe, times = mp4_index(path)
+        self.frames: NDArray[np.int64] = np.rint(times * fps).astype(np.int64)
         self.order = np.argsort(self.frames, kind="stable")
         self.keys = np.flatnonzero(self.is_keyframe)
         with opened_video(path) as (_, stream):

@@ -1,19 +1,18 @@
-"""The files of a dataset of unknown origin, opened within bounds: JSON, Parquet tables, mp4 videos.
+"""The files of a dataset of unknown origin, opened within bounds: JSON and Parquet tables.
 
-Anyone writes LeRobot datasets, and people pass them on. A table of a few kB can claim a thousand million rows, a video
-as many images, and under the name of either may lie something that is no file at all.
+Anyone writes LeRobot datasets, and people pass them on. A table of a few kB can claim a thousand million rows,
+and under its name may lie something that is no file at all.
 """
 
 from __future__ import annotations
 
 import os
-import struct
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.abc import MetaPathFinder
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -40,8 +39,6 @@ _MOST_SAID = 4096
 _MOST_SAID_AT_ALL, _SAID_RATIO = 16 << 20, 32
 """Values of them in any table, and per byte of a larger one; ours have 2 values a byte."""
 _BYTES_PER_VALUE = 8
-_PARENT_BOXES = frozenset((b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf"))
-_MAX_BOXES = 100_000
 
 
 def leave_pandas_out() -> None:
@@ -293,55 +290,3 @@ def _too_large(path: Path, allowed: int) -> ExportError:
 
 def _most_bytes(size: int) -> int:
     return max(_FLOOR_BYTES, _RATIO * size)
-
-
-def check_video(path: Path) -> None:
-    """Refuse what no decoder should be given: no regular mp4 file, or one that claims more images than it can hold.
-
-    Raises:
-        ExportError: That.
-    """
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            claimed = sum(_samples(file, size))
-    except (OSError, ValueError, struct.error) as error:
-        raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
-    if claimed > size:
-        raise ExportError(f"The video claims {claimed:,} bytes or images, but has {size:,} bytes: {path}")
-
-
-def _samples(file: BinaryIO, size: int) -> Iterator[int]:
-    """What the sample tables of an mp4 file claim: bytes of their samples, or their number where it is larger.
-
-    ISO/IEC 14496-12: a box has its length (1: 64 bits follow; 0: to the end) and its kind in front.
-    """
-    waiting, num_boxes = [(0, size)], 0
-    while waiting:
-        start, end = waiting.pop()
-        while start + 8 <= end:
-            num_boxes += 1
-            if num_boxes > _MAX_BOXES:
-                raise ValueError(f"more than {_MAX_BOXES:,} boxes")
-            file.seek(start)
-            length, kind = struct.unpack(">I4s", file.read(8))
-            head = 8
-            if length == 1:
-                (length,) = struct.unpack(">Q", file.read(8))
-                head = 16
-            elif length == 0:
-                length = end - start
-            if length < head or start + length > end:
-                raise ValueError("a box that is cut off" if start else "no mp4 file")
-            if kind in _PARENT_BOXES:
-                waiting.append((start + head, start + length))
-            elif kind in (b"stsz", b"stz2"):
-                _, each, count = struct.unpack(">III", file.read(12))
-                if kind == b"stsz" and each == 0 and 4 * count <= length:
-                    found = np.frombuffer(file.read(4 * count), ">u4", count)
-                    yield max(count, int(found.sum(dtype=np.int64)))
-                else:
-                    yield max(count, each * count if kind == b"stsz" else 0)
-            elif kind == b"trun":
-                yield struct.unpack(">II", file.read(8))[1]
-            start += length

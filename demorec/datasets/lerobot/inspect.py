@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.files import check_video, open_table, read_json, read_table
+from demorec.datasets.lerobot.files import open_table, read_json, read_table
 from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
+from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.reader import RowStream, episode_places, read_tasks
 from demorec.datasets.lerobot.videos import PacketReader

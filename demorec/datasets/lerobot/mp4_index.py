@@ -1,90 +1,126 @@
-"""Where each encoded image lies in an mp4 file: the tables in its `moov` box, read and written (ISO/IEC
-14496-12)."""
+"""Where each encoded image lies in an mp4 file: the tables in its `moov` box, read and written (ISO/IEC 14496-12).
+
+A video of a few kB, whoever wrote it, can claim a thousand million images.
+"""
 
 from __future__ import annotations
 
+import io
+import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
-from demorec.datasets.lerobot.files import check_video
 
 _MAX_MOOV = 256 << 20
 _CHUNK = 1 << 20
 """Bytes, below which images that follow each other are listed as one chunk, as libav does."""
 _PARENTS = (b"trak", b"mdia", b"minf", b"stbl", b"edts")
+_PARENTS_ABOVE = (b"moov", b"moof", b"traf")
+_MAX_BOXES = 100_000
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Mp4Index:
-    """The images of the first video track in the order in which they are stored.
+def check_video(path: Path) -> None:
+    """Refuse what no decoder should be given: no regular mp4 file, or one that claims more images than it can hold.
 
-    Attributes:
-        offsets, sizes: (N,) int64, bytes in the file.
-        is_keyframe: (N,) bool.
-        times: (N,) float64, when each is shown, s.
+    Raises:
+        ExportError: That.
     """
-
-    offsets: NDArray[np.int64]
-    sizes: NDArray[np.int64]
-    is_keyframe: NDArray[np.bool_]
-    times: NDArray[np.float64]
-
-
-def mp4_index(path: Path) -> Mp4Index:
-    """Read it; ExportError for what is no mp4 file, is cut off, or is fragmented."""
-    check_video(path)
     try:
         with open_regular(path) as file:
-            size = path.stat().st_size
-            place = 0
-            while place + 8 <= size:
-                file.seek(place)
-                length, kind = struct.unpack(">I4s", file.read(8))
-                head = 8
-                if length == 1:
-                    (length,), head = struct.unpack(">Q", file.read(8)), 16
-                length = length or size - place
-                if kind == b"moov":
-                    if length > _MAX_MOOV:
-                        raise ValueError("its index is very large")
-                    return _index(file.read(length - head), size)
-                place += max(length, 8)
-        raise ValueError("it has no index")
-    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
-        raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
+            size = os.fstat(file.fileno()).st_size
+            claimed = sum(_claims(file, size))
+    except (OSError, ValueError, struct.error) as error:
+        raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
+    if claimed > size:
+        raise ExportError(f"The video claims {claimed:,} bytes or images, but has {size:,} bytes: {path}")
 
 
-def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    place = 0
-    while place + 8 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, place)
-        head = 8
+def _claims(file: BinaryIO, size: int) -> Iterator[int]:
+    """What the sample tables of an mp4 file claim: bytes of their samples, or their number where it is larger."""
+    waiting, num_boxes = [(0, size)], 0
+    while waiting:
+        for kind, begin, end in _boxes(file, *waiting.pop()):
+            num_boxes += 1
+            if num_boxes > _MAX_BOXES:
+                raise ValueError(f"more than {_MAX_BOXES:,} boxes")
+            if kind in _PARENTS or kind in _PARENTS_ABOVE:
+                waiting.append((begin, end))
+            elif kind in (b"stsz", b"stz2"):
+                _, each, count = _read(file, begin, ">III")
+                if kind == b"stsz" and each == 0 and 4 * count <= end - begin:
+                    sizes = np.frombuffer(file.read(4 * count), ">u4", count)
+                    yield max(count, int(sizes.sum(dtype=np.int64)))
+                else:
+                    yield max(count, each * count if kind == b"stsz" else 0)
+            elif kind == b"trun":
+                yield _read(file, begin, ">II")[1]
+
+
+def _read(file: BinaryIO, begin: int, layout: str) -> tuple[Any, ...]:
+    file.seek(begin)
+    return struct.unpack(layout, file.read(struct.calcsize(layout)))
+
+
+def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """(kind, first byte of its content, byte behind it) of the boxes in a part of a file.
+
+    A box has its length (1: 64 bits follow; 0: to the end) and its kind in front.
+    """
+    while start + 8 <= end:
+        (length, kind), head = _read(file, start, ">I4s"), 8
         if length == 1:
-            (length,), head = struct.unpack_from(">Q", data, place + 8), 16
-        length = length or len(data) - place
-        if length < head:
-            raise ValueError("a box that is cut off")
-        yield kind, data[place + head : place + length]
-        place += length
+            (length,), head = _read(file, start + 8, ">Q"), 16
+        length = length or end - start
+        if length < head or start + length > end:
+            raise ValueError("a box that is cut off" if start else "no mp4 file")
+        yield kind, start + head, start + length
+        start += length
 
 
-def _flat(data: bytes) -> dict[bytes, bytes]:
-    found: dict[bytes, bytes] = {}
-    for kind, content in _boxes(data):
-        found |= _flat(content) if kind in _PARENTS else {kind: content}
+def _flat(file: BinaryIO, start: int, end: int) -> dict[bytes, bytes]:
+    """Kind -> content of all boxes in a part of a file, those within others included."""
+    found, waiting = {}, [(start, end)]
+    for part in waiting:
+        for kind, begin, stop in _boxes(file, *part):
+            if kind in _PARENTS:
+                waiting.append((begin, stop))
+            else:
+                file.seek(begin)
+                found[kind] = file.read(stop - begin)
     return found
 
 
-def _index(moov: bytes, size: int) -> Mp4Index:
-    tracks = [_flat(content) for kind, content in _boxes(moov) if kind == b"trak"]
-    track = next(track for track in tracks if track[b"hdlr"][8:12] == b"vide")
+Index = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64]]
+"""Of N images in the order in which they are stored, (N,) each: where they begin in the file and their lengths, bytes;
+whether they are keyframes; when they are shown, s."""
+
+
+def mp4_index(path: Path) -> Index:
+    """Of the first video track; ExportError for what is no mp4 file, is cut off, or is fragmented."""
+    check_video(path)
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            moov = next((part for kind, *part in _boxes(file, 0, size) if kind == b"moov"), None)
+            if moov is None:
+                raise ValueError("it has no index")
+            begin, end = moov
+            if end - begin > _MAX_MOOV:
+                raise ValueError("its index is very large")
+            tracks = (_flat(file, *part) for kind, *part in _boxes(file, begin, end) if kind == b"trak")
+            return _index(next(track for track in tracks if track[b"hdlr"][8:12] == b"vide"), size)
+    except (OSError, ValueError, KeyError, IndexError, StopIteration, struct.error) as error:
+        raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
+
+
+def _index(track: Mapping[bytes, bytes], size: int) -> Index:
     (timescale,) = struct.unpack_from(">I", track[b"mdhd"], 20 if track[b"mdhd"][0] else 12)
     each, count = struct.unpack_from(">II", track[b"stsz"], 4)
     sizes = _numbers(track[b"stsz"], 12, count) if not each else np.full(count, each, dtype=np.int64)
@@ -101,7 +137,7 @@ def _index(moov: bytes, size: int) -> Mp4Index:
     offsets = _offsets(track, sizes)
     if count and (offsets.min() < 0 or (offsets + sizes).max() > size):
         raise ValueError("it is cut off")
-    return Mp4Index(offsets=offsets, sizes=sizes, is_keyframe=is_keyframe, times=ticks / timescale)
+    return offsets, sizes, is_keyframe, ticks / timescale
 
 
 def _count(box: bytes) -> int:
@@ -131,7 +167,7 @@ def _edited(box: bytes) -> int:
     return 0
 
 
-def _offsets(track: dict[bytes, bytes], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+def _offsets(track: Mapping[bytes, bytes], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where each image begins, from the chunks that they lie in."""
     name, kind = (b"co64", ">u8") if b"co64" in track else (b"stco", ">u4")
     chunks = _numbers(track[name], 8, _count(track[name]), kind)
@@ -158,8 +194,9 @@ def mp4_head(
         is_keyframe: (N,) which ones can be decoded by themselves.
         delays: (N,) by how many frames each is shown later than it is decoded.
     """
-    found = dict(_boxes(template))
-    track = _flat(found[b"moov"])
+    file = io.BytesIO(template)
+    found = {kind: (begin, end) for kind, begin, end in _boxes(file, 0, len(template))}
+    track = _flat(file, *found[b"moov"])
     step = int(_repeated(track[b"stts"], 1)[0])
     timescale, movie_scale = (struct.unpack_from(">I", box, 12)[0] for box in (track[b"mdhd"], track[b"mvhd"]))
     duration, total = len(sizes) * step, int(sizes.sum())
@@ -180,9 +217,9 @@ def mp4_head(
 
     def index(begin: int) -> bytes:
         offsets = {b"co64": _table(begins + begin, ">u8")} if is_long else {b"stco": _table(begins + begin)}
-        return _box(b"moov", _with_tables(found[b"moov"], {**tables, **offsets}, durations))
+        return _box(b"moov", _with_tables(file, found[b"moov"], {**tables, **offsets}, durations))
 
-    start = _box(b"ftyp", found[b"ftyp"])
+    start = _box(b"ftyp", template[slice(*found[b"ftyp"])])
     head = start + index(len(start) + len(index(0)) + 16)
     if is_long:
         return head + struct.pack(">I4sQ", 1, b"mdat", total + 16)
@@ -217,15 +254,21 @@ def _box(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I4s", 8 + len(content), kind) + content
 
 
-def _with_tables(data: bytes, tables: Mapping[bytes, bytes], durations: Mapping[bytes, tuple[int, int]]) -> bytes:
+def _with_tables(
+    file: io.BytesIO,
+    part: tuple[int, int],
+    tables: Mapping[bytes, bytes],
+    durations: Mapping[bytes, tuple[int, int]],
+) -> bytes:
     """Boxes with other tables of images, and numbers of four bytes at some places."""
     parts = []
-    for kind, content in _boxes(data):
+    for kind, begin, end in _boxes(file, *part):
+        content = file.getvalue()[begin:end]
         if kind == b"stbl":
             of_images = (_box(name, table) for name, table in tables.items())
-            parts.append(_box(kind, _box(b"stsd", _flat(content)[b"stsd"]) + b"".join(of_images)))
+            parts.append(_box(kind, _box(b"stsd", _flat(file, begin, end)[b"stsd"]) + b"".join(of_images)))
         elif kind in _PARENTS:
-            parts.append(_box(kind, _with_tables(content, tables, durations)))
+            parts.append(_box(kind, _with_tables(file, (begin, end), tables, durations)))
         else:
             place, number = durations.get(kind, (len(content), None))
             new = b"" if number is None else struct.pack(">I", number)

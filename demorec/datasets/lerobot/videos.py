@@ -25,8 +25,8 @@ from PIL import Image
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
-from demorec.datasets.lerobot.files import check_video
 from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream
 
