@@ -320,7 +320,7 @@ class Dataset:
 
     def _tell_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
         """What of the sources is in the result, and what is not."""
-        from demorec.datasets.editing.left_out import left_out
+        from demorec.datasets.editing.beside import left_out
 
         lengths = [place.length for source in plan.sources for place in source.places]
         frames = sum(cut.last - cut.first for cut in plan.cuts)

@@ -1,7 +1,12 @@
-"""What stands beside the tables of an edited dataset: the sidecar's rows, robots, attempts, poses, boxes, progress."""
+"""What stands beside the tables of an edited dataset, and what of its sources it will not have.
+
+Beside stand the sidecar's rows, robots, attempts, poses of cameras, boxes and progress. What is left out is known
+before anything is written.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +20,9 @@ from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import Cut, Plan, Source
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, STAGE_COLUMNS, read_progress, write_progress
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, read_progress, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
-from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, THUMBNAILS_PATH, is_dataset_file
 from demorec.datasets.lerobot.reader import EpisodeRows
 from demorec.datasets.lerobot.robots import read_robot
 from demorec.datasets.lerobot.sidecar import (
@@ -33,9 +38,12 @@ _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "goa
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
+ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes")
+"""Files that are copied from a single source."""
+_NAMED = 5
 
 
-def moving_cameras(source: Source) -> tuple[str, ...] | None:
+def _moving_cameras(source: Source) -> tuple[str, ...] | None:
     """Cameras of whose every frame the pose is kept; None where the files do not agree."""
     names = [open_table(path).schema_arrow.names for path in _pose_files(source)]
     if any(each != names[0] for each in names):
@@ -47,18 +55,18 @@ def _pose_files(source: Source) -> list[Path]:
     return sorted((source.root / SIDECAR_DIR / "camera_poses").glob("*/*.parquet"))
 
 
-def poses_are_kept(plan: Plan) -> bool:
+def _poses_are_kept(plan: Plan) -> bool:
     """Whether all sources with moving cameras have the same."""
-    found = {moving_cameras(source) for source in plan.sources} - {()}
+    found = {_moving_cameras(source) for source in plan.sources} - {()}
     return len(found) <= 1 and None not in found
 
 
-class CameraPoses:
+class _CameraPoses:
     """Those of one source."""
 
     def __init__(self, source: Source) -> None:
         self._root = source.root
-        self._names = moving_cameras(source) or ()
+        self._names = _moving_cameras(source) or ()
         self._rows = EpisodeRows(_pose_files(source), rows=_ROWS_AT_ONCE) if self._names else None
 
     def of(self, episode_index: int, cut: Cut) -> dict[str, Array]:
@@ -71,26 +79,26 @@ class CameraPoses:
         return {name: column_numbers(rows.column(name).combine_chunks()) for name in self._names}
 
 
-def has_stages(plan: Plan) -> bool:
+def _has_stages(plan: Plan) -> bool:
     """Whether progress is computed anew, from the stages that demorec wrote."""
     needed = {*STAGE_COLUMNS, "num_goals"}
     return all(source.sidecar_tables and needed <= set(source.fact_types) for source in plan.sources)
 
 
-def progress_is_kept(plan: Plan) -> bool:
+def _progress_is_kept(plan: Plan) -> bool:
     """Whether all sources have progress of the same kind."""
     paths = [source.root / PROGRESS_PATH for source in plan.sources]
     if not all(path.is_file() for path in paths):
         return False
     schemas = [open_table(path).schema_arrow for path in paths]
-    return has_stages(plan) or (
+    return _has_stages(plan) or (
         set(_COUNTERS) <= set(schemas[0].names) and all(schema.equals(schemas[0]) for schema in schemas)
     )
 
 
-def write_kept_progress(plan: Plan, folder: Path) -> None:
+def _write_kept_progress(plan: Plan, folder: Path) -> None:
     """Write the progress of the new dataset's rows: from stages, else as the sources have it of each frame."""
-    if has_stages(plan):
+    if _has_stages(plan):
         write_progress(folder, read_progress(folder))
         return
     path, total = folder / PROGRESS_PATH, 0
@@ -137,7 +145,7 @@ class Beside:
         self._sidecar = SidecarWriter(folder, plan.info, configs) if has_any else None
         sources = plan.sources if has_any else ()
         self._rows = [EpisodeRows(source.sidecar_tables, EPISODE_SCHEMA, rows=64) for source in sources]
-        self._poses = [CameraPoses(source) for source in (sources if poses_are_kept(plan) else ())]
+        self._poses = [_CameraPoses(source) for source in (sources if _poses_are_kept(plan) else ())]
         self._boxes = BoxWriter(folder, fps=plan.info.fps)
         self._stored_boxes = [
             {
@@ -197,8 +205,8 @@ class Beside:
                     self._sidecar.add_attempt(attempt, in_dataset=False)
             found = next((s.root for s in self._plan.sources if (s.root / EXPORT_PATH).exists()), None)
             self._sidecar.finish(read_json(found / EXPORT_PATH) if found else {})
-        if progress_is_kept(self._plan):
-            write_kept_progress(self._plan, self._folder)
+        if _progress_is_kept(self._plan):
+            _write_kept_progress(self._plan, self._folder)
 
 
 def _reworded(info: str, task: str, root: Path) -> str:
@@ -221,3 +229,74 @@ def _cut_frames(row: dict[str, Any], cut: Cut) -> dict[str, Any]:
     ]
     misses = [frame - cut.first for frame in row.get("deliberate_miss_frames") or () if cut.first <= frame < cut.last]
     return {"phases": phases, "deliberate_miss_frames": misses}
+
+
+def left_out(plan: Plan) -> tuple[str, ...]:
+    """One phrase each, with the reason in brackets; what the user chose to leave out is none."""
+    found: dict[str, set[str]] = {}
+    for number, source in enumerate(plan.sources):
+        for name, reason in _files(plan, number, source.root):
+            found.setdefault(reason, set()).add(name)
+    phrases = []
+    for reason, names in found.items():
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        phrases.append(f"{', '.join(sorted(names)[:_NAMED])}{more} ({reason})")
+    return (*phrases, *_scenes(plan), *_descriptions(plan), *_attempts(plan), *_facts(plan))
+
+
+def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
+    cameras = {take.feature for take in plan.takes[number].values()}
+    proportions = [PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")]
+    keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
+    for path in sorted(root.rglob("*")):
+        name = path.relative_to(root).as_posix()
+        if not path.is_file() or name.startswith(".cache/"):
+            continue
+        if not is_dataset_file(name):
+            yield name, "of a kind that demorec does not know: copy it if it still holds"
+        elif name in ABOUT_THE_WHOLE and len(plan.sources) > 1:
+            yield name, "each of the datasets may have its own"
+        elif name == THUMBNAILS_PATH:
+            yield name, "it shows the episodes of the source"
+        elif name.startswith("images/"):
+            yield name, "no row has it"
+        elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
+            yield name, "other cameras move in the other datasets"
+        elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
+            yield name, "its camera is left out"
+        elif name == PROGRESS_PATH and not keeps_progress:
+            yield name, "not all datasets have progress with the same columns"
+        elif name in proportions and not (keeps_progress and _has_stages(plan)):
+            yield name, "they are those of the source's episodes together"
+
+
+def _scenes(plan: Plan) -> Iterator[str]:
+    lost = 0
+    for cut in plan.cuts:
+        source = plan.sources[cut.source]
+        lost += source.has_scene(source.places[cut.episode].episode_index) and not plan.keeps_scene(cut)
+    if lost:
+        yield f"scenes of simulated episodes: {lost} (they describe the episode as it was recorded)"
+
+
+def _descriptions(plan: Plan) -> Iterator[str]:
+    spoken = any(feature.dtype == "language" for feature in plan.info.features.values())
+    if spoken and (count := sum(bool(cut.task) for cut in plan.cuts)):
+        yield f"other wordings (task_aug) in episodes: {count} (they are wordings of the old instruction)"
+
+
+def _attempts(plan: Plan) -> Iterator[str]:
+    lost = 0
+    for number, source in enumerate(plan.sources):
+        kept = {cut.episode for cut in plan.cuts if cut.source == number}
+        gone = [place.episode_index for episode, place in enumerate(source.places) if episode not in kept]
+        lost += sum(len(source.attempts.failed(index)) for index in gone)
+        lost += 0 if plan.takes_all_of(number) else len(source.attempts.homeless())
+    if lost:
+        yield f"failed attempts: {lost} (at episodes that are not in the result)"
+
+
+def _facts(plan: Plan) -> Iterator[str]:
+    names = {name for source in plan.sources if not source.info.is_old for name in source.info.other}
+    if lost := sorted(names - set(plan.info.other)):
+        yield f"{', '.join(lost)} of info.json (the datasets differ in it)"

@@ -182,15 +182,6 @@ class Attempts:
         """Failed ones at episodes that the dataset has not."""
         return self._rows(self._homeless)
 
-    def num_failed(self, episode_index: int) -> int:
-        """How many failed before an episode."""
-        return len(self._failed.get(episode_index, []))
-
-    @property
-    def num_homeless(self) -> int:
-        """How many failed at episodes that the dataset has not."""
-        return len(self._homeless)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Take:

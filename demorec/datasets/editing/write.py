@@ -16,8 +16,7 @@ from PIL import Image
 
 from demorec.core.errors import ExportError
 from demorec.core.replacing import check_replaceable
-from demorec.datasets.editing.beside import Beside
-from demorec.datasets.editing.left_out import ABOUT_THE_WHOLE
+from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
 from demorec.datasets.editing.packets import OpenVideo, video_files
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, table_batches
