@@ -61,24 +61,6 @@ def _poses_are_kept(plan: Plan) -> bool:
     return len(found) <= 1 and None not in found
 
 
-class _CameraPoses:
-    """Those of one source."""
-
-    def __init__(self, source: Source) -> None:
-        self._root = source.root
-        self._names = _moving_cameras(source) or ()
-        self._rows = EpisodeRows(_pose_files(source), rows=_ROWS_AT_ONCE) if self._names else None
-
-    def of(self, episode_index: int, cut: Cut) -> dict[str, Array]:
-        """Camera -> (T, 7) world_from_camera; none for an episode without; ExportError where frames lack."""
-        rows = self._rows.frames(episode_index, cut.first, cut.last) if self._rows is not None else None
-        if rows is None or not rows.num_rows:
-            return {}
-        if rows.num_rows != cut.last - cut.first:
-            raise ExportError(f"Poses of cameras are missing in episode {episode_index}: {self._root}")
-        return {name: column_numbers(rows.column(name).combine_chunks()) for name in self._names}
-
-
 def _has_stages(plan: Plan) -> bool:
     """Whether progress is computed anew, from the stages that demorec wrote."""
     needed = {*STAGE_COLUMNS, "num_goals"}
@@ -145,7 +127,8 @@ class Beside:
         self._sidecar = SidecarWriter(folder, plan.info, configs) if has_any else None
         sources = plan.sources if has_any else ()
         self._rows = [EpisodeRows(source.sidecar_tables, EPISODE_SCHEMA, rows=64) for source in sources]
-        self._poses = [_CameraPoses(source) for source in (sources if _poses_are_kept(plan) else ())]
+        with_poses = sources if _poses_are_kept(plan) else ()
+        self._poses = [EpisodeRows(_pose_files(source), rows=_ROWS_AT_ONCE) for source in with_poses]
         self._boxes = BoxWriter(folder, fps=plan.info.fps)
         self._stored_boxes = [
             {
@@ -191,10 +174,21 @@ class Beside:
         attempt = attempts.of(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names if name != "in_dataset"}
         record = EpisodeRecord(
             row=row,
-            moving_cameras=self._poses[cut.source].of(index, cut) if self._poses else {},
+            moving_cameras=self._camera_poses(cut, index) if self._poses else {},
             robot=None if robot is None else read_robot(source.root, str(robot)),
         )
         self._sidecar.add(episode_index, digest, record, attempt)
+
+    def _camera_poses(self, cut: Cut, episode_index: int) -> dict[str, Array]:
+        """Camera -> (T, 7) world_from_camera; none for an episode without; ExportError where frames lack."""
+        rows = self._poses[cut.source].frames(episode_index, cut.first, cut.last)
+        if rows is None or not rows.num_rows:
+            return {}
+        if rows.num_rows != cut.last - cut.first:
+            root = self._plan.sources[cut.source].root
+            raise ExportError(f"Poses of cameras are missing in episode {episode_index}: {root}")
+        names = [name for name in rows.column_names if name not in _COUNTERS]
+        return {name: column_numbers(rows.column(name).combine_chunks()) for name in names}
 
     def finish(self) -> None:
         """Complete the files."""

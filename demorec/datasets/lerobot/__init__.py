@@ -15,27 +15,20 @@ if TYPE_CHECKING:
     from demorec.datasets.lerobot.paths import is_dataset
     from demorec.datasets.options import ExportReport, ProgressCallback
 
-__all__ = [
-    "ExportOptions",
-    "ExportReport",
-    "ProgressCallback",
-    "dataset_digest",
-    "export_lerobot",
-    "is_dataset",
-]
-
 _HOMES = {
-    "export_lerobot": "demorec.datasets.lerobot.export",
     "ExportOptions": "demorec.datasets.lerobot.options",
     "ExportReport": "demorec.datasets.options",
     "ProgressCallback": "demorec.datasets.options",
+    "dataset_digest": "demorec.datasets.lerobot.inspect",
+    "export_lerobot": "demorec.datasets.lerobot.export",
     "is_dataset": "demorec.datasets.lerobot.paths",
 }
+__all__ = ["ExportOptions", "ExportReport", "ProgressCallback", "dataset_digest", "export_lerobot", "is_dataset"]
 
 
 def __getattr__(name: str) -> Any:
     import importlib
 
-    if name not in __all__:
+    if name not in _HOMES:
         raise AttributeError(name)
-    return getattr(importlib.import_module(_HOMES.get(name, "demorec.datasets.lerobot.inspect")), name)
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -154,24 +154,11 @@ def _all_stages(episodes: Sequence[EpisodeProgress], head: Head) -> tuple[str, .
 
 
 _TYPES: dict[str, pa.DataType] = {
-    "success": pa.bool_(),
-    "failure_phase": pa.string(),
-    "failure_reason": pa.string(),
-    "num_retries": pa.int64(),
-    "has_deliberate_miss": pa.bool_(),
-    "duration_s": pa.float64(),
-    "task_name": pa.string(),
-    "split": pa.string(),
-    "variation": pa.string(),
+    **dict.fromkeys(("success", "has_deliberate_miss"), pa.bool_()),
+    **dict.fromkeys(("failure_phase", "failure_reason", "task_name", "split", "variation", "object"), pa.string()),
+    **dict.fromkeys(("num_retries", "run_episode_index", "attempt", "num_goals"), pa.int64()),
+    **dict.fromkeys(("duration_s", "object_x", "object_y", "goal_x", "goal_y"), pa.float64()),
     "seed": pa.uint64(),
-    "run_episode_index": pa.int64(),
-    "attempt": pa.int64(),
-    "num_goals": pa.int64(),
-    "object": pa.string(),
-    "object_x": pa.float64(),
-    "object_y": pa.float64(),
-    "goal_x": pa.float64(),
-    "goal_y": pa.float64(),
     **STAGE_COLUMNS,
 }
 DRAWN, CHECKED = "drawn/", "success_checks/"

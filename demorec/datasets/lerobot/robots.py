@@ -10,7 +10,7 @@ import functools
 import hashlib
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,19 +114,24 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     Raises:
         RecordingError: The recording is damaged.
     """
-    spec = None if episode.info.simulation is None else episode.info.robot
     if not (text := episode.urdf):
         return None
-    urdf = portable_urdf(text) if spec is None else text
-    moving = episode.moving()
+    name, moving = episode.recording.info.robot_name, episode.moving()
+    if episode.info.simulation is None:
+        return _robot(name, portable_urdf(text), moving)
+    spec = episode.info.robot
+    return _robot(name, text, moving, spec=spec, meshes=_mesh_names(spec.urdf))
+
+
+def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> DatasetRobot:
+    """An arm whose joints these features move, with what else of its record is known."""
     record = RobotRecord(
-        name=episode.recording.info.robot_name,
+        name=name,
         urdf_sha256=_sha256(urdf),
         joints={feature.name: feature.joints for feature in moving},
         units={feature.name: feature.units for feature in moving if feature.units},
         calibration={feature.name: feature.calibration for feature in moving if feature.calibration},
-        spec=spec,
-        meshes={} if spec is None else _mesh_names(spec.urdf),
+        **known,
     )
     return DatasetRobot(record=record, urdf=urdf)
 
@@ -150,8 +155,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
             # An opening in metres is no angle of the jaw.
             known = zip(names, stems, strict=True)
             joints = tuple(stem if stem in robot.joint_names and name != _IN_METRES else "" for name, stem in known)
-            record = RobotRecord(name=robot.name, urdf_sha256=_sha256(urdf), joints={STATE: joints})
-            return DatasetRobot(record=record, urdf=urdf)
+            return _robot(robot.name, urdf, [Feature(name=STATE, names=names, joints=joints)])
     return None
 
 
@@ -167,16 +171,7 @@ def robot_of_motors(motors: Motors) -> DatasetRobot:
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
     (model,) = (ROBOTS.load(name).urdf for name, arm in IN_MOTOR_UNITS.items() if arm.robot_type == motors.robot_type)
-    urdf = robot_description(model, 1.0)
-    features = motor_features(motors)
-    record = RobotRecord(
-        name=motors.robot_type,
-        urdf_sha256=_sha256(urdf),
-        joints={feature.name: feature.joints for feature in features},
-        units={feature.name: feature.units for feature in features},
-        calibration={feature.name: feature.calibration for feature in features},
-    )
-    return DatasetRobot(record=record, urdf=urdf)
+    return _robot(motors.robot_type, robot_description(model, 1.0), motor_features(motors))
 
 
 @functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run

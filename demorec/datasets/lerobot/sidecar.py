@@ -46,60 +46,66 @@ if TYPE_CHECKING:
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
 
-_POSE = pa.list_(pa.float64(), 7)
-_VECTOR = pa.list_(pa.float64())
-
-_CHECK = pa.struct(
-    [
-        ("name", pa.string()),
-        ("value", pa.float64()),
-        ("limit", pa.float64()),
-        ("unit", pa.string()),
-        ("passed", pa.bool_()),
-    ]
-)
-_PHASE = pa.struct([("name", pa.string()), ("from", pa.int64()), ("to", pa.int64())])
-_OBJECT = pa.struct([("name", pa.string()), ("world_from_object_start", _VECTOR), ("world_from_object_end", _VECTOR)])
-_GOAL = pa.struct([("object", pa.string()), ("onto", pa.string()), ("world_from_goal_start", _VECTOR)])
+_TEXT, _WHOLE, _NUMBER, _FLAG = pa.string(), pa.int64(), pa.float64(), pa.bool_()
+_POSE, _VECTOR = pa.list_(_NUMBER, 7), pa.list_(_NUMBER)
+_CHECK = pa.struct({"name": _TEXT, "value": _NUMBER, "limit": _NUMBER, "unit": _TEXT, "passed": _FLAG})
+_PHASE = pa.struct({"name": _TEXT, "from": _WHOLE, "to": _WHOLE})
+_OBJECT = pa.struct({"name": _TEXT, "world_from_object_start": _VECTOR, "world_from_object_end": _VECTOR})
+_GOAL = pa.struct({"object": _TEXT, "onto": _TEXT, "world_from_goal_start": _VECTOR})
 _CAMERA = pa.struct(
-    [
-        ("name", pa.string()),
-        ("width", pa.int64()),
-        ("height", pa.int64()),
-        ("intrinsics", _VECTOR),
-        ("mount", pa.string()),
-        ("mount_from_camera", _VECTOR),
-        ("world_from_camera_start", _VECTOR),
-    ]
+    {
+        "name": _TEXT,
+        "width": _WHOLE,
+        "height": _WHOLE,
+        "intrinsics": _VECTOR,
+        "mount": _TEXT,
+        "mount_from_camera": _VECTOR,
+        "world_from_camera_start": _VECTOR,
+    }
 )
 
 EPISODE_SCHEMA = pa.schema(
-    [
-        ("episode_index", pa.int64()),
-        ("source", pa.string()),
-        ("run_episode_index", pa.int64()),
-        ("attempt", pa.int64()),
-        ("root_seed", pa.uint64()),
-        ("task", pa.string()),
-        ("origin", pa.string()),
-        ("config_digest", pa.string()),
-        ("content_digest", pa.string()),
-        ("frame_stride", pa.int64()),
-        ("success", pa.bool_()),
-        ("failure_phase", pa.string()),
-        ("failure_reason", pa.string()),
-        ("num_retries", pa.int64()),
-        ("final_state_digest", pa.string()),
-        ("checks", pa.list_(_CHECK)),
-        ("behaviour", pa.map_(pa.string(), pa.float64())),
-        ("phases", pa.list_(_PHASE)),
-        ("deliberate_miss_frames", pa.list_(pa.int64())),
-        ("objects", pa.list_(_OBJECT)),
-        ("goals", pa.list_(_GOAL)),
-        ("cameras", pa.list_(_CAMERA)),
-        ("episode_info", pa.string()),
-        ("robot_digest", pa.string()),
-    ]
+    {
+        "episode_index": _WHOLE,
+        "source": _TEXT,
+        "run_episode_index": _WHOLE,
+        "attempt": _WHOLE,
+        "root_seed": pa.uint64(),
+        "task": _TEXT,
+        "origin": _TEXT,
+        "config_digest": _TEXT,
+        "content_digest": _TEXT,
+        "frame_stride": _WHOLE,
+        "success": _FLAG,
+        "failure_phase": _TEXT,
+        "failure_reason": _TEXT,
+        "num_retries": _WHOLE,
+        "final_state_digest": _TEXT,
+        "checks": pa.list_(_CHECK),
+        "behaviour": pa.map_(_TEXT, _NUMBER),
+        "phases": pa.list_(_PHASE),
+        "deliberate_miss_frames": pa.list_(_WHOLE),
+        "objects": pa.list_(_OBJECT),
+        "goals": pa.list_(_GOAL),
+        "cameras": pa.list_(_CAMERA),
+        "episode_info": _TEXT,
+        "robot_digest": _TEXT,
+    }
+)
+
+
+ATTEMPT_SCHEMA = pa.schema(
+    {
+        "source": _TEXT,
+        "run_episode_index": _WHOLE,
+        "attempt": _WHOLE,
+        "success": _FLAG,
+        "failure_phase": _TEXT,
+        "failure_reason": _TEXT,
+        "object": _TEXT,
+        **dict.fromkeys(("object_x", "object_y", "goal_x", "goal_y"), _NUMBER),
+        "in_dataset": _FLAG,
+    }
 )
 
 
@@ -258,24 +264,6 @@ class SidecarWriter:
         write_text(self._root / CONFIGS_PATH, json.dumps(self._configs, indent=2, sort_keys=True) + "\n")
         write_text(self._root / EXPORT_PATH, json.dumps(dict(export), indent=2, sort_keys=True) + "\n")
         return self._configs
-
-
-ATTEMPT_SCHEMA = pa.schema(
-    [
-        ("source", pa.string()),
-        ("run_episode_index", pa.int64()),
-        ("attempt", pa.int64()),
-        ("success", pa.bool_()),
-        ("failure_phase", pa.string()),
-        ("failure_reason", pa.string()),
-        ("object", pa.string()),
-        ("object_x", pa.float64()),
-        ("object_y", pa.float64()),
-        ("goal_x", pa.float64()),
-        ("goal_y", pa.float64()),
-        ("in_dataset", pa.bool_()),
-    ]
-)
 
 
 def attempt_row(recording: Recording) -> dict[str, Any]:
