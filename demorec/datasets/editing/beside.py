@@ -21,7 +21,7 @@ from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import Cut, Plan, Source
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, read_progress, write_progress
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
 from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, THUMBNAILS_PATH, is_dataset_file
 from demorec.datasets.lerobot.reader import EpisodeRows
 from demorec.datasets.lerobot.robots import read_robot
@@ -52,7 +52,7 @@ def _moving_cameras(source: Source) -> tuple[str, ...] | None:
 
 
 def _pose_files(source: Source) -> list[Path]:
-    return sorted((source.root / SIDECAR_DIR / "camera_poses").glob("*/*.parquet"))
+    return tables_in(source.root, f"{SIDECAR_DIR}/camera_poses")
 
 
 def _poses_are_kept(plan: Plan) -> bool:

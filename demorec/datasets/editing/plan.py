@@ -7,17 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.lerobot.files import open_table, read_json_lines, read_table, table_batches
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.files import open_table, read_json_lines, read_table, table_batches, tables_in
 from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import episode_places, read_tasks
+from demorec.datasets.lerobot.reader import OpenDataset
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
 from demorec.episode.features import ACTION, STATE
 
@@ -28,35 +29,19 @@ _SCENE = "root_seed"
 """Stands in the sidecar for each episode whose scene does."""
 
 
-class Source:
+class Source(OpenDataset):
     """A dataset that is edited.
 
     Attributes:
-        root, info: Its folder and what info.json says.
-        places: Where its episodes lie, in order.
         scores: episode_index -> score, where somebody asked for it.
-
-    Raises:
-        ExportError: There is none, or it is damaged.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.scores: Mapping[int, float] = {}
-        self.root = root
-        self.info = DatasetInfo.load(root)
-        self.places = tuple(episode_places(root, self.info))
-        if missing := [name for name in ("timestamp", "task_index") if name not in self.info.features]:
-            raise ExportError(f"The dataset has no {', '.join(missing)}: {root}")
-
-    @cached_property
-    def tasks(self) -> list[str]:
-        """Instructions."""
-        return read_tasks(self.root)
+    scores: Mapping[int, float] = MappingProxyType({})
 
     @property
     def episode_tables(self) -> list[Path]:
         """The files of the table of episodes; none before v3.0."""
-        return sorted((self.root / "meta" / "episodes").glob("*/*.parquet"))
+        return tables_in(self.root, "meta/episodes")
 
     @cached_property
     def fact_types(self) -> Mapping[str, Any]:
@@ -76,7 +61,7 @@ class Source:
     @property
     def sidecar_tables(self) -> list[Path]:
         """The tables of what demorec keeps beside the episodes."""
-        return sorted((self.root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
+        return tables_in(self.root, f"{SIDECAR_DIR}/episodes")
 
     @cached_property
     def beside(self) -> dict[int, dict[str, Any]]:
@@ -140,7 +125,7 @@ class Attempts:
     """
 
     def __init__(self, root: Path, episodes: Sequence[int]) -> None:
-        paths = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+        paths = tables_in(root, f"{SIDECAR_DIR}/attempts")
         tables = [read_table(path, ATTEMPT_SCHEMA.names, schema=ATTEMPT_SCHEMA) for path in paths]
         self._table = pa.concat_tables(tables or [ATTEMPT_SCHEMA.empty_table()]).combine_chunks()
         is_inside = self._table.column("in_dataset").to_pylist()

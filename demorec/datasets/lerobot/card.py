@@ -21,7 +21,7 @@ from demorec.core.config import GenerateConfig, parse_config
 from demorec.core.errors import ConfigError
 from demorec.core.files import sync_path
 from demorec.core.text import markdown, printable
-from demorec.datasets.lerobot.files import read_table
+from demorec.datasets.lerobot.files import rows_in
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
@@ -223,8 +223,7 @@ def _origin_section(root: Path, configs: Mapping[str, Any], options: ExportOptio
 
 def _success_section(root: Path) -> Iterable[str]:
     columns = ["success", "failure_phase", "failure_reason", "object_x", "object_y", "goal_x", "goal_y"]
-    files = sorted((root / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
-    rows = [row for file in files for row in read_table(file, columns, schema=ATTEMPT_SCHEMA).to_pylist()]
+    rows = list(rows_in(root, f"{SIDECAR_DIR}/attempts", columns, schema=ATTEMPT_SCHEMA))
     known = [row for row in rows if row["success"] is not None]
     success = np.array([row["success"] for row in known], dtype=np.bool_)
     total, good = len(success), int(success.sum())
@@ -321,8 +320,7 @@ def making_commands(root: Path, configs: Mapping[str, Any], options: ExportOptio
         configs: Config digest -> configuration of the runs.
         options: Of the export.
     """
-    files = sorted((root / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-    rows = [row for file in files for row in read_table(file, ["run_episode_index", "origin"]).to_pylist()]
+    rows = list(rows_in(root, f"{SIDECAR_DIR}/episodes", ["run_episode_index", "origin"]))
     if options.append or len(configs) != 1 or any(row["origin"] for row in rows):
         return []
     try:

@@ -22,11 +22,11 @@ import pyarrow as pa
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.boxes import BOXES_DIR
 from demorec.datasets.lerobot.depth import DepthScale
-from demorec.datasets.lerobot.files import column_numbers, open_table, table_batches
+from demorec.datasets.lerobot.files import column_numbers, open_table, table_batches, tables_in
 from demorec.datasets.lerobot.language import COLUMNS, PERSISTENT
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, RowStream, episode_places, read_tasks
+from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, OpenDataset, RowStream
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages, codec_of, opened_video
@@ -55,32 +55,28 @@ _NEXT: Mapping[str, str] = {
 """Columns of LeRobot's environments -> what becomes of them."""
 
 
-class LeRobotDataset:
-    """An opened dataset.
+class LeRobotDataset(OpenDataset):
+    """A dataset whose episodes are read as recordings are.
 
     Attributes:
-        root: Its folder.
-        info: meta/info.json.
-        places: Where its episodes lie, in order.
         features: What its recordings have of numbers.
         keys: Camera, as recordings call it -> feature.
         left_out: What no recording can hold, by its name in the dataset -> why.
         motors: The servos whose values its state and actions are, where the user says so.
 
     Raises:
-        ExportError: There is none, or it is damaged.
+        ExportError: As `OpenDataset`.
         ConfigError: Two cameras would get one name, or it has no state of the servos.
     """
 
     def __init__(self, root: Path, motors: Motors | None = None) -> None:
-        self.root, self.motors = root, motors
-        self.info = DatasetInfo.load(root)
+        super().__init__(root)
+        self.motors = motors
         state = self.info.features.get(STATE)
         if motors is not None and (state is None or state.names != motors.names):
             raise ConfigError(
                 f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
             )
-        self.places = list(episode_places(root, self.info))
         self.features: tuple[Feature, ...] = ()
         self.keys: dict[str, str] = {}
         self.left_out: dict[str, str] = {}
@@ -96,8 +92,6 @@ class LeRobotDataset:
             elif name not in AUTOMATIC_FEATURES:
                 self.features += (_feature(name, feature),)
         self.left_out |= dict(self._left_out_beside())
-        if missing := [name for name in ("timestamp", "task_index") if name not in self.info.features]:
-            raise ExportError(f"The dataset has no {', '.join(missing)}: {root}")
         self._cameras: dict[str, Camera] = {}
         self._videos: dict[tuple[str, int], EpisodeVideo] = {}
         self._stored: dict[str, StoredImages] = {}
@@ -130,7 +124,7 @@ class LeRobotDataset:
                 yield feature.name
 
     def _is_exact(self, name: str) -> bool:
-        for path in sorted((self.root / "data").glob("*/*.parquet")):
+        for path in tables_in(self.root, "data"):
             try:
                 for batch in table_batches(path, [name], rows=4096):
                     numbers = column_numbers(batch.column(name))
@@ -139,11 +133,6 @@ class LeRobotDataset:
             except (ValueError, TypeError, pa.ArrowException) as error:
                 raise ExportError(f"The column {name} cannot be read ({describe_error(error)}): {path}") from error
         return True
-
-    @cached_property
-    def tasks(self) -> list[str]:
-        """Instructions."""
-        return read_tasks(self.root)
 
     @cached_property
     def rows(self) -> RowStream:
@@ -162,7 +151,7 @@ class LeRobotDataset:
     def known(self) -> Mapping[int, dict[str, Any]]:
         """Episode -> what the sidecar says of it, as far as recordings can hold it; empty without a sidecar."""
         found: dict[int, dict[str, Any]] = {}
-        for path in sorted((self.root / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
+        for path in tables_in(self.root, f"{SIDECAR_DIR}/episodes"):
             schema = open_table(path).schema_arrow
             names = [name for name in _KNOWN if name in schema.names]
             for name in names:
@@ -180,8 +169,7 @@ class LeRobotDataset:
 
     def sidecar_rows(self, table: str, episode_index: int) -> list[dict[str, Any]]:
         """All that a table of the sidecar has of an episode; ExportError when it cannot be read."""
-        paths = sorted((self.root / SIDECAR_DIR / table).glob("*/*.parquet"))
-        found = EpisodeRows(paths, rows=64).read(episode_index)
+        found = EpisodeRows(tables_in(self.root, f"{SIDECAR_DIR}/{table}"), rows=64).read(episode_index)
         return [] if found is None else found.to_pylist()
 
     def camera(self, name: str) -> Camera:

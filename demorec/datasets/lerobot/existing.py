@@ -15,7 +15,7 @@ from typing import Any
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, facts_of
-from demorec.datasets.lerobot.files import open_table, read_json, read_table
+from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     CODEBASE_VERSION,
@@ -62,14 +62,10 @@ def open_existing(root: Path) -> Existing:
             f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to; "
             f"{_how_to_convert(root)}"
         )
-    tables = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
-    episodes = frames = 0
     try:
-        for path in tables:
-            table = read_table(path, ["length"])
-            episodes += table.num_rows
-            frames += sum(table.column("length").to_pylist())
-        rows = sum(open_table(path).metadata.num_rows for path in (root / "data").glob("*/*.parquet"))
+        lengths = [row["length"] for row in rows_in(root, "meta/episodes", ["length"])]
+        episodes, frames = len(lengths), sum(lengths)
+        rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
         tasks = tuple(read_tasks(root)) if info.total_tasks else ()
         found = read_json(root / STATS_PATH) if (root / STATS_PATH).exists() else {}
         facts = facts_of(root)

@@ -36,7 +36,7 @@ from demorec.annotate.progress import (
 )
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import sync_path
-from demorec.datasets.lerobot.files import open_table, read_table
+from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
 
 if TYPE_CHECKING:
     from demorec.episode.episode import Columns, SuccessCheck
@@ -108,16 +108,13 @@ def read_progress(root: Path) -> list[EpisodeProgress]:
     Raises:
         ExportError: They cannot be read.
     """
-    found = []
     try:
-        for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-            for row in read_table(path, [*STAGE_COLUMNS, "num_goals"]).to_pylist():
-                found.append(EpisodeProgress.from_row(row, int(row["num_goals"])))
+        rows = rows_in(root, "meta/episodes", [*STAGE_COLUMNS, "num_goals"])
+        return [EpisodeProgress.from_row(row, int(row["num_goals"])) for row in rows]
     except (ValueError, TypeError, KeyError) as error:
         raise ExportError(
             f"The stages of the dataset's episodes cannot be used ({describe_error(error)}): {root}"
         ) from error
-    return found
 
 
 def progress_table(episodes: Sequence[EpisodeProgress]) -> pa.Table:
@@ -177,7 +174,7 @@ def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
 
 def facts_of(root: Path) -> tuple[str, ...]:
     """Names of the columns of facts in the table of episodes of a dataset; ExportError when it is damaged."""
-    tables = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    tables = tables_in(root, "meta/episodes")
     if not tables:
         return ()
     schema = open_table(tables[0]).schema_arrow

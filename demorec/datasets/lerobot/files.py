@@ -100,6 +100,19 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
     return table
 
 
+def tables_in(root: Path, place: str) -> list[Path]:
+    """The numbered tables of one kind, in order: those of a dataset's folder "data", "meta/episodes" or another one."""
+    return sorted(root.glob(f"{place}/*/*.parquet"))
+
+
+def rows_in(
+    root: Path, place: str, columns: Sequence[str], *, schema: pa.Schema | None = None
+) -> Iterator[dict[str, Any]]:
+    """All rows of such tables; arguments and errors as of `read_table`."""
+    for path in tables_in(root, place):
+        yield from read_table(path, columns, schema=schema).to_pylist()
+
+
 def table_batches(
     path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE
 ) -> Iterator[pa.RecordBatch]:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.files import open_table, read_json, read_table
+from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
 from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
@@ -22,12 +22,11 @@ def attempt_counts(path: Path) -> tuple[int, int] | None:
     Raises:
         ExportError: Its tables are damaged.
     """
-    successes, attempts = (sorted((path / SIDECAR_DIR / name).glob("*/*.parquet")) for name in ("episodes", "attempts"))
+    attempts = tables_in(path, f"{SIDECAR_DIR}/attempts")
     if not attempts:
         return None
-    columns = [read_table(file, ["success"]).column("success") for file in successes]
-    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts)
-    return sum(column.to_pylist().count(True) for column in columns), num_attempts
+    successes = sum(row["success"] is True for row in rows_in(path, f"{SIDECAR_DIR}/episodes", ["success"]))
+    return successes, sum(open_table(file).metadata.num_rows for file in attempts)
 
 
 def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
@@ -39,7 +38,7 @@ def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
     rows: dict[str, int] = {}
     for place in ("data", *(() if info.is_old else ("meta/episodes",))):
         rows[place] = 0
-        for file in sorted((path / place).glob("*/*.parquet")):
+        for file in tables_in(path, place):
             with _noted(problems, path):
                 rows[place] += open_table(file).metadata.num_rows
     if not problems:

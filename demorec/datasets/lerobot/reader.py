@@ -6,7 +6,7 @@ import math
 import reprlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from demorec.datasets.lerobot.files import (
     read_json_lines,
     read_table,
     table_batches,
+    tables_in,
 )
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import (
@@ -59,6 +60,30 @@ class EpisodePlace:
     videos: dict[str, tuple[Path, int]]
 
 
+class OpenDataset:
+    """A dataset, whoever wrote it: what is in it, and where.
+
+    Attributes:
+        root, info: Its folder and what info.json says.
+        places: Where its episodes lie, in order.
+
+    Raises:
+        ExportError: There is none, or it is damaged.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.info = DatasetInfo.load(root)
+        self.places = tuple(episode_places(root, self.info))
+        if missing := [name for name in ("timestamp", "task_index") if name not in self.info.features]:
+            raise ExportError(f"The dataset has no {', '.join(missing)}: {root}")
+
+    @cached_property
+    def tasks(self) -> list[str]:
+        """Instructions."""
+        return read_tasks(self.root)
+
+
 def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     """Every episode in order; ExportError when a table cannot be read."""
     columns = ["episode_index", "length", "tasks", "data/chunk_index", "data/file_index", "dataset_from_index"]
@@ -67,8 +92,9 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     if info.is_old:
         rows = _old_rows(root, info)
     else:
-        files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
-        rows = ((path, row) for path in files for row in read_table(path, columns).to_pylist())
+        rows = (
+            (path, row) for path in tables_in(root, "meta/episodes") for row in read_table(path, columns).to_pylist()
+        )
     ends: dict[Path, int] = {}
 
     @cache  # many episodes share a file

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.core.files import sync_path
+from demorec.datasets.lerobot.files import tables_in
 from demorec.datasets.lerobot.language import (
     REPEATING,
     EpisodeLanguage,
@@ -251,9 +252,7 @@ class DatasetWriter:
         self._data.close()
         self._episodes.close()
         write_tasks(self._root / TASKS_PATH, list(self._tasks))
-        statistics: dict[str, Statistics] = dict(
-            data_statistics(sorted((self._root / "data").glob("*/*.parquet")), self._info.features)
-        )
+        statistics = data_statistics(tables_in(self._root, "data"), self._info.features)
         for key in self._cameras:
             new = self._pixels[key].statistics() if key in self._pixels else None
             parts = [part for part in (self._old_statistics.get(key), new) if part is not None]
