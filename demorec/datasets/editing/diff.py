@@ -7,7 +7,7 @@ are matched by content (`content.py`), those that are not equal bit for bit are 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,8 +103,7 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
     found += [*statistics_differences(sources, shared, found, is_reordered=result.is_reordered),
               *episode_statistics_differences(sources, shared, found, pairs)]  # fmt: skip
     found.sort(key=lambda item: LEVELS.index(item.level))
-    return DatasetDiff(pairs=pairs, num_episodes=result.num_episodes, num_same=result.num_same,
-                       differences=tuple(found), notes=tuple(_notes(sources, result, found)))  # fmt: skip
+    return replace(result, differences=tuple(found), notes=tuple(_notes(sources, result, found)))
 
 
 def _contents(

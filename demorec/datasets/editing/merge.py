@@ -196,7 +196,7 @@ def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
         if dropped := [name for name in plan.info.features if name not in common]:
             yield f"drop = {_quoted(dropped)}"
         yield from _other_names(plans[0], plan)
-        for name in common & set(numeric[number]) if number else ():
+        for name in [name for name in numeric[number] if name in common] if number else ():
             mine, first = plan.info.features[name], plans[0].info.features[name]
             if (mine.shape, mine.names) != (first.shape, first.names):
                 own = mine.names or tuple(map(str, range(mine.shape[0])))

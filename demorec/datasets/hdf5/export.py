@@ -136,15 +136,6 @@ class RobomimicWriter:
             RecordingError: It is damaged.
         """
         demo = self._data.create_group(f"demo_{self.num_episodes}")
-        self._write(demo, episode)
-        if self.num_episodes == 0:
-            self._data.attrs.update(_attributes(episode))
-        self.num_episodes += 1
-        self.num_frames += len(episode.rows)
-        self._file.flush()
-
-    def _write(self, demo: h5py.Group, episode: ExportEpisode) -> None:
-        """Fill in the group of an episode."""
         observations, images = _observation_names(episode), _image_names(episode)
         info, count = episode.recording.info, len(episode.rows)
         demo.attrs["num_samples"] = count
@@ -169,6 +160,11 @@ class RobomimicWriter:
             settings = episode.recording.video_settings(camera.name)
             shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
             _add_images(group, name, shape, episode.images(camera), self.options.compression)
+        if self.num_episodes == 0:
+            self._data.attrs.update(_attributes(episode))
+        self.num_episodes += 1
+        self.num_frames += count
+        self._file.flush()
 
     def finish(self) -> None:
         """Write what is known of all episodes together: their number of samples, and who is for validation."""

@@ -127,7 +127,8 @@ class _Export:
             boxes.finish()
             configs = sidecar.finish(self._about_this_export())
         if self._options.progress:
-            write_progress(self._folder, [*self._progress_before(), *self._progress])
+            before = [] if there is None else read_progress(there.root)
+            write_progress(self._folder, [*before, *self._progress])
         write_card(self._folder, finished, self._options, configs, is_transcoded=bool(self._transcoded))
         return ExportReport(
             path=self._folder,
@@ -175,9 +176,6 @@ class _Export:
             )
         return self._existing.facts
 
-    def _progress_before(self) -> list[EpisodeProgress]:
-        return [] if self._existing is None else read_progress(self._existing.root)
-
     def _noted(self, found: Iterable[Reading]) -> Iterator[Reading]:
         """The same, each counted and held against the others before it is written."""
         for reading in found:
@@ -223,21 +221,14 @@ class _Export:
 
     def _about_this_export(self) -> dict[str, Any]:
         options = self._options
-        held = {} if self._is_simulated else {"hold_pictures": options.hold_images}
+        always = ("action", "privileged", "features", "include_failures", "episodes", "fps", "depth")
+        optional = {name: getattr(options, name) for name in ("motor_units", "boxes", "progress")}
         return {
-            **held,
             "demorec": version("demorec"),
-            "action": options.action,
-            "privileged": options.privileged,
-            "features": options.features,
-            "include_failures": options.include_failures,
-            "episodes": options.episodes,
-            "fps": options.fps,
-            "depth": options.depth,
+            **{name: getattr(options, name) for name in always},
+            **{name: value for name, value in optional.items() if value},
+            **({} if self._is_simulated else {"hold_pictures": options.hold_images}),
             **({} if options.state == "joint" else {"state": options.state}),
-            **({"motor_units": options.motor_units} if options.motor_units else {}),
-            **({"boxes": True} if options.boxes else {}),
-            **({"progress": True} if options.progress else {}),
             **({} if options.language is None else {"language": options.spoken}),
         }
 

@@ -258,14 +258,8 @@ class DatasetInfo:
 
     def _check(self) -> None:
         """ValueError for values that no dataset can have."""
-        for name, low in (
-            ("fps", 1),
-            ("total_episodes", 0),
-            ("total_frames", 0),
-            ("total_tasks", 0),
-            ("chunks_size", 1),
-        ):
-            if not _is_count(getattr(self, name), low, 1 << 40):
+        for name in ("fps", "total_episodes", "total_frames", "total_tasks", "chunks_size"):
+            if not _is_count(getattr(self, name), 0 if name.startswith("total") else 1, 1 << 40):
                 raise ValueError(f"{name} is {reprlib.repr(getattr(self, name))}")
         for size in (self.data_files_size_in_mb, self.video_files_size_in_mb):
             if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size < 1e9:
@@ -328,39 +322,33 @@ def merged_video_info(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
 
 def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
     """Schema of the data files, with the metadata from which HF datasets takes its types."""
-    fields, described = [], {}
-    for name, feature in features.items():
-        if feature.is_video:
-            continue
-        if feature.dtype == "language" and name in TYPES:
-            fields.append(pa.field(name, TYPES[name]))
-            described[name] = language_feature(name)
-            continue
-        if feature.dtype == "image":
-            fields.append(pa.field(name, _IMAGE))
-            described[name] = {"_type": "Image"}
-            continue
-        if feature.dtype not in _ARROW_TYPES or len(feature.shape) > _MOST_DIMENSIONS:
-            raise ExportError(
-                f"The feature {name!r} has dtype {feature.dtype} and shape {feature.shape}, which demorec cannot "
-                "write: export into a new folder."
-            )
-        arrow_type = _ARROW_TYPES[feature.dtype]
-        value: dict[str, Any] = {"dtype": feature.dtype, "_type": "Value"}
-        if feature.shape == (1,):
-            fields.append(pa.field(name, arrow_type))
-            described[name] = value
-        elif len(feature.shape) > 1:
-            for _ in feature.shape:
-                arrow_type = pa.list_(arrow_type)
-            fields.append(pa.field(name, arrow_type))
-            kind = f"Array{len(feature.shape)}D"
-            described[name] = {"shape": list(feature.shape), "dtype": feature.dtype, "_type": kind}
-        else:
-            length = feature.shape[0]
-            fields.append(pa.field(name, pa.list_(pa.field("element", arrow_type), length)))
-            described[name] = {"feature": value, "length": length, "_type": "List"}
-    return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": described}})})
+    columns = {name: _column(name, feature) for name, feature in features.items() if not feature.is_video}
+    described = {name: description for name, (_, description) in columns.items()}
+    metadata = {"huggingface": json.dumps({"info": {"features": described}})}
+    return pa.schema([pa.field(name, kind) for name, (kind, _) in columns.items()], metadata)
+
+
+def _column(name: str, feature: DatasetFeature) -> tuple[pa.DataType, Mapping[str, Any]]:
+    """The Arrow type of a column, and its type for HF datasets."""
+    dtype, shape = feature.dtype, feature.shape
+    if dtype == "language" and name in TYPES:
+        return TYPES[name], language_feature(name)
+    if dtype == "image":
+        return _IMAGE, {"_type": "Image"}
+    if dtype not in _ARROW_TYPES or len(shape) > _MOST_DIMENSIONS:
+        raise ExportError(
+            f"The feature {name!r} has dtype {dtype} and shape {shape}, which demorec cannot write: export into a new "
+            "folder."
+        )
+    kind, value = _ARROW_TYPES[dtype], {"dtype": dtype, "_type": "Value"}
+    if shape == (1,):
+        return kind, value
+    if len(shape) == 1:
+        listed = pa.list_(pa.field("element", kind), shape[0])
+        return listed, {"feature": value, "length": shape[0], "_type": "List"}
+    for _ in shape:
+        kind = pa.list_(kind)
+    return kind, {"shape": list(shape), "dtype": dtype, "_type": f"Array{len(shape)}D"}
 
 
 _POSITIONS = frozenset(("index", "episode_index", "task_index"))

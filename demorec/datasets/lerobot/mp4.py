@@ -10,12 +10,11 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import struct
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import accumulate, groupby, pairwise
+from itertools import groupby, pairwise
 from operator import itemgetter
 from pathlib import Path
 from typing import IO
@@ -87,17 +86,21 @@ class EncodedVideo:
         cls, codec: str, width: int, height: int, data: bytes, lengths: Sequence[int] | NDArray[np.int64], lead: int = 0
     ) -> EncodedVideo:
         """From images back to back, as they were encoded, and the length of each; ExportError if that is none."""
-        unit_lengths = np.asarray(lengths, dtype=np.int64)
-        samples, sizes, is_key = mp4_samples(codec, data, unit_lengths)
-        first = data[: int(unit_lengths[0])] if len(unit_lengths) else b""
+        from demorec.mcap.video import is_keyframe  # loads all that reads recordings
+
+        ends = np.cumsum(np.asarray(lengths, dtype=np.int64)).tolist()
+        units = [data[begin:end] for begin, end in pairwise([0, *ends])]
+        samples = [b"".join(stored for _, stored in _units(codec, unit)) for unit in units]
+        if not all(samples):
+            raise ExportError(f"A packet of the {codec} video holds no image.")
         video = cls(
             codec=codec,
             width=width,
             height=height,
-            first=first,
-            samples=samples,
-            sizes=sizes,
-            is_keyframe=is_key,
+            first=units[0] if units else b"",
+            samples=b"".join(samples),
+            sizes=np.array([len(sample) for sample in samples], dtype=np.int64),
+            is_keyframe=np.array([is_keyframe(codec, unit) for unit in units], dtype=np.bool_),
             lead=lead,
         )
         return video.with_digest()
@@ -134,10 +137,14 @@ class EncodedVideo:
         return self.samples if isinstance(self.samples, bytes) else self.samples.read()
 
     def parameter_sets(self) -> bytes:
-        """Of the first image; ExportError if that is no keyframe that stands alone."""
+        """What a decoder must know before the first image; ExportError if that is no keyframe that stands alone."""
         if not len(self.is_keyframe) or not self.is_keyframe[0]:
             raise ExportError(f"The {self.codec} video does not start with a keyframe.")
-        return parameter_sets(self.codec, self.first)
+        kinds = _PARAMETER_SETS[self.codec]
+        found = b"".join(stored for kind, stored in _units(self.codec, self.first) if kind in kinds)
+        if not found:
+            raise ExportError(f"The {self.codec} video does not start with a keyframe that carries its parameter sets.")
+        return found
 
 
 class Mp4Writer:
@@ -238,76 +245,25 @@ def _first_image_file(video: EncodedVideo, fps: int) -> bytes:
     return buffer.getvalue()
 
 
-_AV1_SEQUENCE_HEADER = 1
-_AV1_TEMPORAL_DELIMITER = 2
-_PARAMETER_SETS = {"h264": (7, 8), "hevc": (32, 33, 34)}
+_TEMPORAL_DELIMITER = 2
+"""Kind of a unit of AV1 that mp4 files leave out."""
+_PARAMETER_SETS = {"h264": (7, 8), "hevc": (32, 33, 34), "av1": (1,)}
+"""Kinds of the units of which one mp4 file holds one set: a decoder must know them before the first image."""
 
 
-def mp4_samples(
-    codec: str, data: bytes, lengths: NDArray[np.int64]
-) -> tuple[bytes, NDArray[np.int64], NDArray[np.bool_]]:
-    """Access units back to back, as an mp4 file stores them; their lengths there; which ones are keyframes.
-
-    Raises:
-        ExportError: One of them is none.
-    """
-    from demorec.mcap.video import is_keyframe  # loads all that reads recordings
-
-    ends = [0, *accumulate(lengths.tolist())]
-    units = [data[a:b] for a, b in pairwise(ends)]
-    samples = [mp4_sample(codec, unit) for unit in units]
-    if not all(samples):
-        raise ExportError(f"A packet of the {codec} video holds no image.")
-    sizes = np.array([len(sample) for sample in samples], dtype=np.int64)
-    return b"".join(samples), sizes, np.array([is_keyframe(codec, unit) for unit in units], dtype=np.bool_)
-
-
-def mp4_sample(codec: str, access_unit: bytes) -> bytes:
-    """The access unit as an mp4 file stores it; nothing but the framing changes."""
+def _units(codec: str, access_unit: bytes) -> Iterator[tuple[int, bytes]]:
+    """Kind of each unit, and the unit as an mp4 file stores it: nothing but the framing changes."""
     if codec == "av1":
-        return b"".join(
-            access_unit[start:end]
-            for kind, start, end in _open_bitstream_units(access_unit)
-            if kind != _AV1_TEMPORAL_DELIMITER
-        )
-    parts: list[bytes] = []
-    for nal in _nal_units(access_unit):
-        parts.append(len(nal).to_bytes(4, "big"))
-        parts.append(nal)
-    return b"".join(parts)
-
-
-def parameter_sets(codec: str, access_unit: bytes) -> bytes:
-    """What a decoder must know before the first image: one mp4 file holds one of these.
-
-    Raises:
-        ExportError: There is none, so the episode does not start with a keyframe that stands alone.
-    """
-    if codec == "av1":
-        found = b"".join(
-            access_unit[start:end]
-            for kind, start, end in _open_bitstream_units(access_unit)
-            if kind == _AV1_SEQUENCE_HEADER
-        )
-    else:
-        wanted = _PARAMETER_SETS[codec]
-        found = b"".join(
-            struct.pack(">I", len(nal)) + nal for nal in _nal_units(access_unit) if _nal_type(codec, nal) in wanted
-        )
-    if not found:
-        raise ExportError(f"The {codec} video does not start with a keyframe that carries its parameter sets.")
-    return found
-
-
-def _nal_units(access_unit: bytes) -> list[bytes]:
+        for kind, start, end in _open_bitstream_units(access_unit):
+            if kind != _TEMPORAL_DELIMITER:
+                yield kind, access_unit[start:end]
+        return
     before, *pieces = access_unit.split(b"\x00\x00\x01")
     if before.strip(b"\x00") or not pieces:
         raise ExportError("A video packet does not begin with a start code: it is no Annex B stream.")
-    return [nal for piece in pieces if (nal := piece.rstrip(b"\x00"))]
-
-
-def _nal_type(codec: str, nal: bytes) -> int:
-    return nal[0] & 31 if codec == "h264" else (nal[0] >> 1) & 63
+    for nal in (piece.rstrip(b"\x00") for piece in pieces):
+        if nal:
+            yield nal[0] & 31 if codec == "h264" else (nal[0] >> 1) & 63, len(nal).to_bytes(4, "big") + nal
 
 
 def _open_bitstream_units(access_unit: bytes) -> list[tuple[int, int, int]]:
