@@ -211,7 +211,7 @@ class Dataset:
         return 0 if found.is_same else 1
 
     def _score(self) -> int:
-        from demorec.check.scoring.file import check_target, to_json, write_scores
+        from demorec.check.scoring.score import check_target, to_json, write_scores
 
         if len(self.words) != 1:
             raise ConfigError(f"One dataset is scored, given are {len(self.words)}: demorec dataset score DATASET.")
@@ -242,7 +242,7 @@ class Dataset:
         if "score" not in names_in(self.where) | {self.by} or any("score" in row for row in source.columns()):
             return
         if self.scores is not None:
-            from demorec.check.scoring.file import read_scores
+            from demorec.check.scoring.score import read_scores
 
             lengths = {place.episode_index: place.length for place in source.places}
             source.scores = read_scores(self.scores, lengths)

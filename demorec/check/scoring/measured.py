@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.evidence import Motion, motions_of_dataset
-from demorec.check.scoring.movement import Movement, Scale, movement
+from demorec.check.scoring.movement import Movement, Scale, movement, scale_of
 from demorec.check.scoring.sight import Sight, sight
 from demorec.core.errors import ExportError, without_path
 from demorec.datasets.editing.content import row_hashes
@@ -29,10 +29,11 @@ _SKETCH = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flaw:
-    """What is wrong whatever others do: what, in words, and its first and last frame."""
+class Reason:
+    """Why something is taken off: the factor that is left, in words, the first and the last frame."""
 
     kind: str
+    factor: float
     text: str
     first: int
     last: int
@@ -43,29 +44,27 @@ class Measured:
     """One episode.
 
     Attributes:
-        number: Its place in the dataset.
         episode_index, length, task: As the dataset has them.
-        flaws: What is wrong in itself.
+        flaws: What is wrong in itself, whatever others do.
         movement: None without a state, and where numbers are missing.
         sights: Camera -> what is seen.
         sketch: (N,) hashes of some rows of state and action.
     """
 
-    number: int
     episode_index: int
     length: int
     task: str
-    flaws: tuple[Flaw, ...]
+    flaws: tuple[Reason, ...]
     movement: Movement | None
     sights: Mapping[str, Sight]
     sketch: NDArray[np.uint64]
 
 
-def scale_of(root: Path) -> Scale | None:
+def dataset_scale(root: Path) -> Scale | None:
     """What the elements range over in a dataset; None where no episode has a usable state."""
     dataset = _opened(root)
-    motions = (_motion(dataset, _rows(dataset, number)) for number in range(len(dataset)))
-    return Scale.of(motion for motion in motions if motion is not None)
+    motions = (_motion(dataset, dataset.rows.numbers(place)) for place in dataset.places)
+    return scale_of(motion for motion in motions if motion is not None)
 
 
 def measure(root: Path, scale: Scale | None, images: bool, numbers: Sequence[int]) -> list[Measured]:
@@ -79,10 +78,6 @@ def _opened(root: Path) -> LeRobotDataset:
     return LeRobotDataset(root)
 
 
-def _rows(dataset: LeRobotDataset, number: int) -> dict[str, NDArray[Any]]:
-    return dataset.rows.numbers(dataset.places[number])
-
-
 def _motion(dataset: LeRobotDataset, rows: Mapping[str, NDArray[Any]]) -> Motion | None:
     """None where there is no state, a number of it is missing, or the episode is very short."""
     numbers = [rows[name] for name in (STATE, ACTION) if name in rows]
@@ -92,21 +87,24 @@ def _motion(dataset: LeRobotDataset, rows: Mapping[str, NDArray[Any]]) -> Motion
 
 
 def _measured(dataset: LeRobotDataset, scale: Scale | None, number: int, *, images: bool) -> Measured:
-    place, rows = dataset.places[number], _rows(dataset, number)
+    place, fps = dataset.places[number], float(dataset.info.fps)
+    rows = dataset.rows.numbers(place)
     motion = None if scale is None else _motion(dataset, rows)
     moved = None if motion is None or scale is None else movement(motion, scale)
-    flaws = list(_flaws(rows, place.length, float(dataset.info.fps)))
+    flaws = [
+        Reason(kind=kind, factor=0.0, text=text, first=first, last=last)
+        for kind, text, first, last in _flaws(rows, place.length, fps)
+    ]
     sights: dict[str, Sight] = {}
     recording = DatasetRecording(dataset, number)
-    grips = moved.grips if moved is not None else ()
     for camera in recording.cameras if images and place.length else ():
         try:
             images_at = partial(recording.images_at, camera)
-            sights[camera] = sight(images_at, place.length, float(dataset.info.fps), grips)
+            sights[camera] = sight(images_at, place.length, fps, () if moved is None else moved.grips)
         except ExportError as error:
-            flaws.append(Flaw(kind="images", text=without_path(error, dataset.root), first=0, last=place.length - 1))
+            text = without_path(error, dataset.root)
+            flaws.append(Reason(kind="images", factor=0.0, text=text, first=0, last=place.length - 1))
     return Measured(
-        number=number,
         episode_index=place.episode_index,
         length=place.length,
         task="; ".join(place.tasks),
@@ -117,20 +115,20 @@ def _measured(dataset: LeRobotDataset, scale: Scale | None, number: int, *, imag
     )
 
 
-def _flaws(rows: Mapping[str, NDArray[Any]], length: int, fps: float) -> Iterator[Flaw]:
+def _flaws(rows: Mapping[str, NDArray[Any]], length: int, fps: float) -> Iterator[tuple[str, str, int, int]]:
+    """(kind, what is wrong in words, first and last frame) of the numbers."""
     if length < _FEWEST_FRAMES:
-        yield Flaw(kind="length", text=f"has {length} frames", first=0, last=max(length - 1, 0))
+        yield "length", f"has {length} frames", 0, max(length - 1, 0)
     for name in (STATE, ACTION):
         if name in rows and rows[name].dtype.kind == "f" and not (finite := np.isfinite(rows[name]).all(axis=1)).all():
             frames = np.flatnonzero(~finite)
-            text = f"lacks numbers of {name} in {len(frames)} frames"
-            yield Flaw(kind="missing", text=text, first=int(frames[0]), last=int(frames[-1]))
+            yield "missing", f"lacks numbers of {name} in {len(frames)} frames", int(frames[0]), int(frames[-1])
     steps = np.diff(rows["timestamp"][:, 0].astype(np.float64)) * fps
     odd = np.flatnonzero(~((steps > 2 - _GAP) & (steps < _GAP)))
     if len(odd):
         frame = int(odd[0])
         text = f"has {len(odd)} odd steps of time, of {steps[frame] / fps:.3f} s where {1 / fps:.3f} s are usual"
-        yield Flaw(kind="timing", text=text, first=frame, last=int(odd[-1]) + 1)
+        yield "timing", text, frame, int(odd[-1]) + 1
 
 
 def _sketch(rows: Mapping[str, NDArray[Any]]) -> NDArray[np.uint64]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,7 @@ _EXTREME = 1e-3
 """Share of its range from its largest or least value at which an element counts as saturated."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reading:
+class Reading(NamedTuple):
     """A number, and the frames (the last one too) that it comes from."""
 
     value: float
@@ -43,8 +43,7 @@ class Reading:
     last: int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Scale:
+class Scale(NamedTuple):
     """What elements of state and action range over in a dataset; rows are their least and their largest value.
 
     Attributes:
@@ -56,21 +55,21 @@ class Scale:
     action: Array
     outermost: Array
 
-    @classmethod
-    def of(cls, motions: Iterable[Motion]) -> Scale | None:
-        """Of all episodes; None for none."""
-        found = [
-            [
-                np.stack([values.min(axis=0), values.max(axis=0)])
-                for values in (motion.state, motion.state if motion.action is None else motion.action)
-            ]
-            for motion in motions
+
+def scale_of(motions: Iterable[Motion]) -> Scale | None:
+    """Of all episodes; None for none."""
+    found = [
+        [
+            np.stack([values.min(axis=0), values.max(axis=0)])
+            for values in (motion.state, motion.state if motion.action is None else motion.action)
         ]
-        if not found:
-            return None
-        state, action = (np.stack(part) for part in zip(*found, strict=True))
-        outermost = np.stack([action[:, 0].min(axis=0), action[:, 1].max(axis=0)])
-        return cls(state=_inner(state), action=_inner(action), outermost=outermost)
+        for motion in motions
+    ]
+    if not found:
+        return None
+    state, action = (np.stack(part) for part in zip(*found, strict=True))
+    outermost = np.stack([action[:, 0].min(axis=0), action[:, 1].max(axis=0)])
+    return Scale(_inner(state), _inner(action), outermost)
 
 
 def _inner(ranges: Array) -> Array:
@@ -90,7 +89,6 @@ class Movement:
 
     Attributes:
         readings: What is measured -> its number.
-        switches: Frames at which a gripper is told to close or to open.
         grips: (first, last) frames of which a gripper is not as at the beginning.
         courses: (S, 12, K) where the arm is sent between the switches, at equal distances along the way, less the
             straight line.
@@ -102,7 +100,6 @@ class Movement:
     """
 
     readings: Mapping[str, Reading]
-    switches: tuple[int, ...]
     grips: tuple[tuple[int, int], ...]
     courses: Array
     ends: Array
@@ -113,46 +110,43 @@ class Movement:
 
 
 def movement(motion: Motion, scale: Scale) -> Movement:
-    """Measure an episode of three frames or more."""
+    """Measure an episode of eight frames or more."""
     opens = motion.grippers
     arm = ~opens if not opens.all() else opens
     state = motion.state[:, arm] / _width(scale.state, arm)
     steps = np.linalg.norm(np.diff(state, axis=0), axis=1)
     action = motion.action if motion.action is not None and np.isfinite(motion.action).all() else None
     hands = [_hand(motion, scale, int(element)) for element in np.flatnonzero(opens)]
-    switches = sorted({frame for opening, command in hands for frame in _switches(command)})
-    bounds = (0, *(frame for frame in switches if 0 < frame < len(state) - 1), len(state) - 1)
+    last = len(state) - 1
+    switches = np.unique([frame + 1 for _, command in hands for frame in np.flatnonzero(np.diff(_levels(command)))])
+    bounds = (0, *(int(frame) for frame in switches if frame < last), last)
     readings = dict(_of_state(state, steps, motion.fps, hands))
-    readings["switches"] = Reading(value=len(switches), first=0, last=len(state) - 1)
+    readings["switches"] = Reading(len(switches), 0, last)
     guide = state
     if action is not None:
         scaled = action[:, arm] / _width(scale.action, arm)
         lag, is_target = _lag(state, scaled, motion.fps)
         guide = scaled if is_target else state
         readings |= {"action noise": _roughness(scaled), "limit": _saturation(motion, action, scale, arm)}
-        readings |= {"lag": Reading(value=lag, first=0, last=len(state) - 1)} if lag is not None else {}
-    readings["strokes"] = Reading(value=_strokes(guide, motion.fps), first=0, last=len(state) - 1)
+        readings |= {"lag": Reading(lag, 0, last)} if lag is not None else {}
+    readings["strokes"] = Reading(_strokes(guide, motion.fps), 0, last)
     for opening, command in hands:
         for name, reading in _of_hand(opening, command, motion.fps):
             known = readings.setdefault(name, reading)
             if (reading.value > known.value) == (name == "slip"):  # of two hands the one that holds less, or loses more
                 readings[name] = reading
     stretches = [guide[a : b + 1] for a, b in pairwise(bounds)]
+    lengths = [np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in stretches]
     return Movement(
         readings=readings,
-        switches=tuple(switches),
         grips=tuple(grip for _, command in hands for grip in _grips(command)),
         courses=np.stack([_course(way) for way in stretches]),
         ends=guide[list(bounds)],
-        costs=np.array([[(len(way) - 1) / motion.fps, _length(way)] for way in stretches]),
+        costs=np.column_stack([np.diff(bounds) / motion.fps, lengths]),
         fps=motion.fps,
         steps=steps,
         bounds=bounds,
     )
-
-
-def _length(way: Array) -> float:
-    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
 
 
 def _strokes(guide: Array, fps: float) -> int:
@@ -169,15 +163,15 @@ def _strokes(guide: Array, fps: float) -> int:
 def _hand(motion: Motion, scale: Scale, element: int) -> tuple[Array, Array]:
     """(T,) opening and command of a gripper in units of their ranges; the opening for both where none is commanded."""
     opens, target = scale.state[:, element], scale.action[:, element]
-    narrow, wide = sorted((opens[1] - opens[0], target[1] - target[0]))
-    if wide < _ALIKE * narrow and max(opens[0], target[0]) < min(opens[1], target[1]):  # in the same unit
-        opens = target = np.array([min(opens[0], target[0]), max(opens[1], target[1])])
 
     def of(values: Array, ranges: Array) -> Array:
         return np.asarray((values[:, element] - ranges[0]) / max(ranges[1] - ranges[0], 1e-9))
 
     if motion.action is None or not np.isfinite(motion.action[:, element]).all():
-        return of(motion.state, scale.state[:, element]), of(motion.state, scale.state[:, element])
+        return of(motion.state, opens), of(motion.state, opens)
+    narrow, wide = sorted((opens[1] - opens[0], target[1] - target[0]))
+    if wide < _ALIKE * narrow and max(opens[0], target[0]) < min(opens[1], target[1]):  # in the same unit
+        opens = target = np.array([min(opens[0], target[0]), max(opens[1], target[1])])
     return of(motion.state, opens), of(motion.action, target)
 
 
@@ -187,10 +181,6 @@ def _levels(command: Array) -> Flags:
     known[0] = command[0] > 0.5 if known[0] < 0 else known[0]
     last = np.maximum.accumulate(np.where(known >= 0, np.arange(len(known)), 0))
     return np.asarray(known[last] == 1)
-
-
-def _switches(command: Array) -> list[int]:
-    return [int(frame) + 1 for frame in np.flatnonzero(np.diff(_levels(command).astype(int)))]
 
 
 def _grips(command: Array) -> list[tuple[int, int]]:
@@ -212,28 +202,21 @@ def _of_state(
     inner = still.copy()
     inner[:head] = inner[tail:] = False
     length, start = longest_run(inner)
-    yield "pause", Reading(value=length / fps, first=start, last=start + length)
-    yield "idle", Reading(value=float(still.sum()) / fps, first=0, last=last)
-    yield "duration", Reading(value=float(np.log(len(state) / fps)), first=0, last=last)
+    yield "pause", Reading(length / fps, start, start + length)
+    yield "idle", Reading(float(still.sum()) / fps, 0, last)
+    yield "duration", Reading(float(np.log(len(state) / fps)), 0, last)
     tenth = max(2, round(0.2 * fps))
-    yield "end speed", Reading(value=float(steps[-tenth:].mean()) / fast, first=max(last - tenth, 0), last=last)
+    yield "end speed", Reading(float(steps[-tenth:].mean()) / fast, max(last - tenth, 0), last)
     yield "state noise", _roughness(state)
-    if last > 1:
-        off = np.abs(state[1:-1] - (state[2:] + state[:-2]) / 2).max(axis=1)
-        worst = int(np.argmax(off)) + 1
-        yield "jump", Reading(value=_log(float(off.max()), 1e-3), first=worst - 1, last=worst + 1)
-
-
-def _log(value: float, floor: float) -> float:
-    return float(np.log(value + floor))
+    off = np.abs(state[1:-1] - (state[2:] + state[:-2]) / 2).max(axis=1)
+    worst = int(np.argmax(off)) + 1
+    yield "jump", Reading(float(np.log(off.max() + 1e-3)), worst - 1, worst + 1)
 
 
 def _roughness(values: Array) -> Reading:
     """Third differences, which a smooth motion has hardly any of and white noise has most."""
-    if len(values) < 4:
-        return Reading(value=_log(0.0, 1e-4), first=0, last=len(values) - 1)
     third = np.linalg.norm(np.diff(values, 3, axis=0), axis=1)
-    return Reading(value=_log(float(np.quantile(third, 0.75)), 1e-4), first=0, last=len(values) - 1)
+    return Reading(float(np.log(np.quantile(third, 0.75) + 1e-4)), 0, len(values) - 1)
 
 
 def _lag(state: Array, action: Array, fps: float) -> tuple[float | None, bool]:
@@ -258,12 +241,12 @@ def _saturation(motion: Motion, action: Array, scale: Scale, arm: Flags) -> Read
     at_end &= np.ptp(action, axis=0) > _EXTREME * width  # an axis that is never used is at no end
     frames = np.flatnonzero(at_end[:, arm].any(axis=1))
     first, last = (int(frames[0]), int(frames[-1])) if len(frames) else (0, 0)
-    return Reading(value=len(frames) / len(action), first=first, last=last)
+    return Reading(len(frames) / len(action), first, last)
 
 
 def _of_hand(opening: Array, command: Array, fps: float) -> Iterator[tuple[str, Reading]]:
     held, lost = max(2, round(_HELD_S * fps)), max(1, round(_LOST_S * fps))
-    worst = Reading(value=0.0, first=0, last=0)
+    worst = Reading(0.0, 0, 0)
     for frame in range(held, len(opening) - lost):
         before, after = slice(frame - held, frame + 1), slice(frame - held, frame + lost + 1)
         if np.ptp(opening[before]) > _STEADY:
@@ -271,14 +254,11 @@ def _of_hand(opening: Array, command: Array, fps: float) -> Iterator[tuple[str, 
         toward = np.sign(command[frame] - opening[frame]) * (opening[frame + lost] - opening[frame])
         value = float(toward - np.ptp(command[after]))
         if value > worst.value:
-            worst = Reading(value=value, first=frame, last=frame + lost)
+            worst = Reading(value, frame, frame + lost)
     yield "slip", worst
-    gaps = [
-        (float(np.median(np.abs(opening - command)[first : last + 1])), first, last) for first, last in _grips(command)
-    ]
-    if gaps:
-        gap, first, last = max(gaps)
-        yield "grip", Reading(value=gap, first=first, last=last)
+    gap = np.abs(opening - command)
+    if grips := [Reading(float(np.median(gap[first : last + 1])), first, last) for first, last in _grips(command)]:
+        yield "grip", max(grips)
 
 
 def _course(way: NDArray[np.float64]) -> Array:

@@ -8,8 +8,10 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.evidence import Flags
+from demorec.check.scoring.sight import HUE, LIGHT
 from demorec.core.geometry import Array
 
 FEWEST = 12
@@ -26,6 +28,15 @@ _ODD_SHARE, _FEWEST_ODD = 0.05, 2
 """Of the episodes that a word's error leaves out, the farthest off: what is looked for is no measure of itself."""
 _FEWEST_WORDS, _MOST_WORDS = 3, 60
 """Episodes that have a word, and that lack it, for it to be learned; and how many words are, the most frequent ones."""
+_AGREED = 0.85
+"""Share of the episodes that must show a colour for the others to lack it."""
+_MOST, _SAME = 0.7, 0.1
+"""Share of the episodes of an instruction that must show a colour, for it to be compared with other instructions; and
+what those may lack at most of each other's colours."""
+_HARDLY = 0.3
+"""Share of what is usual of a colour, below which it is lacking: things differ in size."""
+_LEAST = 0.01
+"""Share of the image that something has at least, to be seen."""
 
 
 def groups(tasks: Sequence[str]) -> list[list[int]]:
@@ -163,3 +174,60 @@ def contradicted_words(tasks: Sequence[str], looks: Array) -> tuple[Array, list[
         for number in np.flatnonzero(off > worst):
             worst[number], which[number] = off[number], word
     return worst, which
+
+
+def lacking(colors: NDArray[np.float32], tasks: Sequence[str]) -> Array:
+    """(N,) share of what others hold that each hand lacks; nan where hardly anything is seen in it, or few are alike.
+
+    Compared are episodes of one instruction, and of others of which most hold the same. Where fewer than 85 in 100
+    agree in a colour nothing lacks it.
+
+    Args:
+        colors: (N, 1176) as `Sight.held`.
+        tasks: Instruction of each.
+    """
+    shares = _around(colors.reshape(-1, LIGHT, HUE, HUE), np.add)
+    own = _around(shares, np.maximum)  # what is beside a usual colour is no other one
+    found = np.full(len(colors), np.nan)
+    for pool in _pools(shares, tasks, colors.sum(axis=1) >= _LEAST):
+        if len(pool) >= FEWEST:
+            found[pool] = _lack(np.quantile(shares[pool], 1 - _AGREED, axis=0), own[pool])
+    return found
+
+
+def _pools(shares: NDArray[np.float32], tasks: Sequence[str], seen: Flags) -> list[list[int]]:
+    """Numbers of the episodes by what most of their instruction hold; those of which most do not agree are left out."""
+    members: dict[str, list[int]] = {}
+    for number in np.flatnonzero(seen).tolist():
+        members.setdefault(tasks[number], []).append(number)
+    pools: list[tuple[NDArray[np.float32], list[int]]] = []
+    for numbers in sorted(members.values(), key=len, reverse=True):
+        usual = np.quantile(shares[numbers], 1 - _MOST, axis=0)[None].astype(np.float32)
+        if usual.max() < _LEAST:
+            continue
+        around = _around(usual, np.maximum)
+        for other, pool in pools:
+            if max(_lack(usual[0], _around(other, np.maximum))[0], _lack(other[0], around)[0]) < _SAME:
+                pool += numbers
+                break
+        else:
+            pools.append((usual, numbers))
+    return [pool for _, pool in pools]
+
+
+def _lack(usual: Array | NDArray[np.float32], own: NDArray[np.float32]) -> Array:
+    """(N,) share of what is usual (...) that each of (N, ...) lacks."""
+    if usual.max() < _LEAST:
+        return np.zeros(len(own))
+    lack = np.maximum(1 - own / np.maximum(_HARDLY * usual, 1e-9), 0.0) * usual
+    return np.asarray(lack.sum(axis=(1, 2, 3)) / usual.sum())
+
+
+def _around(shares: NDArray[np.float32], join: np.ufunc) -> NDArray[np.float32]:
+    """(N, ...) joined with the bins beside, along all axes but the first."""
+    for axis in range(1, shares.ndim):
+        width = [(0, 0)] * shares.ndim
+        width[axis] = (1, 1)
+        padded = np.moveaxis(np.pad(shares, width), axis, 0)
+        shares = np.moveaxis(join(join(padded[:-2], padded[1:-1]), padded[2:]), 0, axis)
+    return shares
