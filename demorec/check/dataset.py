@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import Cells
 from demorec.check.coverage import motion_vector
-from demorec.check.dataset_video import EpisodeImages, episode_images
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, draw, frames_to_draw
 from demorec.check.dynamics import Dynamics
 from demorec.check.episode_drawn import drawable_scene
 from demorec.check.evidence import Motion, Named, course_of, motions_of_dataset, quaternions
-from demorec.check.films import Film, Films, likeness_of_films
+from demorec.check.films import Film, Films, films_of_dataset, likeness_of_films
 from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices
 from demorec.core.errors import ConfigError, ExportError, describe_error
@@ -102,7 +101,7 @@ class Dataset:
 
     def __init__(self, path: Path, urdf: str = "", motors: Motors | None = None) -> None:
         self.path, self.urdf, self.motors = path, urdf, motors
-        self._images: dict[str, list[EpisodeImages]] = {}
+        self._films: dict[str, list[Film]] = {}
 
     @cached_property
     def info(self) -> DatasetInfo:
@@ -174,30 +173,18 @@ class Dataset:
         """Names of the camera features, less those of depth."""
         return [key for key in self.info.video_keys if not self.info.features[key].is_depth]
 
-    def images(self, key: str) -> list[EpisodeImages]:
-        """What is decoded of a camera in each episode, kept from the first call on."""
-        if key not in self._images:
-            self._images[key] = episode_images(self.info, self.places, key)
-        return self._images[key]
+    def films_of(self, key: str) -> list[Film]:
+        """Those of a camera in each episode, beside the states; decoded by the first call."""
+        if key not in self._films:
+            known = self.info.features.get(STATE)
+            states = [course_of(rows[STATE], known.names or ()) if known else None for rows in self.rows]
+            self._films[key] = films_of_dataset(self.info, self.places, key, states)
+        return self._films[key]
 
-    @cached_property
+    @property
     def films(self) -> Films:
-        """Those of its cameras, beside the states."""
-        known = self.info.features.get(STATE)
-        return {
-            key: [
-                Film(
-                    where=f"{key}, episode {number}",
-                    fps=self.info.fps,
-                    cells=images.cells,
-                    detail=images.detail,
-                    frames=np.arange(images.count),
-                    state=course_of(self.rows[number][STATE], known.names or ()) if known else None,
-                )
-                for number, images in enumerate(self.images(key))
-            ]
-            for key in self.colour_keys
-        }
+        """Those of all its cameras that show colours."""
+        return {key: self.films_of(key) for key in self.colour_keys}
 
     def distances(self) -> Iterator[tuple[str, Iterator[NDArray[Any]]]]:
         """Of none: of depth videos the length counts."""
@@ -213,7 +200,7 @@ class Dataset:
         found: list[tuple[int, str, ImageComparison | NotMeasured]] = []
         for each in self.described():
             names = [camera.name for camera in each.info.scene.cameras if camera.name in keys]
-            seen = {name: self.images(keys[name])[each.number].cells.astype(np.float32) for name in names}
+            seen = {name: self.films_of(keys[name])[each.number].cells.astype(np.float32) for name in names}
             compared = compare_beginning(each.info, each.rows[STATE].astype(np.float64), self.info.fps, seen)
             of_cameras = {"": compared} if isinstance(compared, NotMeasured) else compared
             found += [(each.number, camera, images) for camera, images in of_cameras.items()]

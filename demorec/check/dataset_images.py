@@ -14,6 +14,7 @@ from demorec.check.base import Found, Measurement, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.check.dataset_statistics import episode_column, numbers_of, read_statistics
 from demorec.check.drawn import judge_lag, judge_unlike
+from demorec.check.films import Film
 from demorec.core.geometry import Array
 
 _DOUBTFUL, _CLEARLY = 0.012, 0.35
@@ -35,20 +36,19 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
     if dataset.info.is_old:
         return
     stats, of_cameras = read_statistics(dataset), {}
-    for key in dataset.colour_keys:
-        images = dataset.images(key)
-        if not images:
+    for key, films in dataset.films.items():
+        if not films:
             continue
-        told, weights = stats.get(key, {}), [p.count for p in images]
-        own = [np.concatenate([p.mean, p.std]) for p in images]
+        told, weights = stats.get(key, {}), [len(film.cells) for film in films]
+        own = [_colours(film) for film in films]
         of_all = _pooled(own, weights)
         yield _off_colour(told.get("mean"), of_all[:3], key)
         yield _off_colour(told.get("std"), of_all[3:], f"deviation of {key}")
         yield _disordered(told, stats, key)
         columns = [episode_column(dataset, f"stats/{key}/{quantity}") for quantity in ("mean", "std")]
-        for quantity, stated in zip(("mean", "std"), columns, strict=True):
-            for number, (said, p) in enumerate(zip(stated, images, strict=False)):
-                yield _off_colour(said, getattr(p, quantity), f"{quantity} of {key}, episode {number}")
+        for quantity, part, stated in zip(("mean", "std"), (slice(3), slice(3, 6)), columns, strict=True):
+            for number, (said, colours) in enumerate(zip(stated, own, strict=False)):
+                yield _off_colour(said, colours[part], f"{quantity} of {key}, episode {number}")
         stated = [np.concatenate([numbers_of(said) for said in pair]) for pair in zip(*columns, strict=True)]
         yield _exchanged(stated, own, [f"{key}, episode {number}" for number in range(len(own))])
         said = np.concatenate([numbers_of(told.get("mean")), numbers_of(told.get("std"))])
@@ -57,6 +57,12 @@ def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
     # LeRobot merges the episodes' own, which are nearer to what it says of all than images that were encoded.
     for true in (1, 2):
         yield _exchanged([c[0] for c in of_cameras.values()], [c[true] for c in of_cameras.values()], list(of_cameras))
+
+
+def _colours(film: Film) -> Array:
+    """(6,) mean and deviation of three colours of all pixels, of 1."""
+    assert film.deviation is not None
+    return np.concatenate([film.cells.mean(axis=(0, 1, 2), dtype=np.float64) / 255, film.deviation])
 
 
 def _pooled(parts: Sequence[Array], weights: Sequence[int]) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from demorec.check.base import IMAGES, Found, Measurement, NotMeasured, check, external_check, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.films import Filmed
+from demorec.check.over_time import Filmed
 from demorec.episode.episode import NO_IMAGE
 
 _NANOSECONDS = 1_000_000_000

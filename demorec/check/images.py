@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import wraps
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from demorec.check.base import (
     image_check,
     worst_frame,
 )
+from demorec.check.dataset import Dataset
 from demorec.check.drawn import ImageComparison, judge_unlike
 from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
@@ -208,20 +208,12 @@ def _stale_frames(camera: SceneCamera, compared: ImageComparison, count: int, fi
     on=("simulated", "external", "dataset"),
     needs="two cameras",
 )
-def distinct_cameras(subject: Filmed) -> Iterator[Found]:
+def distinct_cameras(subject: CheckedEpisode | Dataset) -> Iterator[Found]:
     """Two cameras in different places do not show the same images, as when one is plugged in under two names."""
     pairs = list(subject.likeness_of_cameras())
     if not pairs:
         yield Lacking(need="two cameras")
     yield from (Measurement(value=value, detail=names) for names, value in pairs)
-
-
-class Filmed(Protocol):
-    """What has cameras."""
-
-    def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
-        """(two cameras, correlation of their images)."""
-        ...
 
 
 @image_check(

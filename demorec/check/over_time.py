@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
+from demorec.check.dataset import Dataset
+from demorec.check.episode import CheckedEpisode
 from demorec.check.evidence import Flags
-from demorec.check.films import STANDS, Film, Filmed, difference, turned
+from demorec.check.films import STANDS, Film, difference, turned
 from demorec.core.geometry import Array
 
 _ALIEN_LEVELS, _ALIEN_TIMES = 2.5, 4.0
@@ -54,6 +56,9 @@ _OTHER_VIEW = 0.7
 """Share of the distance from their own views within which two images must be from exchanged ones."""
 CHANGES = 1.5
 """Levels of 255 by which an image differs clearly from the one before."""
+
+Filmed = CheckedEpisode | Dataset
+"""What has films."""
 
 film_check = partial(image_check, on=("external", "dataset"), needs=IMAGES)
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured
 from demorec.check.evidence import Flags
-from demorec.check.films import Film, Filmed, difference
-from demorec.check.over_time import CHANGES, FEWEST_IMAGES, MOVING, film_check, moving
+from demorec.check.films import Film, difference
+from demorec.check.over_time import CHANGES, FEWEST_IMAGES, MOVING, Filmed, film_check, moving
 
 _NEARLY, _NEARLY_COUNTS, _CATCHES_UP = 0.05, 0.25, 2.0
 """Share of the usual change at a speed below which an image is nearly the same; what counts of such a time: of clean
