@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.check.base import Form, NotMeasured
@@ -61,6 +60,11 @@ _DRAWN_SECONDS = 3.0
 _CLOSING = 1e-3
 """Metres that the opening shrinks by from frame to frame when the fingers begin to close."""
 _MIN_DRAWN = 3
+_NEEDED = (
+    "episode_index", "success", "num_retries", "content_digest", "frame_stride", "phases", "objects", "goals",
+    "deliberate_miss_frames", "episode_info",
+)  # fmt: skip
+"""Columns of the sidecar that all versions have."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,10 +84,10 @@ class DescribedEpisode:
     info: EpisodeInfo
 
 
-def read_rows(folder: Path, names: Sequence[str], *, schema: pa.Schema | None = None) -> list[dict[str, Any]]:
-    """Some columns of all tables of episodes below a folder, as `read_table` reads each."""
+def read_rows(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Some columns of all tables of episodes below a folder."""
     paths = sorted((folder / "episodes").glob("*/*.parquet"))
-    return [row for path in paths for row in read_table(path, names, schema=schema).to_pylist()]
+    return [row for path in paths for row in read_table(path, names).to_pylist()]
 
 
 class Dataset:
@@ -152,7 +156,7 @@ class Dataset:
         names = self.info.features[STATE].names if STATE in self.info.features else None
         if self.motors is not None and names == self.motors.names:
             return dict.fromkeys(range(len(self.places)), robot_of_motors(self.motors))
-        return {number: self.robots[name] for number, name in self.robot_digests.items() if name is not None}
+        return {row["episode_index"]: self.robots[row["robot_digest"]] for row in self._named}
 
     def quaternions(self) -> Iterator[Named]:
         """All rotations, by the names of their elements."""
@@ -208,36 +212,33 @@ class Dataset:
 
     @cached_property
     def sidecar(self) -> list[dict[str, Any]]:
-        """The rows that demorec keeps beside each episode; empty for a dataset of somebody else's."""
-        names = [
-            "episode_index", "success", "num_retries", "content_digest", "frame_stride", "phases", "objects", "goals",
-            "deliberate_miss_frames", "episode_info",
-        ]  # fmt: skip
-        return read_rows(self.path / SIDECAR_DIR, names, schema=EPISODE_SCHEMA)
-
-    @cached_property
-    def details(self) -> dict[int, dict[str, Any]]:
-        """Episode -> whatever else the sidecar's rows have; those of older versions have less."""
-        paths = sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet"))
-        known = [n for n in EPISODE_SCHEMA.names if all(n in open_table(path).schema_arrow.names for path in paths)]
-        return {row["episode_index"]: row for row in read_rows(self.path / SIDECAR_DIR, known)}
-
-    @cached_property
-    def robot_digests(self) -> dict[int, str | None]:
-        """Episode -> by what name the sidecar calls its arm; None where that is not known, as in older datasets."""
-        found: list[str | None] = []
+        """The rows that demorec keeps beside each episode, those of older versions with fewer columns; empty for a
+        dataset of somebody else's."""
+        found = []
         for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
-            table = open_table(path)
-            if "robot_digest" in table.schema_arrow.names:
-                found += read_table(path, ["robot_digest"], schema=EPISODE_SCHEMA).column(0).to_pylist()
-            else:
-                found += [None] * table.metadata.num_rows
-        return {row["episode_index"]: name for row, name in zip(self.sidecar, found, strict=True)}
+            needed = read_table(path, _NEEDED, schema=EPISODE_SCHEMA).to_pylist()
+            there = [name for name in EPISODE_SCHEMA.names if name in open_table(path).schema_arrow.names]
+            found += [row | kept for row, kept in zip(read_table(path, there).to_pylist(), needed, strict=True)]
+        return found
 
     @cached_property
     def robots(self) -> dict[str, DatasetRobot]:
         """Name -> arm, of all that the episodes call by name."""
-        return {name: read_robot(self.path, name) for name in sorted(filter(None, set(self.robot_digests.values())))}
+        return {name: read_robot(self.path, name) for name in sorted({row["robot_digest"] for row in self._named})}
+
+    @property
+    def _named(self) -> list[dict[str, Any]]:
+        """Rows of the sidecar that say which arm moved, as those of older datasets do not."""
+        return [row for row in self.sidecar if row.get("robot_digest")]
+
+    def links(self, each: DescribedEpisode) -> LinkMatrices:
+        """Forward kinematics of an episode's states."""
+        info, state = each.info, each.rows[STATE].astype(np.float64)
+        if name := each.kept.get("robot_digest"):
+            urdf = self.robots[name].model
+        else:
+            urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
+        return LinkMatrices(urdf, dict(zip(info.robot.arm_joints, state.T, strict=False)), len(state))
 
     @cached_property
     def spoken(self) -> list[SpokenEpisode]:
@@ -290,12 +291,7 @@ class Dataset:
             rows, info = each.rows, each.info
             if not (poses := self.tcp_poses(info, rows)):
                 return
-            if (model := self.robot_digests[each.number]) is not None:
-                urdf = self.robots[model].model
-            else:
-                urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)  # as of older datasets
-            joints = dict(zip(info.robot.arm_joints, rows[STATE].astype(np.float64).T, strict=False))
-            hand = LinkMatrices(urdf, joints, len(rows[STATE]))[info.robot.tcp_link]
+            hand = self.links(each)[info.robot.tcp_link]
             yield from ((f"{name}, episode {each.number}", tcp, hand) for name, tcp in poses.items())
 
     def check_simulated(self) -> None:

@@ -1,4 +1,4 @@
-"""Is a LeRobot dataset whole: tables, counts, videos, statistics, and what stands beside it."""
+"""Is a LeRobot dataset whole: are its tables and videos as info.json says, and does LeRobot open it."""
 
 from __future__ import annotations
 
@@ -6,25 +6,44 @@ import json
 import math
 import os
 import re
-import reprlib
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
-from demorec.check.base import Measurement, dataset_check, sidecar_check
+from demorec.check.base import Measurement, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
+from demorec.core.errors import ExportError, MissingDependencyError, ResourceError, describe_error
+from demorec.core.tables import ROBOTS
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
-from demorec.datasets.lerobot.files import open_table, read_table
-from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests
-from demorec.datasets.lerobot.layout import EPISODES_PATH, TASKS_PATH, FilePosition
+from demorec.datasets.lerobot.files import open_table, read_json, read_table
+from demorec.datasets.lerobot.inspect import dataset_problems
+from demorec.datasets.lerobot.layout import (
+    AUTOMATIC_FEATURES,
+    EPISODES_PATH,
+    TASKS_PATH,
+    DatasetFeature,
+    FilePosition,
+)
+from demorec.datasets.lerobot.mp4_index import check_video
+from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
 from demorec.datasets.lerobot.videos import PacketReader
+from demorec.episode.features import STATE
+
+_TYPES = {
+    "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
+}  # fmt: skip
+_CHANNELS, _CHANNEL_COUNTS = ("channel", "channels"), (1, 3, 4)
+_RATE_TOLERANCE = 0.01
+"""Files that were put together have rates that are a little off."""
 
 
 @dataset_check(
@@ -180,34 +199,127 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
 
 
-@sidecar_check(
-    measures="episodes on which dataset and sidecar disagree",
+@dataset_check(
+    measures="statements of info.json that its tables and videos contradict",
 )
-def dataset_sidecar(dataset: Dataset) -> Measurement | None:
-    """Task, success and content digest of each episode are those that the sidecar keeps."""
-    if not dataset.sidecar:
-        return None
-    wrong, known = [], [row["episode_index"] for row in dataset.sidecar]
-    if any(number not in range(len(dataset.rows)) for number in known) or sorted(set(known)) != known:
-        wrong.append(f"its rows are of the episodes {reprlib.repr(known)}, the dataset has {len(dataset.rows)}")
-    elif missing := sorted(set(range(len(dataset.rows))) - set(known)):
-        wrong.append(
-            f"of episode {', '.join(map(str, missing[:5]))} it knows nothing: LeRobot recorded {len(missing)} of "
-            f"{len(dataset.rows)} into the dataset, or its rows were lost"
-        )
-    if all(number in range(len(dataset.rows)) for number in known):
-        infos = {each.number: each.info for each in dataset.described()}
-        digests = episode_digests(dataset.path, dataset.info)
-        for row in dataset.sidecar:
-            number = row["episode_index"]
-            rows, info = dataset.rows[number], infos.get(number)
-            if info is not None and dataset.places[number].tasks != (info.instruction,):
-                wrong.append(f"episode {number} has another instruction")
-            elif "next.success" in rows and bool(rows["next.success"][-1, 0]) != row["success"]:
-                wrong.append(f"episode {number} has another outcome")
-            elif digests[number] != row["content_digest"]:
-                wrong.append(f"episode {number} has changed since it was exported")
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.sidecar)} episodes")
+def dataset_schema(dataset: Dataset) -> Measurement:
+    """Columns, types, shapes, names; codec, size and rate of each video file; splits that cover all episodes."""
+    wrong = [*_columns(dataset), *_names(dataset), *_videos(dataset), *_splits(dataset)]
+    found = f"{len(dataset.info.features)} features"
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or found)
+
+
+def _columns(dataset: Dataset) -> Iterator[str]:
+    """Of the data files, against the features; and of the counters, against what they always are."""
+    features = {name: feature for name, feature in dataset.info.features.items() if not feature.is_video}
+    for name, fixed in AUTOMATIC_FEATURES.items():
+        found = features.get(name)
+        if found is None or (found.dtype, found.shape) != (fixed.dtype, fixed.shape):
+            yield f"{name} is no {fixed.dtype} of shape {fixed.shape}"
+    for path in sorted((dataset.path / "data").glob("*/*.parquet")):
+        schema = open_table(path).schema_arrow
+        columns = set(schema.names)
+        yield from (f"{path.name} has no column {name}" for name in features if name not in columns)
+        yield from (f"{path.name} has a column {name}, which is no feature" for name in columns if name not in features)
+        for name in features:
+            if name in columns and not _fits(schema.field(name).type, features[name]):
+                yield f"{name} is {schema.field(name).type} in {path.name}, {features[name].dtype} in info.json"
+
+
+def _fits(found: pa.DataType, feature: DatasetFeature) -> bool:
+    if feature.dtype not in _TYPES:
+        return True  # images in tables, which other writers have
+    size = None
+    while pa.types.is_list(found) or pa.types.is_fixed_size_list(found) or pa.types.is_large_list(found):
+        if pa.types.is_fixed_size_list(found):
+            size = (size or 1) * found.list_size
+        found = found.value_type
+    if size is not None and size != math.prod(feature.shape):
+        return False
+    return bool(found == _TYPES[feature.dtype] or (feature.dtype == "string" and pa.types.is_large_string(found)))
+
+
+def _names(dataset: Dataset) -> Iterator[str]:
+    for name, feature in dataset.info.features.items():
+        for place, told in enumerate(feature.names or ()) if len(feature.shape) == 3 else ():
+            if told in _CHANNELS and place < 3 and feature.shape[place] not in _CHANNEL_COUNTS:
+                yield f"{name} has {feature.shape[place]} {told} by its names"
+        if feature.names is None or len(feature.shape) != 1:
+            continue
+        if len(feature.names) != feature.shape[0]:
+            yield f"{name} has {len(feature.names)} names for {feature.shape[0]} components"
+        if len(set(feature.names)) != len(feature.names):
+            yield f"{name} names a component twice"
+    state = dataset.info.features.get(STATE)
+    joints = [ELEMENT_SUFFIX.sub("", name) for name in state.names or ()] if state is not None else []
+    robot = dataset.info.robot_type
+    for other in ROBOTS.names() if joints and robot in ROBOTS.names() else ():
+        if other != robot and all(other in name for name in joints[:-1]):
+            yield f"robot_type is {robot}, the joints are those of {other}"
+    known = ROBOTS.load(robot).arm_joints if robot in ROBOTS.names() else ()
+    lacking = [joint for joint in known if joint not in joints]
+    if lacking and len(lacking) <= len(known) / 2 and len(joints) >= len(known):  # of an arm called otherwise all are
+        yield f"robot_type is {robot}, no joint is its {lacking[0]}"
+
+
+def _videos(dataset: Dataset) -> Iterator[str]:
+    for key in dataset.info.video_keys:
+        feature = dataset.info.features[key]
+        height, width = feature.shape[:2]
+        info = feature.info or {}
+        said: dict[str, Any] = {"height": height, "width": width}
+        said |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
+        said |= {"sound": info["has_audio"]} if isinstance(info.get("has_audio"), bool) else {}
+        for path in dict.fromkeys(place.videos[key][0] for place in dataset.places):
+            found, rate = _stream(path)
+            for quantity, value in found.items():
+                if quantity in said and said[quantity] != value:
+                    yield f"{key}: {quantity} is {said[quantity]} in info.json, {value} in {path.name}"
+            if not abs(rate - dataset.info.fps) <= _RATE_TOLERANCE * dataset.info.fps:
+                yield f"{key}: fps is {dataset.info.fps} in info.json, {rate:.4g} in {path.name}"
+        if feature.is_depth and feature.shape[2] != 1:
+            yield f"{key} is a depth map of {feature.shape[2]} channels"
+        for quantity, value in (("height", height), ("width", width), ("channels", feature.shape[2])):
+            if info.get(f"video.{quantity}", value) != value:
+                yield f"{key}: video.{quantity} is {info[f'video.{quantity}']}, the shape has {value}"
+        if info.get("video.fps", dataset.info.fps) != dataset.info.fps:
+            yield f"{key}: video.fps is {info['video.fps']}, the dataset has {dataset.info.fps}"
+
+
+def _stream(path: Path) -> tuple[dict[str, Any], float]:
+    """What an mp4 file says of its images, and how many a second it has."""
+    import av
+
+    check_video(path)
+    try:
+        with av.open(str(path), format="mp4") as container:
+            context = container.streams.video[0].codec_context
+            rate = container.streams.video[0].average_rate
+            codec = {"libdav1d": "av1"}.get(context.name, context.name)
+            found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}
+            found["sound"] = bool(container.streams.audio)
+    except (OSError, IndexError, av.FFmpegError) as error:
+        raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
+    return found, float(rate or 0)
+
+
+def _splits(dataset: Dataset) -> Iterator[str]:
+    """Every episode in one split, none beyond."""
+    splits = read_json(dataset.path / INFO_PATH).get("splits")
+    if splits is None:
+        return
+    used: list[int] = []
+    try:
+        for text in splits.values():
+            first, last = (int(part) for part in text.split(":"))
+            if not 0 <= first <= last <= dataset.info.total_episodes:
+                raise ValueError(text)
+            used += range(first, last)
+    except (AttributeError, TypeError, ValueError):
+        yield f"the splits {str(splits)[:80]} are no ranges of its {dataset.info.total_episodes} episodes"
+        return
+    if sorted(used) != list(range(dataset.info.total_episodes)):
+        yield f"the splits have {len(used)} of {dataset.info.total_episodes} episodes"
 
 
 _PATIENCE_S = 600

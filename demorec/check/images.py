@@ -16,10 +16,11 @@ from demorec.check.base import (
     Measurement,
     NotMeasured,
     image_check,
+    sidecar_check,
     worst_frame,
 )
 from demorec.check.dataset import Dataset
-from demorec.check.drawn import ImageComparison, judge_unlike
+from demorec.check.drawn import ImageComparison, judge_lag, judge_unlike
 from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
 from demorec.check.rows import longest_run
@@ -239,3 +240,27 @@ def pixel_statistics(episode: CheckedEpisode) -> Iterator[Found]:
         channel = int(np.argmax(off))
         detail = f"camera {camera.name}, {('red', 'green', 'blue')[channel]}"
         yield Measurement(value=float(off[channel]), detail=detail)
+
+
+@sidecar_check(
+    needs_images=True,
+    measures="difference of an episode's first images from what its states and scene make of them, median of 255",
+    warn=13.0,
+    fail=16.0,
+)
+def dataset_images_as_drawn(dataset: Dataset) -> Iterator[Found]:
+    """Each video shows its own episode by its own camera, drawn anew until the fingers close, for 3 s at most."""
+    for number, camera, compared in dataset.compared:
+        yield judge_unlike(compared, f"camera {camera}, episode {number}")
+
+
+@sidecar_check(
+    needs_images=True,
+    measures="lag between an episode's first images and its states, frames",
+    warn=0.73,
+    fail=0.85,
+)
+def dataset_image_lag(dataset: Dataset) -> Iterator[Found]:
+    """Image t shows state t, in each episode and camera, until the fingers close, for 3 s at most."""
+    for number, camera, compared in dataset.compared:
+        yield judge_lag(compared, f"camera {camera}, episode {number}", f"camera {camera} in episode {number}")
