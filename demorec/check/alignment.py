@@ -15,26 +15,7 @@ from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.scene import POSITION_GAIN
 
-MAX_LAG = 5
-
-
-def measured_lag(before: Array, after: Array) -> tuple[float, float] | None:
-    """By how many frames `after` (T, n) runs behind `before` (T, n), and what share of its motion that leaves open.
-
-    Least squares over whole lags from -5 to 5, all columns together, each on the scale of its speed and up to a
-    constant, with a parabola through the best lag and its neighbours. None when nothing moves.
-    """
-    if len(before) < 4 * MAX_LAG:
-        return None
-    speed = np.sqrt((np.diff(before, axis=0) ** 2).mean(axis=0))
-    moving = speed > 1e-5
-    if not moving.any():
-        return None
-    x, y = before[:, moving] / speed[moving], after[:, moving] / speed[moving]
-    core = slice(MAX_LAG, len(x) - MAX_LAG)
-    lags = range(-MAX_LAG, MAX_LAG + 1)
-    errors = [float((np.roll(y, -lag, axis=0)[core] - x[core]).var(axis=0).sum()) for lag in lags]
-    return finest_lag(lags, errors), float(np.min(errors)) / max(float(x[core].var(axis=0).sum()), 1e-12)
+_MAX_LAG = 5
 
 
 def nearest_lag(
@@ -78,34 +59,35 @@ def servo_response(commands: Array, *, start: Array, substeps: int) -> Array:
     return out
 
 
-def lag_error(before: Array, after: Array, *, what: str) -> Measurement | None:
-    """How far the lag between two motions, which ought to be 0 frames, is off; infinite for unrelated motions."""
-    found = measured_lag(before, after)
-    if found is None:
-        return None
-    lag, left_open = found
-    if left_open > 0.5:
-        return Measurement(value=math.inf, detail=f"{what}: the two do not follow each other at any lag")
-    return Measurement(value=abs(lag), detail=f"{what}: {lag:+.2f} frames off")
-
-
-@alignment_check(
-    measures="lag between states and what the commands ask for, frames",
-)
+@alignment_check(measures="lag between states and what the commands ask for, frames")
 def command_lag(episode: CheckedEpisode) -> Measurement | None:
-    """Command t is sent after observation t and reached, but for the servo's lag, at observation t + 1."""
+    """Command t is sent after observation t and reached, but for the servo's lag, at observation t + 1.
+
+    Least squares over whole lags from -5 to 5, all joints together, each on the scale of its speed and up to a
+    constant, with a parabola through the best lag and its neighbours; infinite for unrelated motions.
+    """
     c, info = episode.columns, episode.info
     expected = servo_response(
         c.command_joint_target,
         start=np.array(info.scene.robot.joint_position),
         substeps=max(info.physics_hz // info.fps, 1),
     )
-    return lag_error(expected, c.joint_position[:, : episode.num_arm], what="states")
+    if len(expected) < 4 * _MAX_LAG:
+        return None
+    speed = np.sqrt((np.diff(expected, axis=0) ** 2).mean(axis=0))
+    moving = speed > 1e-5
+    if not moving.any():
+        return None
+    x, y = (table[:, moving] / speed[moving] for table in (expected, c.joint_position[:, : episode.num_arm]))
+    core, lags = slice(_MAX_LAG, len(x) - _MAX_LAG), range(-_MAX_LAG, _MAX_LAG + 1)
+    errors = [float((np.roll(y, -lag, axis=0)[core] - x[core]).var(axis=0).sum()) for lag in lags]
+    if min(errors) > 0.5 * max(float(x[core].var(axis=0).sum()), 1e-12):
+        return Measurement(value=math.inf, detail="states: the two do not follow each other at any lag")
+    lag = finest_lag(lags, errors)
+    return Measurement(value=abs(lag), detail=f"states: {lag:+.2f} frames off")
 
 
-@alignment_check(
-    measures="lag between action and executed command, frames",
-)
+@alignment_check(measures="lag between action and executed command, frames")
 def action_lag(episode: CheckedEpisode) -> Measurement | None:
     """The action of a frame is the wish behind that frame's command.
 
@@ -113,7 +95,7 @@ def action_lag(episode: CheckedEpisode) -> Measurement | None:
     third of the moving frames in which the two are nearest, in units of the way to the next frame.
     """
     action, command = episode.columns.action_joint_target, episode.columns.command_joint_target
-    nearest = nearest_lag(action, command, action, reach=MAX_LAG, least=1e-4)
+    nearest = nearest_lag(action, command, action, reach=_MAX_LAG, least=1e-4)
     if nearest is None:
         return None
     lag, off = nearest
@@ -126,9 +108,7 @@ _PRESSED = 0.2
 """Of the speed with which a gripper opens: slower, it is pressed apart."""
 
 
-@alignment_check(
-    measures="lag between gripper command and opening, frames beyond the motor's",
-)
+@alignment_check(measures="lag between gripper command and opening, frames beyond the motor's")
 def gripper_lag(episode: CheckedEpisode) -> Iterator[Found]:
     """The opening starts to follow within a few frames of each command to close or open, and never before it."""
     c, fps = episode.columns, episode.info.fps
@@ -157,9 +137,7 @@ _AS_ALIKE = 0.99
 0.997, increments that are two frames early 0.98."""
 
 
-@sidecar_check(
-    measures="lag between action and state, off the contract's, frames",
-)
+@sidecar_check(measures="lag between action and state, off the contract's, frames")
 def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
     """Action t is what leads from observation t to t + 1, in every episode; catches shifted and made-up actions.
 

@@ -322,3 +322,8 @@ def worst_entry(table: Array, names: Sequence[str], *, first: int = 0) -> Measur
         return None
     row, column = divmod(int(np.argmax(table)), table.shape[1])
     return Measurement(value=float(table[row, column]), frame=row + first, detail=names[column])
+
+
+def counted(wrong: Sequence[str], good: str = "") -> Measurement:
+    """How many things are wrong, the first three of them by name; or what is told where none is."""
+    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or good)

@@ -19,7 +19,7 @@ from demorec.check.cells import ImageKind
 from demorec.check.drawn import ImageComparison, judge_lag
 from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
-from demorec.check.images import at_full_size, of_each_camera
+from demorec.check.images import of_each_camera
 from demorec.check.rows import displacement, matrices
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
@@ -89,7 +89,7 @@ def _allowance(episode: CheckedEpisode, camera: SceneCamera) -> float:
     unit="%",
     needs_images=True,
 )
-@of_each_camera
+@of_each_camera(CheckedEpisode.compared)
 def projection(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
     """Recorded poses, projected with K and extrinsics, fall where the image has them.
 
@@ -112,8 +112,8 @@ def projection(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComp
     unit="px",
     needs_images=True,
 )
-@at_full_size
-def image_placement(camera: SceneCamera, compared: FullSize) -> Found:
+@of_each_camera(CheckedEpisode.full_size)
+def image_placement(episode: CheckedEpisode, camera: SceneCamera, compared: FullSize) -> Found:
     """Nothing is shifted by a part of a pixel, turned, sheared, or of another size or aspect than K makes it."""
     return Measurement(value=compared.displacement, frame=int(compared.frames[0]), detail=f"camera {camera.name}")
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from demorec.check.base import Measurement, dataset_check
+from demorec.check.base import Measurement, counted, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, MissingDependencyError, ResourceError, describe_error
 from demorec.core.tables import ROBOTS
@@ -46,18 +46,14 @@ _RATE_TOLERANCE = 0.01
 """Files that were put together have rates that are a little off."""
 
 
-@dataset_check(
-    measures="tables that cannot be read",
-)
+@dataset_check(measures="tables that cannot be read")
 def dataset_readable(dataset: Dataset) -> Measurement:
     """info.json, the tables and every row can be read."""
     frames = sum(len(rows["index"]) for rows in dataset.rows)
     return Measurement(value=0, detail=f"{len(dataset.rows)} episodes, {frames} frames, {len(dataset.tasks)} tasks")
 
 
-@dataset_check(
-    measures="counters, indices and timestamps that are not as they must be",
-)
+@dataset_check(measures="counters, indices and timestamps that are not as they must be")
 def dataset_counts(dataset: Dataset) -> Measurement:
     """Totals agree with the tables; indices count up without a gap; timestamps are frame_index / fps."""
     info, wrong = dataset.info, []
@@ -92,7 +88,7 @@ def dataset_counts(dataset: Dataset) -> Measurement:
         numbers = read_table(dataset.path / TASKS_PATH, ["task_index"]).column("task_index").to_pylist()
         wrong += ["the tasks' numbers"] if numbers != list(range(len(numbers))) else []
         wrong += [*_wrong_ranges(dataset), *_stray_rows(dataset)]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{start} frames at {info.fps} fps")
+    return counted(wrong, f"{start} frames at {info.fps} fps")
 
 
 def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
@@ -142,7 +138,6 @@ def _wrong_ends(dataset: Dataset) -> Iterator[str]:
 
 @dataset_check(
     measures="files of images that no episode has, and of episodes that are said to lie elsewhere",
-    warn=0,
     fail=math.inf,
 )
 def dataset_strays(dataset: Dataset) -> Measurement | None:
@@ -170,9 +165,7 @@ def _said_elsewhere(dataset: Dataset) -> Iterator[str]:
                     yield f"{there} says of its episodes that they lie in {path}"
 
 
-@dataset_check(
-    measures="episodes without a coded image for every frame",
-)
+@dataset_check(measures="episodes without a coded image for every frame")
 def dataset_videos(dataset: Dataset) -> Measurement | None:
     """Every episode has its images in every camera's file, one after the other.
 
@@ -199,14 +192,12 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
 
 
-@dataset_check(
-    measures="statements of info.json that its tables and videos contradict",
-)
+@dataset_check(measures="statements of info.json that its tables and videos contradict")
 def dataset_schema(dataset: Dataset) -> Measurement:
     """Columns, types, shapes, names; codec, size and rate of each video file; splits that cover all episodes."""
     wrong = [*_columns(dataset), *_names(dataset), *_videos(dataset), *_splits(dataset)]
     found = f"{len(dataset.info.features)} features"
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or found)
+    return counted(wrong, found)
 
 
 def _columns(dataset: Dataset) -> Iterator[str]:

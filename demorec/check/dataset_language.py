@@ -19,7 +19,7 @@ from demorec.annotate import STATES
 from demorec.annotate.questions import ANSWERS
 from demorec.annotate.referring import references
 from demorec.annotate.situation import COLOR_WORDS, Surroundings, place_of, situation
-from demorec.check.base import Found, Measurement, NotMeasured, dataset_check, sidecar_check
+from demorec.check.base import Found, Measurement, NotMeasured, counted, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
 from demorec.datasets.lerobot.language import SpokenEpisode
@@ -39,9 +39,7 @@ _GOES_M = 0.02
 """How far a hand goes that is said to move up or down."""
 
 
-@dataset_check(
-    measures="entries of the language columns that are not as LeRobot has them",
-)
+@dataset_check(measures="entries of the language columns that are not as LeRobot has them")
 def dataset_language(dataset: Dataset) -> Measurement | None:
     """Styles, roles and cameras; one subtask at every frame; times of frames; answers that can be read."""
     if not dataset.spoken:
@@ -53,12 +51,11 @@ def dataset_language(dataset: Dataset) -> Measurement | None:
     ]
     wrong += [*_wrong_motions(dataset), *_wrong_plans(dataset), *_wrong_colors(dataset)]
     entries = sum(len(episode.persistent) + sum(map(len, episode.events.values())) for episode in dataset.spoken)
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{entries} entries")
+    return counted(wrong, f"{entries} entries")
 
 
 @dataset_check(
     measures="instructions that say nothing, or the same as another one",
-    warn=0,
     fail=math.inf,
 )
 def dataset_instructions(dataset: Dataset) -> Measurement:
@@ -204,9 +201,7 @@ def _points(answer: Row) -> Iterator[tuple[float, float]]:
         yield (float(point[0]), float(point[1])) if numbers else (math.nan, math.nan)
 
 
-@sidecar_check(
-    measures="statements that the phases, the scene or the boxes beside the dataset contradict",
-)
+@sidecar_check(measures="statements that the phases, the scene or the boxes beside the dataset contradict")
 def dataset_language_truth(dataset: Dataset) -> Found:
     """Subtasks change with the phases, words refer to things of the task, boxes and counts are those of the masks."""
     if not dataset.spoken or not dataset.sidecar:
@@ -225,7 +220,7 @@ def dataset_language_truth(dataset: Dataset) -> Found:
             *_wrong_answers(episode, number, start, boxes),
         ]
         wrong += [f"episode {number}: {text}" for text in faults]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.spoken)} episodes")
+    return counted(wrong, f"{len(dataset.spoken)} episodes")
 
 
 def _wrong_phases(episode: SpokenEpisode, row: Row, fps: int) -> Iterator[str]:

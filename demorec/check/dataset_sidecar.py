@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, dataset_check, sidecar_check
+from demorec.check.base import Measurement, counted, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset, DescribedEpisode
 from demorec.check.rows import displacement, matrices
 from demorec.core.errors import ExportError, without_path
@@ -42,9 +42,7 @@ _ATTEMPT = ("source", "run_episode_index", "attempt", "success", "failure_reason
 _START = ("object", "object_x", "object_y", "goal_x", "goal_y")
 
 
-@sidecar_check(
-    measures="episodes on which dataset and sidecar disagree",
-)
+@sidecar_check(measures="episodes on which dataset and sidecar disagree")
 def dataset_sidecar(dataset: Dataset) -> Measurement | None:
     """Task, success and content digest of each episode are those that the sidecar keeps."""
     if not dataset.sidecar:
@@ -69,12 +67,10 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | None:
                 wrong.append(f"episode {number} has another outcome")
             elif digests[number] != row["content_digest"]:
                 wrong.append(f"episode {number} has changed since it was exported")
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.sidecar)} episodes")
+    return counted(wrong, f"{len(dataset.sidecar)} episodes")
 
 
-@sidecar_check(
-    measures="statements of info.json that the episodes' own descriptions contradict",
-)
+@sidecar_check(measures="statements of info.json that the episodes' own descriptions contradict")
 def dataset_description(dataset: Dataset) -> Measurement | None:
     """Robot, rate, names of components and sizes of images are those of the scenes that the sidecar keeps."""
     if not dataset.infos:
@@ -84,7 +80,7 @@ def dataset_description(dataset: Dataset) -> Measurement | None:
         for each in dataset.described()
         for words in _described(dataset, each.info, int(each.kept["frame_stride"]))
     ]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.infos)} episodes")
+    return counted(wrong, f"{len(dataset.infos)} episodes")
 
 
 def _described(dataset: Dataset, info: EpisodeInfo, stride: int) -> Iterator[str]:
@@ -106,9 +102,7 @@ def _described(dataset: Dataset, info: EpisodeInfo, stride: int) -> Iterator[str
             yield f"the camera {camera.name} has {camera.width}x{camera.height} pixels, its feature {feature.shape}"
 
 
-@sidecar_check(
-    measures="details of the sidecar that an episode's scene, its rows or its run's config contradict",
-)
+@sidecar_check(measures="details of the sidecar that an episode's scene, its rows or its run's config contradict")
 def dataset_details(dataset: Dataset) -> Measurement | None:
     """Task, seed, behaviour, cameras, goals, objects, phases, conditions; the poses of cameras that move."""
     if not (described := dataset.described()):
@@ -121,7 +115,7 @@ def dataset_details(dataset: Dataset) -> Measurement | None:
         for each in described
         for words in (*_contradictions(each, configs), *_wrong_poses(dataset, each, poses))
     ]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(described)} episodes")
+    return counted(wrong, f"{len(described)} episodes")
 
 
 def _contradictions(each: DescribedEpisode, configs: Mapping[str, Any]) -> Iterator[str]:
@@ -205,9 +199,7 @@ def _wrong_poses(
             yield f"camera {camera.name} is {off[frame]:.3g} m from where the joints take it at frame {frame}"
 
 
-@sidecar_check(
-    measures="descriptions of robots that are missing, changed or of another robot",
-)
+@sidecar_check(measures="descriptions of robots that are missing, changed or of another robot")
 def dataset_robots(dataset: Dataset) -> Measurement | None:
     """The URDF beside each episode is there, unchanged, and of the robot, joints and TCP that the episode has.
 
@@ -235,12 +227,10 @@ def dataset_robots(dataset: Dataset) -> Measurement | None:
             wrong.append(f"{name} is not the robot of episode {number}")
         elif spec is not None and spec.tcp_link not in robot.model.link_poses({}):
             wrong.append(f"the URDF of {name} has no link {spec.tcp_link}")
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(used)} robot{'s' * (len(used) > 1)}")
+    return counted(wrong, f"{len(used)} robot{'s' * (len(used) > 1)}")
 
 
-@sidecar_check(
-    measures="columns of the table of episodes that the sidecar contradicts",
-)
+@sidecar_check(measures="columns of the table of episodes that the sidecar contradicts")
 def dataset_facts(dataset: Dataset) -> Measurement | None:
     """Every column by which episodes are chosen is what the sidecar's scene and conditions give, and each episode is
     one of the attempts."""
@@ -259,7 +249,7 @@ def dataset_facts(dataset: Dataset) -> Measurement | None:
         expected = _expected_facts(dataset, each)
         differing = [name for name in names if name in expected and row[name] != expected[name]]
         wrong += [f"episode {each.number}: {name} is {row[name]}" for name in differing]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(rows)} episodes")
+    return counted(wrong, f"{len(rows)} episodes")
 
 
 def _expected_facts(dataset: Dataset, each: DescribedEpisode) -> dict[str, Any]:
@@ -290,9 +280,7 @@ def _strange_attempts(dataset: Dataset) -> Iterator[str]:
             yield f"the attempt of episode {each.number} has another start"
 
 
-@dataset_check(
-    measures="rows of sarm_progress.parquet that the episodes' stages contradict",
-)
+@dataset_check(measures="rows of sarm_progress.parquet that the episodes' stages contradict")
 def dataset_progress(dataset: Dataset) -> Measurement | None:
     """Every row of the dataset has a progress in 0 to 1, which is that of its stage; stages leave no gap."""
     path = dataset.path / PROGRESS_PATH

@@ -40,35 +40,29 @@ _PREDICTED_WEIGHT = 0.25
 """Of the difference of a predicted image of AV1, which leaves whole motions to the next keyframe (15 levels seen)."""
 
 
-def of_each_camera(
-    judge: Callable[[CheckedEpisode, SceneCamera, ImageComparison], Found],
-) -> Callable[[CheckedEpisode], Iterator[Found]]:
-    """A check of the colour images of one camera, against what the recorded numbers make of them, as one of all."""
-
-    @wraps(judge)
-    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
-        for camera in episode.cameras:
-            compared = episode.compared(camera)
-            yield compared if isinstance(compared, NotMeasured) else judge(episode, camera, compared)
-
-    return judge_all
+_OfEpisode = Callable[[CheckedEpisode], Iterator[Found]]
 
 
-def at_full_size(judge: Callable[[SceneCamera, FullSize], Found]) -> Callable[[CheckedEpisode], Iterator[Found]]:
-    """A check of some colour images of one camera at their full size, as one of all cameras."""
+def of_each_camera[Seen](
+    look: Callable[[CheckedEpisode, SceneCamera], Seen | NotMeasured],
+) -> Callable[[Callable[[CheckedEpisode, SceneCamera, Seen], Found]], _OfEpisode]:
+    """A check of what is known of one camera (by `look`), as one of all cameras of a recording."""
 
-    @wraps(judge)
-    def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
-        for camera in episode.cameras:
-            compared = episode.full_size(camera)
-            yield compared if isinstance(compared, NotMeasured) else judge(camera, compared)
+    def of_all(
+        judge: Callable[[CheckedEpisode, SceneCamera, Seen], Found],
+    ) -> Callable[[CheckedEpisode], Iterator[Found]]:
+        @wraps(judge)
+        def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
+            for camera in episode.cameras:
+                seen = look(episode, camera)
+                yield seen if isinstance(seen, NotMeasured) else judge(episode, camera, seen)
 
-    return judge_all
+        return judge_all
+
+    return of_all
 
 
-@image_check(
-    measures="frames without an image that decodes",
-)
+@image_check(measures="frames without an image that decodes")
 def images_decode(episode: CheckedEpisode) -> Iterator[Found]:
     """Every camera's video, depth and labels decode to their end, one image a frame."""
     for camera in episode.cameras:
@@ -82,9 +76,7 @@ def images_decode(episode: CheckedEpisode) -> Iterator[Found]:
             yield Measurement(value=abs(missing), frame=frame, detail=detail)
 
 
-@image_check(
-    measures="largest share of an image that is black or white",
-)
+@image_check(measures="largest share of an image that is black or white")
 def exposure(episode: CheckedEpisode) -> Iterator[Found]:
     """Most of every image is neither under- nor overexposed."""
     for camera in episode.cameras:
@@ -93,7 +85,7 @@ def exposure(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @image_check(
-    measures="difference of the images from what the recorded numbers and the encoder make of them, median of 255",
+    measures="difference of the images from what the recorded numbers and the encoder make of them, median of 255"
 )
 def images_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
     """The images show robot, objects, colours and light as recorded: drawn anew and compared in every frame.
@@ -108,10 +100,10 @@ def images_as_drawn(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @image_check(
-    measures="mean difference of a colour from what is drawn and encoded at full size, in units of the encoder's error",
+    measures="mean difference of a colour from what is drawn and encoded at full size, in units of the encoder's error"
 )
-@at_full_size
-def image_colors(camera: SceneCamera, compared: FullSize) -> Found:
+@of_each_camera(CheckedEpisode.full_size)
+def image_colors(episode: CheckedEpisode, camera: SceneCamera, compared: FullSize) -> Found:
     """Every colour is as drawn: catches other gains, curves, saturation and colour matrices, also if they drift."""
     return Measurement(value=compared.color, frame=compared.color_frame, detail=f"camera {camera.name}")
 
@@ -120,27 +112,23 @@ def image_colors(camera: SceneCamera, compared: FullSize) -> Found:
     measures="blur or sharpening of some images at full size, as half its variance",
     unit="px^2",
 )
-@at_full_size
-def image_sharpness(camera: SceneCamera, compared: FullSize) -> Found:
+@of_each_camera(CheckedEpisode.full_size)
+def image_sharpness(episode: CheckedEpisode, camera: SceneCamera, compared: FullSize) -> Found:
     """Images are as sharp as their encoder leaves them."""
     word = "blurred" if compared.sharpness > 0 else "sharpened"
     frame = int(compared.frames[0])
     return Measurement(value=abs(compared.sharpness), frame=frame, detail=f"camera {camera.name}, {word}")
 
 
-@image_check(
-    measures="error of an image at full size, or of its worst block, in units of the encoder's own",
-)
-@at_full_size
-def image_errors(camera: SceneCamera, compared: FullSize) -> Found:
+@image_check(measures="error of an image at full size, or of its worst block, in units of the encoder's own")
+@of_each_camera(CheckedEpisode.full_size)
+def image_errors(episode: CheckedEpisode, camera: SceneCamera, compared: FullSize) -> Found:
     """No part is farther from what is drawn than its encoder leaves it: catches noise, spots, lines and stamps."""
     return worst_frame(compared.errors, f"camera {camera.name}", frames=compared.frames.astype(np.intp))
 
 
-@image_check(
-    measures="difference of a single image from what was recorded at its frame, beyond the usual, of 255",
-)
-@of_each_camera
+@image_check(measures="difference of a single image from what was recorded at its frame, beyond the usual, of 255")
+@of_each_camera(CheckedEpisode.compared)
 def odd_images(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
     """No single image is another one, torn, blurred, shifted or off in colour."""
     full = episode.full_size(camera)
@@ -168,19 +156,15 @@ def _stale(compared: ImageComparison) -> NDArray[np.bool_]:
     return np.asarray(still & (_excess(compared) > STALE_EXCESS))
 
 
-@image_check(
-    measures="longest run of unchanged images while something moves before the camera, frames",
-)
-@of_each_camera
+@image_check(measures="longest run of unchanged images while something moves before the camera, frames")
+@of_each_camera(CheckedEpisode.compared)
 def frozen(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
     """A camera does not stand still while something moves in its view."""
     return _stale_frames(camera, compared, *longest_run(_stale(compared)))
 
 
-@image_check(
-    measures="images that repeat the one before, in the midst of motion",
-)
-@of_each_camera
+@image_check(measures="images that repeat the one before, in the midst of motion")
+@of_each_camera(CheckedEpisode.compared)
 def repeated_images(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComparison) -> Found:
     """No image was dropped and the one before shown in its place.
 
@@ -217,9 +201,7 @@ def distinct_cameras(subject: CheckedEpisode | Dataset) -> Iterator[Found]:
     yield from (Measurement(value=value, detail=names) for names, value in pairs)
 
 
-@image_check(
-    measures="mean colour of the decoded images against the recorded histogram, of 255",
-)
+@image_check(measures="mean colour of the decoded images against the recorded histogram, of 255")
 def pixel_statistics(episode: CheckedEpisode) -> Iterator[Found]:
     """The histograms, counted before coding, are those of the images: catches swapped channels and other images."""
     for camera in episode.cameras:

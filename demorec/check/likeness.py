@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check, counted
 from demorec.check.cells import correlation
 from demorec.check.dataset import Dataset, Rows
 from demorec.check.evidence import Flags, Motion, is_gripper, quaternion_places
@@ -243,7 +243,6 @@ def same_joints(dataset: Dataset) -> Iterator[tuple[int, int]]:
 @likeness_check(
     group="alignment",
     measures="episodes in which a joint is farther from its targets than in the others",
-    warn=0,
     fail=math.inf,
 )
 def offsets_alike(dataset: Dataset) -> Found:
@@ -262,13 +261,12 @@ def offsets_alike(dataset: Dataset) -> Found:
             off = np.abs(means[:, element] - np.median(means[:, element])) / spread[element]
             name = motions[0].names[element]
             wrong += [f"{name}, {motions[row].where}" for row in np.flatnonzero(far_off(off, _OFFSET))]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+    return counted(wrong)
 
 
 @likeness_check(
     group="alignment",
     measures="joints whose action is called a position, as their state is, where no action is a target of the state",
-    warn=0,
     fail=math.inf,
 )
 def targets_as_named(dataset: Dataset) -> Found:
@@ -285,7 +283,6 @@ def targets_as_named(dataset: Dataset) -> Found:
     on=("dataset",),
     needs="an element that two observations have",
     measures="elements of one name that go their own ways in two observations",
-    warn=0,
     fail=math.inf,
 )
 def same_by_name(dataset: Dataset) -> Found:
@@ -304,7 +301,7 @@ def same_by_name(dataset: Dataset) -> Found:
         a, b = (np.concatenate([rows[f][:, n] for rows in dataset.rows]) for f, n in ((one, i), (other, k)))
         if max(np.ptp(a), np.ptp(b)) > MOVES and abs(correlation(a, b)) < _SAME:
             wrong.append(f"{name} of {one} and {other}")
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+    return counted(wrong)
 
 
 def _told_by_states(found: _Scaled) -> Array:
@@ -326,7 +323,6 @@ def _told_by_states(found: _Scaled) -> Array:
     on=("dataset",),
     needs=STATE_ALONE,
     measures="episodes that alone begin or end in the middle of a motion, with another opening, or standing still",
-    warn=0,
     fail=math.inf,
 )
 def whole_episodes(dataset: Dataset) -> Found:
@@ -354,7 +350,7 @@ def whole_episodes(dataset: Dataset) -> Found:
             strange = np.flatnonzero((off > _OTHER) & alike & np.isin(tasks, tasks[off <= _OTHER]))
             if len(strange) <= max(1, _RARE * len(motions)):
                 wrong += [f"{motions[number].where} {word} {words}, unlike the others" for number in strange]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]))
+    return counted(wrong)
 
 
 def _speed_at(motion: Motion, row: int, spread: Array) -> float:

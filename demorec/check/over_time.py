@@ -69,7 +69,7 @@ def _all(subject: Filmed) -> Iterator[Film]:
 
 
 @film_check(
-    measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
+    measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so"
 )
 def stray_images(subject: Filmed) -> Iterator[Found]:
     """No image is empty (where most are, `images_show_something` says so), and none is from another moment or place."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Measurement, run_check
+from demorec.check.base import Measurement, counted, run_check
 from demorec.check.dataset import Dataset, Rows, read_rows
 from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
@@ -47,9 +47,7 @@ class DatasetEpisode:
     details: Mapping[str, Any]
 
 
-@run_check(
-    measures="episodes of the run's dataset that are not what was recorded",
-)
+@run_check(measures="episodes of the run's dataset that are not what was recorded")
 def run_dataset_content(run: CheckedRun) -> Measurement | None:
     """Every number and coded image of each episode is that of its recording, exported with the same options."""
     path = run.path / "dataset"
@@ -68,7 +66,7 @@ def run_dataset_content(run: CheckedRun) -> Measurement | None:
         )
         if words := [what for what, _ in episode_differences(file, options, episode)]:
             wrong.append(f"episode {episode.number}: {', '.join(words)}")
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(dataset.sidecar)} episodes")
+    return counted(wrong, f"{len(dataset.sidecar)} episodes")
 
 
 def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:

@@ -89,7 +89,6 @@ def _instructions(dataset: Dataset) -> Array:
 
 @views_check(
     measures="episodes in which a camera begins with another view than in the others",
-    warn=0,
     needs="images of four episodes",
 )
 def views_alike(dataset: Dataset) -> Iterator[Found]:
@@ -152,7 +151,6 @@ def views_upright(dataset: Dataset) -> Iterator[Found]:
 
 @views_check(
     measures="episodes that have a camera's film of another episode",
-    warn=0,
     needs="images of two episodes",
 )
 def films_differ(dataset: Dataset) -> Iterator[Found]:
