@@ -134,7 +134,7 @@ class CheckedEpisode(ExitStack):
         """Topic -> messages that are there; every chunk's checksum is verified on the way."""
         if self.form == "simulated":
             return {topic: len(scan.time_ns) for topic, scan in self.scan.items()}
-        return Counter(message.topic for message in self.container.messages(tuple(self.container.channels)))
+        return Counter(topic for topic, _, _ in self.container.messages(tuple(self.container.channels)))
 
     @property
     def num_words(self) -> int:

@@ -1,4 +1,4 @@
-"""Chunks of an MCAP file: where they are, what is in them, and all messages of a topic as one table of bytes.
+"""Chunks of an MCAP file: what is in them, and all messages of a topic as one table of bytes.
 
 An export reads every message of every recording. So nothing is made per message here: one walk over a chunk finds
 where its records begin, and NumPy takes their heads and their contents apart, a whole topic at a time.
@@ -38,51 +38,6 @@ _MESSAGE_HEAD = np.dtype(
 _GATHERED_ROWS = 4096
 """Messages that are taken out of a chunk at once: the places of their bytes take eight times as much as the bytes."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
-_PLACE_HEAD = struct.Struct("<QQQQI")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChunkPlace:
-    """What the index at the end of the file says about a chunk.
-
-    Attributes:
-        start, length: Of the chunk's record in the file, bytes.
-        channels: That it has messages of.
-        uncompressed_size: Of its records, bytes.
-    """
-
-    start: int
-    length: int
-    channels: frozenset[int]
-    uncompressed_size: int
-
-    @classmethod
-    def read(cls, record: bytes) -> ChunkPlace:
-        """Of the content of a Chunk Index record; struct.error when it is too short."""
-        _, _, start, length, num_bytes = _PLACE_HEAD.unpack_from(record)
-        position = _PLACE_HEAD.size
-        offsets = record[position : position + num_bytes]
-        position += num_bytes + 8  # message_index_length
-        (name_bytes,) = struct.unpack_from("<I", record, position)
-        (uncompressed_size,) = struct.unpack_from("<Q", record, position + 4 + name_bytes + 8)
-        channels = np.frombuffer(offsets, dtype=[("channel", "<u2"), ("offset", "<u8")])["channel"]
-        return cls(
-            start=start, length=length, channels=frozenset(channels.tolist()), uncompressed_size=uncompressed_size
-        )
-
-    @classmethod
-    def together(cls, places: Iterable[ChunkPlace], num_bytes: int) -> Iterator[list[ChunkPlace]]:
-        """Neighbours that have at most so many bytes together, at least one each."""
-        group: list[ChunkPlace] = []
-        total = 0
-        for place in places:
-            if group and total + place.uncompressed_size > num_bytes:
-                yield group
-                group, total = [], 0
-            group.append(place)
-            total += place.uncompressed_size
-        if group:
-            yield group
 
 
 def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, int, int]]:

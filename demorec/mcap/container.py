@@ -7,42 +7,24 @@ others, one chunk at a time. The mcap library parses the records; what this adds
 
 from __future__ import annotations
 
-import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Footer,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Footer, Metadata, MetadataIndex, Statistics
 
-from demorec.core.errors import DemorecError, RecordingError, ResourceError, describe_error, resource_error
-from demorec.core.files import open_regular
-from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, ChunkPlace, blocks_of, chunk_content, records_in
+from demorec.core.errors import RecordingError, ResourceError, describe_error, resource_error
+from demorec.core.files import MCAP_MAGIC, open_regular
+from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, blocks_of, chunk_content, records_in
 from demorec.mcap.limits import LimitError, Limits
-from demorec.mcap.scan import MAX_METADATA_BYTES, MESSAGE_HEAD, read_channel, read_record, read_schema
+from demorec.mcap.scan import MAX_METADATA_BYTES, MESSAGE_HEAD, NO_SCHEMA, read_channel, read_record, read_schema
 
-MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_BYTES = RECORD_HEAD.size + 20
-
-
-class Message(NamedTuple):
-    """One message: its topic, time and bytes."""
-
-    topic: str
-    time_ns: int
-    data: bytes
+_PARSERS = ("builtins", "mcap", "struct", "zstandard", "zstd")
+"""Modules whose errors damaged bytes lead to; those of the parsers share no base class but Exception."""
 
 
 @contextmanager
@@ -54,19 +36,13 @@ def damage_as_recording_error(path: Path) -> Iterator[None]:
         raise
     except LimitError as error:
         raise RecordingError(f"The recording is not read, {error}: {path}") from error
-    except (OSError, MemoryError, ValueError, KeyError, IndexError, OverflowError, EOFError, struct.error) as error:
-        raise _damage(error, path) from error
     except Exception as error:
-        # The parsers' own errors (mcap, zstandard) share no base class but Exception.
-        if type(error).__module__.split(".")[0] not in ("mcap", "zstandard", "zstd", "builtins"):
+        if not isinstance(error, (OSError, ValueError)) and type(error).__module__.split(".")[0] not in _PARSERS:
             raise
-        raise _damage(error, path) from error
-
-
-def _damage(error: BaseException, path: Path) -> DemorecError:
-    if "not enough memory" in str(error):  # zstandard has no error of its own for that
-        error = MemoryError()
-    return resource_error(error, path) or RecordingError(f"The recording is damaged ({describe_error(error)}): {path}")
+        # zstandard has no error of its own for a lack of memory
+        lacking = MemoryError() if "not enough memory" in str(error) else error
+        damaged = RecordingError(f"The recording is damaged ({describe_error(error)}): {path}")
+        raise resource_error(lacking, path) or damaged from error
 
 
 class Container:
@@ -103,16 +79,16 @@ class Container:
         self._limits = Limits.of_file(size)
         if size == 0:
             raise RecordingError(f"The file is empty, so no recording: {self.path}")
-        if self._read_at(0, min(size, len(MAGIC))) != MAGIC:
+        if self._read_at(0, min(size, len(MCAP_MAGIC))) != MCAP_MAGIC:
             raise RecordingError(f"The file is no MCAP file, so no recording: {self.path}")
-        tail_bytes = _FOOTER_BYTES + len(MAGIC)
-        if size < tail_bytes + len(MAGIC) or self._read_at(size - len(MAGIC), len(MAGIC)) != MAGIC:
+        tail_bytes = _FOOTER_BYTES + len(MCAP_MAGIC)
+        if size < tail_bytes + len(MCAP_MAGIC) or self._read_at(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise RecordingError(
                 f"The recording is cut off, its index is missing; demorec recover keeps what is whole: {self.path}"
             )
         footer_start = size - tail_bytes
-        footer = self._record_at(footer_start, _FOOTER_BYTES, Opcode.FOOTER, Footer)
-        if not len(MAGIC) <= footer.summary_start < footer_start:
+        footer = read_record(self._content_at(footer_start, _FOOTER_BYTES, Opcode.FOOTER), Footer)
+        if not len(MCAP_MAGIC) <= footer.summary_start < footer_start:
             raise RecordingError(f"The recording is damaged or has no index: {self.path}")
         # The checksum covers the summary and the footer up to the checksum itself.
         summary = self._read_at(footer.summary_start, footer_start - footer.summary_start + _FOOTER_BYTES - 4)
@@ -122,8 +98,8 @@ class Container:
 
     def _parse_summary(self, summary: bytes) -> None:
         channels: dict[int, Channel] = {}
-        self.schemas = {0: Schema(id=0, name="", encoding="", data=b"")}  # 0: messages without one
-        self._chunks: list[ChunkPlace] = []
+        self.schemas = {0: NO_SCHEMA}
+        self._chunks: list[ChunkIndex] = []
         self._metadata: dict[str, MetadataIndex] = {}
         self._attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
@@ -136,7 +112,7 @@ class Container:
                 schema = read_schema(content)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHUNK_INDEX:
-                self._chunks.append(ChunkPlace.read(content))
+                self._chunks.append(read_record(content, ChunkIndex))
             elif opcode == Opcode.METADATA_INDEX:
                 metadata = read_record(content, MetadataIndex)
                 self._metadata[metadata.name] = metadata
@@ -145,7 +121,7 @@ class Container:
                 self._attachments[attachment.name] = attachment
             elif opcode == Opcode.STATISTICS:
                 counts = dict(read_record(content, Statistics).channel_message_counts)
-        self._chunks.sort(key=lambda chunk: chunk.start)
+        self._chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
         self._limits.check_total(sum(chunk.uncompressed_size for chunk in self._chunks))
         self._limits.check_records(sum(counts.values()))
         for channel in channels.values():
@@ -174,9 +150,6 @@ class Container:
             )
         return memoryview(data)[RECORD_HEAD.size :]
 
-    def _record_at[R: McapRecord](self, offset: int, length: int, opcode: Opcode, kind: type[R]) -> R:
-        return read_record(self._content_at(offset, length, opcode), kind)
-
     @property
     def metadata_names(self) -> tuple[str, ...]:
         """Names of all metadata records."""
@@ -192,7 +165,7 @@ class Container:
                 f"The metadata {name} have {index.length / 1e6:,.0f} MB, those of recordings a few kB: {self.path}"
             )
         with damage_as_recording_error(self.path):
-            record = self._record_at(index.offset, index.length, Opcode.METADATA, Metadata)
+            record = read_record(self._content_at(index.offset, index.length, Opcode.METADATA), Metadata)
             return dict(record.metadata)
 
     @property
@@ -204,51 +177,58 @@ class Container:
         """The bytes of an attachment; KeyError when there is none of that name."""
         index = self._attachments[name]
         with damage_as_recording_error(self.path):
-            data = self._read_at(index.offset, index.length)
-            content, stored = data[RECORD_HEAD.size : -4], int.from_bytes(data[-4:], "little")
-            if stored and zlib.crc32(content) != stored:
+            content = self._content_at(index.offset, index.length, Opcode.ATTACHMENT)
+            stored = int.from_bytes(content[-4:], "little")
+            if stored and zlib.crc32(content[:-4]) != stored:
                 raise RecordingError(
                     f"The recording is damaged: the attachment {name!r} fails its checksum: {self.path}"
                 )
-            record = self._record_at(index.offset, index.length, Opcode.ATTACHMENT, Attachment)
-            return bytes(record.data)
+            return bytes(read_record(content, Attachment).data)
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Messages of some topics in the order of the file; chunks without them are not read."""
-        wanted = {self.channels[topic].id: topic for topic in topics if topic in self.channels}
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """(topic, time in ns, bytes) of the messages of some topics in the order of the file."""
+        wanted = {channel: topic for topic, channel in self._ids(topics).items()}
+        count = 0
         with damage_as_recording_error(self.path):
-            yield from _messages_of(self._unpacked(self._places(wanted)), wanted, self._limits)
+            for content in self._unpacked(self._chunks_of(wanted)):
+                for opcode, start, end in records_in(content):
+                    count += 1
+                    if opcode == Opcode.MESSAGE:
+                        channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(content, start)
+                        if channel in wanted:
+                            yield wanted[channel], time_ns, content[start + MESSAGE_HEAD.size : end]
+                self._limits.check_records(count)
 
     def blocks(self, topics: Collection[str]) -> dict[str, Block]:
         """topic -> all its messages; the chunks that hold any of them are in memory together."""
-        wanted = {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
+        wanted = self._ids(topics)
         with damage_as_recording_error(self.path):
-            return blocks_of(self._unpacked(self._places(wanted.values())), wanted, self._limits)
+            return blocks_of(self._unpacked(self._chunks_of(wanted.values())), wanted, self._limits)
 
     def blocks_by_chunk(self, topics: Collection[str], *, num_bytes: int = 0) -> Iterator[dict[str, Block]]:
         """As `blocks`, one chunk after the other, or a few of them: no more than have that many bytes unpacked."""
-        wanted = {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
+        wanted = self._ids(topics)
+        group: list[ChunkIndex] = []
+        total = 0
         with damage_as_recording_error(self.path):
-            for places in ChunkPlace.together(self._places(wanted.values()), num_bytes):
-                yield blocks_of(self._unpacked(places), wanted, self._limits)
+            for chunk in self._chunks_of(wanted.values()):
+                if group and total + chunk.uncompressed_size > num_bytes:
+                    yield blocks_of(self._unpacked(group), wanted, self._limits)
+                    group, total = [], 0
+                group.append(chunk)
+                total += chunk.uncompressed_size
+            if group:
+                yield blocks_of(self._unpacked(group), wanted, self._limits)
 
-    def _places(self, channels: Collection[int]) -> list[ChunkPlace]:
-        return [place for place in self._chunks if not place.channels.isdisjoint(channels)]
+    def _ids(self, topics: Collection[str]) -> dict[str, int]:
+        """topic -> number of its channel, -1 where there is none."""
+        return {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
 
-    def _unpacked(self, places: Iterable[ChunkPlace]) -> Iterator[bytes]:
-        for place in places:
-            record = self._content_at(place.start, place.length, Opcode.CHUNK)
-            yield chunk_content(record, self._limits, place.uncompressed_size)
+    def _chunks_of(self, channels: Collection[int]) -> list[ChunkIndex]:
+        """The chunks that hold messages of any of these channels; the others are not read."""
+        return [chunk for chunk in self._chunks if not chunk.message_index_offsets.keys().isdisjoint(channels)]
 
-
-def _messages_of(contents: Iterable[bytes], wanted: dict[int, str], limits: Limits) -> Iterator[Message]:
-    count = 0
-    for content in contents:
-        for opcode, start, end in records_in(content):
-            count += 1
-            if opcode == Opcode.MESSAGE:
-                channel_id, _, log_time, _ = MESSAGE_HEAD.unpack_from(content, start)
-                topic = wanted.get(channel_id)
-                if topic is not None:
-                    yield Message(topic, log_time, content[start + MESSAGE_HEAD.size : end])
-        limits.check_records(count)
+    def _unpacked(self, chunks: Iterable[ChunkIndex]) -> Iterator[bytes]:
+        for chunk in chunks:
+            record = self._content_at(chunk.chunk_start_offset, chunk.chunk_length, Opcode.CHUNK)
+            yield chunk_content(record, self._limits, chunk.uncompressed_size)

@@ -177,8 +177,8 @@ class EpisodeFile(Closing):
     def _read[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
         """(time_ns, what was read) of the messages of a topic, in order."""
         with damage_as_recording_error(self.path):
-            for message in self._container.messages((topic,)):
-                yield message.time_ns, read(message.data)
+            for _, time_ns, data in self._container.messages((topic,)):
+                yield time_ns, read(data)
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera, in order; `frame_index` is their number, by which frames hold them."""

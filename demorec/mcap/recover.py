@@ -15,11 +15,11 @@ from typing import NamedTuple
 from mcap.records import Metadata
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
-from demorec.core.files import make_folder, open_regular
+from demorec.core.files import MCAP_MAGIC, make_folder, open_regular
 from demorec.episode.episode import frame_time_ns
 from demorec.episode.info import Origin
 from demorec.mcap import channels, messages, metadata
-from demorec.mcap.container import MAGIC, damage_as_recording_error
+from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
@@ -164,7 +164,7 @@ def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
         with open_regular(source) as file:
             size = file.seek(0, 2)
             file.seek(0)
-            if file.read(len(MAGIC)) != MAGIC:
+            if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
                 yield "the file is empty" if size == 0 else "the file is no MCAP file"
                 return
             with damage_as_recording_error(source):

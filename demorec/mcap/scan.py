@@ -28,7 +28,9 @@ MAX_CHANNELS = 4096
 """Of a file; large systems have some hundred topics."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence number, time of recording and of publishing (MCAP specification, Message)."""
-_READ = frozenset((Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE))
+_IN_CHUNKS = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
+NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
+"""Of messages without one."""
 
 
 class CutOffError(ValueError):
@@ -101,8 +103,39 @@ def scan(file: BinaryIO, unpacked: Unpacked) -> Iterator[ScannedMessage | Metada
         LimitError: It would unpack to more than is allowed.
         Exception: A record is damaged; the parsers' own errors share no other base class.
     """
+    schemas = {0: NO_SCHEMA}
+    channels: dict[int, ScannedChannel] = {}
+    for opcode, data, start, end in _records(file, unpacked):
+        if opcode == Opcode.MESSAGE:
+            channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data, start)
+            yield ScannedMessage(channels[channel], log_ns, data[start + MESSAGE_HEAD.size : end])
+        elif opcode == Opcode.CHUNK:
+            yield None
+        elif opcode == Opcode.METADATA:
+            yield read_record(data[start:end], Metadata)
+        elif opcode == Opcode.SCHEMA:
+            schema = read_schema(data[start:end])
+            if len(schema.data) > MAX_SCHEMA_BYTES:
+                raise ValueError(f"the definition of {schema.name[:80]!r} has {len(schema.data):,} bytes")
+            schemas[schema.id] = schema
+        else:
+            found = read_channel(data[start:end])
+            if found.id not in channels and len(channels) >= MAX_CHANNELS:
+                raise ValueError("too many channels")
+            schema = schemas[found.schema_id]
+            channels[found.id] = ScannedChannel(
+                topic=found.topic,
+                type=schema.name,
+                encoding=found.message_encoding,
+                schema_encoding=schema.encoding,
+                schema=schema.data,
+                has_qos="offered_qos_profiles" in found.metadata,
+            )
+
+
+def _records(file: BinaryIO, unpacked: Unpacked) -> Iterator[tuple[int, bytes, int, int]]:
+    """(opcode, data, start, end) of the records that `scan` reads, in chunks too; an empty one ends a chunk's."""
     size = os.fstat(file.fileno()).st_size
-    records = _Records(unpacked)
     while True:
         head = file.read(RECORD_HEAD.size)
         if len(head) < RECORD_HEAD.size:
@@ -112,60 +145,17 @@ def scan(file: BinaryIO, unpacked: Unpacked) -> Iterator[ScannedMessage | Metada
             raise CutOffError("a record is cut off")
         if opcode in (Opcode.DATA_END, Opcode.FOOTER):
             return
-        if opcode not in _READ or (opcode == Opcode.METADATA and length > MAX_METADATA_BYTES):
-            file.seek(length, os.SEEK_CUR)
-        elif opcode == Opcode.METADATA:
-            yield read_record(file.read(length), Metadata)
-        elif opcode == Opcode.CHUNK:
-            yield from records.in_chunk(file.read(length))
-            yield None
-        elif (message := records.read(opcode, file.read(length))) is not None:
-            yield message
-
-
-class _Records:
-    """What has been learnt from the records so far."""
-
-    def __init__(self, unpacked: Unpacked) -> None:
-        self._unpacked = unpacked
-        self._schemas = {0: Schema(id=0, name="", encoding="", data=b"")}
-        self._channels: dict[int, ScannedChannel] = {}
-
-    def read(self, opcode: int, content: bytes) -> ScannedMessage | None:
-        """The message in a record; None for one that says what messages are."""
-        if opcode == Opcode.MESSAGE:
-            channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(content)
-            return ScannedMessage(self._channels[channel], log_ns, content[MESSAGE_HEAD.size :])
-        if opcode == Opcode.SCHEMA:
-            schema = read_schema(content)
-            if len(schema.data) > MAX_SCHEMA_BYTES:
-                raise ValueError(f"the definition of {schema.name[:80]!r} has {len(schema.data):,} bytes")
-            self._schemas[schema.id] = schema
+        if opcode == Opcode.CHUNK:
+            content = chunk_content(file.read(length), unpacked.limits)
+            unpacked.add(len(content))
+            count = 0
+            for inner, start, end in records_in(content):
+                count += 1
+                if inner in _IN_CHUNKS:
+                    yield inner, content, start, end
+            unpacked.add(0, count)
+            yield opcode, b"", 0, 0
+        elif opcode in _IN_CHUNKS or (opcode == Opcode.METADATA and length <= MAX_METADATA_BYTES):
+            yield opcode, file.read(length), 0, length
         else:
-            found = read_channel(content)
-            if found.id not in self._channels and len(self._channels) >= MAX_CHANNELS:
-                raise ValueError("too many channels")
-            schema = self._schemas[found.schema_id]
-            self._channels[found.id] = ScannedChannel(
-                topic=found.topic,
-                type=schema.name,
-                encoding=found.message_encoding,
-                schema_encoding=schema.encoding,
-                schema=schema.data,
-                has_qos="offered_qos_profiles" in found.metadata,
-            )
-        return None
-
-    def in_chunk(self, content: bytes) -> Iterator[ScannedMessage]:
-        """The messages in a chunk."""
-        unpacked = chunk_content(content, self._unpacked.limits)
-        self._unpacked.add(len(unpacked))
-        count = 0
-        for opcode, start, end in records_in(unpacked):
-            count += 1
-            if opcode == Opcode.MESSAGE:
-                channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(unpacked, start)
-                yield ScannedMessage(self._channels[channel], log_ns, unpacked[start + MESSAGE_HEAD.size : end])
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.read(opcode, unpacked[start:end])
-        self._unpacked.add(0, count)
+            file.seek(length, os.SEEK_CUR)

@@ -138,7 +138,7 @@ def test_images_that_compress_well_are_no_bomb(tmp_path: Path) -> None:
         assert recording.num_frames == 60
         assert 16 * sum(count for _, count in recording.topics.values()) < path.stat().st_size
         for place in places:
-            limits.check_chunk(place.uncompressed_size, place.length)
+            limits.check_chunk(place.uncompressed_size, place.chunk_length)
 
 
 def test_metadata_of_two_hundred_megabytes_are_not_read(good: Path, commands: LimitedCommands, tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ def damaged(tmp_path: Path) -> Path:
     """A recording with one flipped bit in its first chunk, which holds the calibration of its camera."""
     path = write_episode(tmp_path / "e.mcap", num_frames=40, cameras=("front",), width=64, height=48)
     container = Container(path)
-    place = min(container._chunks, key=lambda chunk: chunk.start)
+    place = min(container._chunks, key=lambda chunk: chunk.chunk_start_offset)
     container.close()
-    return flip_bits(path, path, offset=place.start + place.length // 2)
+    return flip_bits(path, path, offset=place.chunk_start_offset + place.chunk_length // 2)
 
 
 def check(path: Path, capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
