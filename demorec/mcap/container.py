@@ -206,7 +206,10 @@ class Container:
             return blocks_of(self._unpacked(self._chunks_of(wanted.values())), wanted, self._limits)
 
     def blocks_by_chunk(self, topics: Collection[str], *, num_bytes: int = 0) -> Iterator[dict[str, Block]]:
-        """As `blocks`, one chunk after the other, or a few of them: no more than have that many bytes unpacked."""
+        """As `blocks`, one chunk after the other, or a few of them: no more than have that many bytes unpacked.
+
+        Where no chunk holds any, there is one without messages.
+        """
         wanted = self._ids(topics)
         group: list[ChunkIndex] = []
         total = 0
@@ -217,8 +220,7 @@ class Container:
                     group, total = [], 0
                 group.append(chunk)
                 total += chunk.uncompressed_size
-            if group:
-                yield blocks_of(self._unpacked(group), wanted, self._limits)
+            yield blocks_of(self._unpacked(group), wanted, self._limits)
 
     def _ids(self, topics: Collection[str]) -> dict[str, int]:
         """topic -> number of its channel, -1 where there is none."""

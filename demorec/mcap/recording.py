@@ -1,71 +1,216 @@
-"""A recording as the sequence of its frames, at home in notebooks."""
+"""A recording: numbers as columns, images as packets or decoded, and the sequence of its frames."""
 
 from __future__ import annotations
 
-import base64
-import dataclasses
-import html
-import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+import hashlib
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from types import MappingProxyType
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from demorec.core.errors import MissingDependencyError, NotSimulatedError
-from demorec.core.text import printable
-from demorec.episode.episode import CameraImages, Columns, Event, Frame, JointSample
-from demorec.episode.sensed import STREAMS
-from demorec.mcap.reader import RecordingReader
-from demorec.mcap.streams import action_at, observation_at, pose_of
+from demorec.core.errors import NotSimulatedError, RecordingError
+from demorec.core.plain import to_json
+from demorec.episode.episode import NO_IMAGE, Columns, Event, Frame, JointSample
+from demorec.mcap import channels, messages, notebook
+from demorec.mcap.chunks import Block
+from demorec.mcap.container import damage_as_recording_error
+from demorec.mcap.episode_file import EpisodeFile
+from demorec.mcap.frames import Said, decoded_images, frame_times, frames_of, images_at, read_columns
+from demorec.mcap.lossless import LabelDecoder, from_labels
+from demorec.mcap.streams import SUBTASK, frame_streams
+from demorec.mcap.video import Rgb, is_keyframe
+from demorec.robots.urdf import check_primitives
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-class Recording(RecordingReader):
-    """Context manager over one recording, and the sequence of its frames.
+class Recording(EpisodeFile):
+    """Context manager over one recording, and the sequence of its frames; one chunk is in memory at a time.
 
     `for frame in recording` gives numbers and images together, `recording[120]`, `recording[-1]` and
     `recording[::30]` any of them; `columns` gives all numbers at once, which is much faster where images are not
     needed. Frames are those of a simulation: asking another episode for them raises NotSimulatedError.
+
+    Attributes:
+        path: Of the file.
+        info: What was known before the first frame.
+        outcome: How the episode ended; None when a crash cut it off (`is_recovered`).
+        num_frames: Length.
+
+    Raises:
+        RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
+        NotSimulatedError: A method was asked for what only a simulated episode has.
     """
 
-    def __len__(self) -> int:
-        return self.num_frames
+    _said: Said | None = None
+    """Messages of all events, once `columns` has come by them: they lie among the numbers in the file."""
+    _packed_labels: Mapping[str, Block] = MappingProxyType({})
+    """topic -> segmentation images and the names in them, once `coded_images` has come by them."""
 
-    def __iter__(self) -> Iterator[Frame]:
-        return _frames_with_images(self)
-
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self[number] for number in range(self.num_frames)[index]]
-        columns, frames = self._numbers
-        frame = frames[index]
-        return dataclasses.replace(frame, images=_images_at(self, columns, frame.frame_index))
+    def columns(self) -> Columns:
+        """All numbers, one row a frame, bit-exact as they were written, and which images the frames hold."""
+        return self._columns
 
     @cached_property
-    def _numbers(self) -> tuple[Columns, list[Frame]]:
-        """All numbers, kept from the first frame on that is asked for."""
-        columns = self.columns()
-        return columns, list(frames_of(self, columns))
+    def _columns(self) -> Columns:
+        """Read once: an export and a check look at them from several sides."""
+        topics = {name: self._image_topic(name) for name, _ in self._cameras_in_order}
+        columns, self._said = read_columns(self._container, self.info, self.num_frames, topics)
+        return columns
 
-    def __repr__(self) -> str:
-        return f"Recording({str(self.path)!r}: {_described(self)})"
+    @cached_property
+    def subtasks(self) -> tuple[tuple[int, str], ...]:
+        """(frame, what is begun there), in order, as the source states it; empty where nobody said any."""
+        found = []
+        for time_ns, text in self._read(SUBTASK, messages.read_string):
+            frame = int(np.searchsorted(self._columns.time_ns, time_ns))
+            if frame == self.num_frames or self._columns.time_ns[frame] != time_ns:
+                raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
+            found.append((frame, text))
+        return tuple(found)
 
-    def _repr_html_(self) -> str:
-        return _html_page(self)
+    def _image_topic(self, camera: str) -> str:
+        return channels.video_topic(camera, self.video_settings(camera).codec)
+
+    def description(self, body: str = "") -> str:
+        """URDF of the robot, or of the body of that name: primitives only, complete without any other file."""
+        topic = channels.description_topic(body)
+        for _, text in self._read(topic, messages.read_string):
+            with damage_as_recording_error(self.path):
+                check_primitives(text)
+            return text
+        raise RecordingError(f"The recording has no description on {topic}: {self.path}")
+
+    def joint_samples(self) -> Iterator[JointSample]:
+        """Every recorded joint state in order of time: the frames' own and those between them."""
+        assert self.info.robot, "else NotSimulatedError"
+        stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
+        read = self._read(channels.JOINT_STATES, lambda data: stream.layout.decode([data]).reshape(3, -1))
+        for time_ns, (position, velocity, effort) in read:
+            yield JointSample(time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort)
+
+    def events(self) -> Iterator[tuple[int, Event]]:
+        """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
+        for time_ns, data in self._read(channels.EVENTS, bytes) if self._said is None else self._said:
+            with damage_as_recording_error(self.path):
+                event = messages.read_log(data)
+            if event.name != channels.PHASE_EVENT:
+                yield time_ns, event
+
+    def coded_images(self, cameras: Sequence[str]) -> dict[str, Block]:
+        """camera -> all its encoded images, read in one pass; they are in memory together."""
+        topics = {camera: self._image_topic(camera) for camera in cameras}
+        labels = [self._segmentation_topic(camera) for camera in cameras if self.has_segmentation(camera)]
+        labels += [channels.LABELS] if labels else []
+        found = self._container.blocks((*topics.values(), *labels))
+        self._packed_labels = {topic: found[topic] for topic in labels}
+        images = {}
+        for camera, topic in topics.items():
+            times = frame_times(self.num_frames, self.info.fps)
+            if self.info.simulation is not None and not np.array_equal(found[topic].time_ns, times):
+                raise self._wrong_times(topic)
+            with damage_as_recording_error(self.path):
+                images[camera] = messages.coded_images(found[topic], self.video_settings(camera).codec)
+        return images
+
+    def keyframes(self, camera: str) -> NDArray[np.int64]:
+        """Numbers of the images of a camera that are decoded without others; its images are in memory together."""
+        codec = self.video_settings(camera).codec
+        return np.flatnonzero([is_keyframe(codec, image) for image in self.coded_images([camera])[camera].messages()])
+
+    def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
+        """Segmentation images, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
+        topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
+        for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
+            yield labels
+
+    def segmentation_at(
+        self, cameras: Sequence[str], frames: Collection[int]
+    ) -> Iterator[tuple[str, int, NDArray[np.uint16]]]:
+        """(camera, frame, (H, W) labels) of some frames, read in one pass; the other images stay packed.
+
+        Labels are what `segment_labels` tells, less to compute than the values of `segmentation`.
+
+        Those of one camera come in the order of its frames; how those of several cameras alternate is not said.
+        """
+        topics = {camera: self._segmentation_topic(camera) for camera in cameras}
+        decoders = {camera: LabelDecoder(self._size(camera)) for camera in cameras}
+        times, counts = frame_times(self.num_frames, self.info.fps), dict.fromkeys(cameras, 0)
+        is_read = self._packed_labels.keys() >= set(topics.values())
+        for blocks in [self._packed_labels] if is_read else self._container.blocks_by_chunk(topics.values()):
+            for camera, topic in topics.items():
+                block, first = blocks[topic], counts[camera]
+                counts[camera] += len(block)
+                if not np.array_equal(block.time_ns, times[first : counts[camera]]):
+                    raise self._wrong_times(topic)
+                chosen = np.array([index for index in range(len(block)) if first + index in frames], dtype=np.intp)
+                for index, message in zip(chosen.tolist(), block.select(chosen).messages(), strict=True):
+                    with damage_as_recording_error(self.path):
+                        labels = decoders[camera].labels(messages.read_compressed_image(message))
+                    yield camera, first + index, labels
+        for camera, count in counts.items():
+            if count != self.num_frames:
+                raise self._wrong_times(topics[camera])
+
+    def _segmentation_topic(self, camera: str) -> str:
+        if not self.has_segmentation(camera):
+            raise RecordingError(f"The recording has no segmentation images of the camera {camera!r}: {self.path}")
+        return channels.camera_topic(camera, "segmentation")
+
+    def segment_names(self) -> dict[int, str]:
+        """Segmentation value -> name of the body, or ROBOT/LINK; empty when no segmentation was recorded."""
+        labels = self.segment_labels()
+        values = from_labels(np.array(list(labels), dtype=np.uint16)).tolist()
+        return dict(zip(values, labels.values(), strict=True))
+
+    def segment_labels(self) -> dict[int, str]:
+        """Label in the files -> name, as of `segment_names`."""
+        if packed := self._packed_labels.get(channels.LABELS):
+            with damage_as_recording_error(self.path):
+                return messages.read_label_info(next(packed.messages()))
+        for _, names in self._read(channels.LABELS, messages.read_label_info):
+            return names
+        return {}
+
+    def _shown(self, camera: str) -> NDArray[np.int64]:
+        """(T,) number of the image of a camera that each frame holds."""
+        self._camera(camera)
+        return self.columns().images[camera] if self.info.simulation is None else np.arange(self.num_frames)
+
+    def image(self, camera: str, frame: int) -> Rgb | None:
+        """The decoded image that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
+
+        It is decoded from the keyframe before it on.
+
+        Raises:
+            IndexError: There is no such frame; negative ones count from the end.
+        """
+        number = int(self._shown(camera)[range(self.num_frames)[frame]])
+        return None if number == NO_IMAGE else self.numbered_image(camera, number)
+
+    def num_images(self, camera: str) -> int:
+        """How many images there are of a camera."""
+        return self._container.counts.get(self._image_topic(camera), 0)
+
+    def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
+        """What some frames, in rising order, show of a camera that has images, (H, W, 3) uint8 RGB; in one pass.
+
+        A frame without an image shows the last one before it, or else the first.
+        """
+        held = np.maximum(np.maximum.accumulate(self._shown(camera)), 0)
+        return self._images(camera, held[list(frames)].tolist())
+
+    def calibration(self, camera: str) -> messages.Calibration:
+        """What the calibration message of a camera says, which is what other programs go by."""
+        for _, found in self._read(channels.camera_topic(camera, "camera_info"), messages.read_camera_info):
+            return found
+        raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
 
     def to_pandas(self) -> pd.DataFrame:
         """All numbers as a table, one row a frame, bit-exact float64; the index is `frame_index`.
@@ -79,177 +224,93 @@ class Recording(RecordingReader):
         Raises:
             MissingDependencyError: pandas is not installed.
         """
-        try:
-            import pandas as pd
-        except ImportError as error:
-            raise MissingDependencyError("A table of the frames", "pandas", "pip install pandas") from error
+        return notebook.table_of(self.info, self.columns())
+
+    def __len__(self) -> int:
+        return self.num_frames
+
+    def __iter__(self) -> Iterator[Frame]:
         columns = self.columns()
-        table: dict[str, Any] = {"time_ns": columns.time_ns}
-        for feature in self.info.features:
-            table |= _components(feature.name, columns.features[feature.name], feature.names)
-        if self.info.simulation is not None:
-            table |= self._simulated_table(columns)
-        return pd.DataFrame(table, index=pd.RangeIndex(columns.num_frames, name="frame_index"))
+        for frame, images in zip(frames_of(self, columns), decoded_images(self, columns), strict=True):
+            yield replace(frame, images=images)
 
-    def _simulated_table(self, columns: Columns) -> dict[str, Any]:
-        table: dict[str, Any] = {"phase": columns.phase}
-        joints, arm = self.info.robot.joint_names, self.info.robot.arm_joints
-        for name in ("joint_position", "joint_velocity", "joint_effort"):
-            table |= _components(name, getattr(columns, name), joints)
-        table |= {"gripper_width": columns.gripper_width, "contact_force": columns.contact_force}
-        for name, values in columns.sensed.items():
-            table |= _components(name, values, STREAMS[name][1].components(self.info.robot))
-        table |= _components("base_from_tcp", columns.base_from_tcp, _POSE)
-        for kind in ("action", "command"):
-            table |= _components(f"{kind}_joint_target", getattr(columns, f"{kind}_joint_target"), arm)
-            table[f"{kind}_gripper"] = getattr(columns, f"{kind}_gripper")
-            table |= _components(f"{kind}_base_from_tcp", getattr(columns, f"{kind}_base_from_tcp"), _POSE)
-        for group in ("object_poses", "world_from_camera"):
-            poses: Mapping[str, NDArray[np.float64]] = getattr(columns, group)
-            for name, rows in poses.items():
-                table |= _components(f"{group}.{name}", rows, _POSE)
-        return {**table, "is_deliberate_miss": columns.is_deliberate_miss}
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        if isinstance(index, slice):
+            return [self[number] for number in range(self.num_frames)[index]]
+        frame = self._frames[index]
+        return replace(frame, images=images_at(self, self._columns, frame.frame_index))
+
+    @cached_property
+    def _frames(self) -> list[Frame]:
+        """All frames without images, kept from the first on that is asked for."""
+        return list(frames_of(self))
+
+    def __repr__(self) -> str:
+        return f"Recording({str(self.path)!r}: {notebook.line_of(self)})"
+
+    def _repr_html_(self) -> str:
+        return notebook.page_of(self)
+
+    def digest(self) -> str:
+        """SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.
+
+        Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold bit for bit
+        the same episode. A column that the format version does not have is not part of it, so that recordings of
+        older versions keep their digests.
+        """
+        result = self._digest_of_description()
+        columns = self.columns()
+        if self.info.simulation is None:
+            result.update(columns.time_ns.tobytes())
+            for mapping in (columns.features, columns.stamps, columns.images, columns.image_stamps):
+                for name in sorted(mapping):
+                    result.update(name.encode() + mapping[name].tobytes())
+            for frame, text in self.subtasks:
+                result.update(f"subtask {frame} {text}".encode())
+            for camera in self.info.cameras:
+                for packet in self.packets(camera.name):
+                    result.update(hashlib.sha256(packet.data).digest())
+            return result.hexdigest()
+        for name, value in _column_bytes(columns):
+            result.update(name.encode() + value)
+        for sample in self.joint_samples():
+            result.update(sample.time_ns.to_bytes(8, "little"))
+            for vector in (sample.joint_position, sample.joint_velocity, sample.joint_effort):
+                result.update(vector.tobytes())
+        for time_ns, event in self.events():
+            result.update(f"{time_ns} {to_json(event)}".encode())
+        for name in self.cameras:
+            result.update(name.encode())
+            for packet in self.packets(name):
+                result.update(hashlib.sha256(packet.data).digest())
+            for depth in self.depth(name) if self.has_depth(name) else ():
+                result.update(depth.tobytes())
+            for labels in self.segmentation(name) if self.has_segmentation(name) else ():
+                result.update(labels.tobytes())
+        return result.hexdigest()
 
 
-def frames_of(recording: RecordingReader, columns: Columns | None = None) -> Iterator[Frame]:
-    """Every frame without its images: numbers, phase, events, and the joint samples before it.
-
-    Args:
-        recording: An open recording.
-        columns: Its columns, where the caller has read (or changed) them already.
-    """
-    columns = recording.columns() if columns is None else columns
-    times = columns.time_ns.tolist()
-    events: dict[int, list[Event]] = {}
-    for time_ns, event in recording.events():
-        frame = max(int(np.searchsorted(columns.time_ns, time_ns, side="right")) - 1, 0)
-        events.setdefault(frame, []).append(event)
-    samples = _samples_before_frames(recording, times)
-    for index, time_ns in enumerate(times):
-        yield Frame(
-            frame_index=index,
-            time_ns=time_ns,
-            observation=observation_at(columns, index),
-            action=action_at(columns, index, "action"),
-            command=action_at(columns, index, "command"),
-            phase=columns.phase[index],
-            events=tuple(events.get(index, ())),
-            joint_samples=samples.get(index, ()),
-            is_deliberate_miss=bool(columns.is_deliberate_miss[index]),
-        )
+_NOT_RECORDED = ("features", "stamps", "images", "image_stamps")
+"""Columns that are the same of every simulated episode, and no part of its digest."""
 
 
-def _samples_before_frames(recording: RecordingReader, times: list[int]) -> dict[int, tuple[JointSample, ...]]:
-    number = {time_ns: index for index, time_ns in enumerate(times)}
-    result: dict[int, tuple[JointSample, ...]] = {}
-    waiting: list[JointSample] = []
-    for sample in recording.joint_samples():
-        if sample.time_ns in number:
-            if waiting:
-                result[number[sample.time_ns]] = tuple(waiting)
-            waiting = []
+def _column_bytes(columns: Columns) -> Iterator[tuple[str, bytes]]:
+    """Name and bytes of every column that was recorded."""
+    for field in fields(columns):
+        if field.name in _NOT_RECORDED:
+            continue
+        value = getattr(columns, field.name)
+        if isinstance(value, Mapping):
+            for key in sorted(value):
+                yield key if field.name == "sensed" else f"{field.name}/{key}", value[key].tobytes()
         else:
-            waiting.append(sample)
-    return result
-
-
-def decoded_images(recording: RecordingReader, columns: Columns) -> Iterator[Mapping[str, CameraImages]]:
-    """The recorded images of every frame, decoded (so not those that were encoded), with the recorded camera poses."""
-    streams = {
-        name: (
-            recording.images(name),
-            recording.depth(name) if recording.has_depth(name) else None,
-            recording.segmentation(name) if recording.has_segmentation(name) else None,
-        )
-        for name in recording.cameras
-    }
-    for index in range(columns.num_frames):
-        yield {
-            name: CameraImages(
-                color=next(color),
-                depth=None if depth is None else next(depth),
-                segmentation=None if labels is None else next(labels),
-                world_from_camera=pose_of(columns.world_from_camera[name][index]),
-            )
-            for name, (color, depth, labels) in streams.items()
-        }
-
-
-def _frames_with_images(recording: RecordingReader) -> Iterator[Frame]:
-    """Every frame with its decoded images, one after the other: a few images are in memory at a time."""
-    columns = recording.columns()
-    for frame, images in zip(frames_of(recording, columns), decoded_images(recording, columns), strict=True):
-        yield replace(frame, images=images)
-
-
-def _images_at(recording: RecordingReader, columns: Columns, frame: int) -> Mapping[str, CameraImages]:
-    """The images of one frame; only those from the keyframe before it on are decoded."""
-
-    def at[P](images: Callable[[str], Iterator[P]], camera: str) -> P:
-        return next(islice(images(camera), frame, None))
-
-    return {
-        name: CameraImages(
-            color=next(recording.images_at(name, [frame])),
-            depth=at(recording.depth, name) if recording.has_depth(name) else None,
-            segmentation=at(recording.segmentation, name) if recording.has_segmentation(name) else None,
-            world_from_camera=pose_of(columns.world_from_camera[name][frame]),
-        )
-        for name in recording.cameras
-    }
-
-
-_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_MOMENTS, _IMAGE_HEIGHT = 5, 120
-_OUTCOMES = {True: "success", None: "unknown"}
-
-
-def _described(recording: RecordingReader) -> str:
-    """The facts about a recording in one line, without control characters."""
-    return printable(", ".join(f"{name} {value}" if name else value for name, value in _facts(recording)))
-
-
-def _facts(recording: RecordingReader) -> Iterator[tuple[str, str]]:
-    info, outcome = recording.info, recording.outcome
-    yield "", f"{recording.num_frames} frames ({recording.num_frames / info.fps:.1f} s at {info.fps} Hz)"
-    task = info.instruction if info.simulation is None else info.task
-    yield "task", f"{task} with {info.robot_name}"
-    yield "episode", f"{info.episode_index}, attempt {info.attempt}"
-    if outcome is None:
-        yield "outcome", "unknown: recovered after a crash"
-    else:
-        phase = f" in phase {outcome.failure_phase}" if outcome.failure_phase else ""
-        yield "outcome", _OUTCOMES.get(outcome.success) or f"{outcome.failure_reason}{phase}"
-    yield "cameras", " and ".join(recording.cameras) or "none"
-
-
-def _html_page(recording: RecordingReader) -> str:
-    """The facts, and images of every camera from the first to the last frame, as one piece of HTML."""
-    facts = (("instruction", recording.info.instruction), *_facts(recording), ("file", str(recording.path)))
-    rows = [
-        f"<tr><th>{html.escape(printable(name or 'length'))}</th>"
-        f"<td style='text-align: left'>{html.escape(printable(value))}</td></tr>"
-        for name, value in facts
-    ]
-    moments = np.linspace(0, recording.num_frames - 1, _MOMENTS).round().astype(int).tolist()
-    for camera in (name for name in recording.cameras if recording.num_frames and recording.num_images(name)):
-        images = "".join(map(_image, recording.images_at(camera, moments)))
-        rows.append(f"<tr><th>{html.escape(printable(camera))}</th><td style='text-align: left'>{images}</td></tr>")
-    return f"<table>{''.join(rows)}</table>"
-
-
-def _image(pixels: NDArray[np.uint8]) -> str:
-    buffer = io.BytesIO()
-    image = Image.fromarray(pixels)
-    image.thumbnail((4 * _IMAGE_HEIGHT, _IMAGE_HEIGHT))
-    image.save(buffer, format="JPEG", quality=85)
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return f"<img style='display: inline' src='data:image/jpeg;base64,{data}'>"
-
-
-def _components(name: str, rows: NDArray[np.float64], parts: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """The columns of (T, D) rows, named by their components."""
-    return {f"{name}.{part}": rows[:, number] for number, part in enumerate(parts)}
+            yield field.name, value.tobytes() if isinstance(value, np.ndarray) else "\n".join(value).encode()
 
 
 def open_recording(path: str | Path, *, simulated: bool = False) -> Recording:

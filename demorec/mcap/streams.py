@@ -13,17 +13,17 @@ there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import NO_IMAGE, Action, Columns, Frame, Observation, SampledFrame
+from demorec.episode.episode import NO_IMAGE, Action, Frame, Observation, SampledFrame
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.episode.sensed import STREAMS, Sensed, Stream
 from demorec.mcap import messages
@@ -135,51 +135,6 @@ def _moving_frames(tree: FrameTree | None, *, is_simulated: bool) -> Iterator[Fr
             rows=lambda frames: tree.arrange(gathered(frames) if is_simulated else tree.parts_of_samples(frames)),
             columns=lambda values: {},
         )
-
-
-def merged_columns(found: Iterable[ColumnArrays]) -> dict[str, Any]:
-    """The columns of several streams as arguments of `Columns`; the mappings are there even when empty."""
-    merged: dict[str, Any] = {
-        name: {} for name in ("sensed", "object_poses", "world_from_camera", "features", "stamps", "images")
-    }
-    for columns in found:
-        for name, rows in columns.items():
-            if isinstance(rows, Mapping):
-                merged[name].update(rows)
-            else:
-                merged[name] = rows
-    return merged
-
-
-# --------------------------------------------------------------------------- columns back into one frame's values
-
-
-def observation_at(columns: Columns, frame: int) -> Observation:
-    """The observation of a frame, bit-exact."""
-    return Observation(
-        joint_position=columns.joint_position[frame].copy(),
-        joint_velocity=columns.joint_velocity[frame].copy(),
-        joint_effort=columns.joint_effort[frame].copy(),
-        gripper_width=float(columns.gripper_width[frame]),
-        base_from_tcp=pose_of(columns.base_from_tcp[frame]),
-        object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
-        contact_force=float(columns.contact_force[frame]),
-        sensed={name: values[frame].copy() for name, values in columns.sensed.items()},
-    )
-
-
-def action_at(columns: Columns, frame: int, kind: Literal["action", "command"]) -> Action:
-    """What the expert wanted at a frame, or the command that was sent to the motors."""
-    return Action(
-        joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),
-        gripper_target=float(getattr(columns, f"{kind}_gripper")[frame]),
-        base_from_tcp_target=pose_of(getattr(columns, f"{kind}_base_from_tcp")[frame]),
-    )
-
-
-def pose_of(row: Array) -> Pose:
-    """The pose of a row (7,): position, quaternion xyzw."""
-    return Pose(position=row[:3], quat_xyzw=row[3:])
 
 
 # ------------------------------------------------------------------------------------ what the rows are made of

@@ -24,8 +24,7 @@ from demorec.episode.features import ACTION, STATE, ActionKind
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Physics, RobotPlacement, Scene
 from demorec.mcap import Recording, open_recording
-from demorec.mcap.recording import frames_of
-from demorec.mcap.streams import action_at, observation_at
+from demorec.mcap.frames import action_at, frames_of, observation_at
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
 

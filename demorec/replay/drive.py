@@ -20,7 +20,7 @@ from demorec.episode.episode import Action, Frame, Observation, Outcome, Success
 from demorec.loop import Session, SimulatorCache, Step
 from demorec.loop.actions import ActionDecoder
 from demorec.mcap import EpisodeWriter
-from demorec.mcap.streams import pose_of
+from demorec.mcap.frames import pose_of
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import Demonstration, ReplayOptions, sensed_of
 from demorec.replay.rerender import config_as, recorded_view, view_behaviour, view_painter

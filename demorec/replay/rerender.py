@@ -27,7 +27,7 @@ from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.loop import prepare
 from demorec.mcap import EpisodeWriter, Recording, open_recording
-from demorec.mcap.recording import frames_of
+from demorec.mcap.frames import frames_of
 from demorec.render import Renderer
 from demorec.render.painter import Painter, WarmRenderer
 from demorec.render.recorded import RecordedWorld

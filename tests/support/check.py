@@ -25,8 +25,8 @@ from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepar
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
+from demorec.mcap.frames import decoded_images, frames_of
 from demorec.mcap.part_file import PartFile
-from demorec.mcap.recording import decoded_images, frames_of
 from demorec.robots.motors import Motors
 from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
 from support.mcap import metadata_of
@@ -154,7 +154,7 @@ class Spoilt:
 
     def _frame(self, frame: Frame, number: int, index: int) -> Frame:
         from demorec.episode.episode import frame_time_ns
-        from demorec.mcap.streams import pose_of
+        from demorec.mcap.frames import pose_of
 
         images = {
             name: replace(image, world_from_camera=pose_of(self.columns.world_from_camera[name][index]))

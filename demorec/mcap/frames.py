@@ -1,0 +1,228 @@
+"""The numbers of an episode: read as columns, by the streams that its recording has; and columns as frames."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice, repeat
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import RecordingError
+from demorec.core.geometry import Array, Pose
+from demorec.episode.episode import NO_IMAGE, Action, CameraImages, Columns, Event, Frame, JointSample, Observation
+from demorec.episode.info import EpisodeInfo
+from demorec.mcap import channels, messages
+from demorec.mcap.container import Container, damage_as_recording_error
+from demorec.mcap.streams import FRAMES, FrameStream, frame_streams
+
+if TYPE_CHECKING:
+    from demorec.mcap.recording import Recording
+
+_TABLE_BYTES = 1 << 20
+"""Of chunks whose numbers are taken out together: taking out takes several times as much memory as they have."""
+
+Said = list[tuple[int, bytes]]
+"""When, and what: messages that do not come at each frame."""
+_Parts = Mapping[str, list[NDArray[Any]]]
+"""Topic -> its rows, chunk by chunk."""
+
+
+def frame_times(num_frames: int, fps: int) -> NDArray[np.int64]:
+    """(T,) `frame_time_ns` of every frame."""
+    return (np.arange(num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)
+
+
+def read_columns(
+    container: Container, info: EpisodeInfo, num_frames: int, image_topics: Mapping[str, str]
+) -> tuple[Columns, Said]:
+    """The columns of an episode, and its events, which lie among the numbers in the file.
+
+    Args:
+        container: The open file.
+        info: Of the episode.
+        num_frames: T.
+        image_topics: Recorded camera -> topic of its images, in the order of `info`.
+
+    Raises:
+        RecordingError: A stream is damaged, not at the times of the frames, or a frame holds an image that is none.
+    """
+    is_simulated, streams = info.simulation is not None, frame_streams(info)
+    said: dict[str, Said] = {
+        topic: [] for topic in (channels.PHASE, channels.DELIBERATE_MISS, channels.EVENTS) if is_simulated
+    }
+    due = frame_times(num_frames, info.fps)
+    times, values = defaultdict[str, list[NDArray[Any]]](list), defaultdict[str, list[NDArray[Any]]](list)
+    with damage_as_recording_error(container.path):
+        for blocks in container.blocks_by_chunk((*(row.topic for row in streams), *said), num_bytes=_TABLE_BYTES):
+            for stream in streams:
+                block = blocks[stream.topic]
+                if is_simulated and stream.topic == channels.JOINT_STATES:  # there may be more of these between frames
+                    block = block.select(np.isin(block.time_ns, due))
+                times[stream.topic].append(block.time_ns)
+                values[stream.topic].append(stream.layout.decode_rows(block.rows(len(stream.layout.constant))))
+            for topic, found in said.items():
+                found += zip(blocks[topic].time_ns.tolist(), blocks[topic].messages(), strict=True)
+        time_ns = due if is_simulated else np.concatenate(times[FRAMES])
+        if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
+            raise RecordingError(f"The frames of the recording are not in the order of their times: {container.path}")
+        columns = {"phase": ()} | _merged(streams, times, values, time_ns, container)
+        if is_simulated:
+            columns["phase"] = tuple(_held(said[channels.PHASE], messages.read_string, time_ns, ""))
+            misses = _held(said[channels.DELIBERATE_MISS], messages.read_boolean, time_ns, False)
+            columns["is_deliberate_miss"] = np.array(misses, dtype=np.bool_)
+    if is_simulated:
+        columns["world_from_camera"] = {name: columns["world_from_camera"][name] for name in image_topics}
+        columns["images"] = dict.fromkeys(image_topics, np.arange(num_frames, dtype=np.int64))
+        columns["image_stamps"] = dict.fromkeys(image_topics, time_ns)
+    else:
+        columns["image_stamps"] = _stamps(container, image_topics)
+        for name, numbers in columns["images"].items():
+            count = len(columns["image_stamps"][name])
+            if len(numbers) and not NO_IMAGE <= int(numbers.min()) <= int(numbers.max()) < count:
+                raise RecordingError(
+                    f"A frame holds an image of the camera {name!r} that is none of its {count}: {container.path}"
+                )
+    return Columns(time_ns=time_ns, **columns), said.get(channels.EVENTS, [])
+
+
+def _merged(
+    streams: tuple[FrameStream, ...], times: _Parts, values: _Parts, time_ns: NDArray[np.int64], container: Container
+) -> dict[str, Any]:
+    """What messages become, as arguments of `Columns`; RecordingError unless each stream has one at each frame."""
+    merged: dict[str, Any] = {
+        name: {} for name in ("sensed", "object_poses", "world_from_camera", "features", "stamps", "images")
+    }
+    for stream in streams:
+        found = np.concatenate(times[stream.topic])
+        if not np.array_equal(found, time_ns):
+            raise RecordingError(
+                f"The recording has {len(found)} messages on {stream.topic} at other times than its {len(time_ns)} "
+                f"frames: {container.path}"
+            )
+        for name, rows in stream.columns(np.concatenate(values[stream.topic])).items():
+            merged[name] = merged[name] | rows if isinstance(rows, Mapping) else rows
+    return merged
+
+
+def _held[V](said: Said, read: Callable[[bytes], V], times: NDArray[np.int64], first: V) -> list[V]:
+    """The value that holds at each time, given the messages that tell its changes."""
+    values = [first, *(read(data) for _, data in said)]
+    changes = np.array([time_ns for time_ns, _ in said], dtype=np.int64)
+    numbers = np.searchsorted(np.maximum.accumulate(changes), times, side="right")
+    return [values[number] for number in numbers.tolist()]
+
+
+def _stamps(container: Container, topics: Mapping[str, str]) -> dict[str, NDArray[np.int64]]:
+    """Name -> (N,) of the messages of its topic, one chunk of them in memory at a time: images may take gigabytes."""
+    found = defaultdict[str, list[NDArray[np.int64]]](list)
+    for blocks in container.blocks_by_chunk(topics.values()):
+        for name, topic in topics.items():
+            found[name].append(blocks[topic].time_ns)
+    return {name: np.concatenate(times) for name, times in found.items()}
+
+
+# ------------------------------------------------------------------------------------------------ columns as frames
+
+
+def pose_of(row: Array) -> Pose:
+    """The pose of a row (7,): position, quaternion xyzw."""
+    return Pose(position=row[:3], quat_xyzw=row[3:])
+
+
+def action_at(columns: Columns, frame: int, kind: Literal["action", "command"]) -> Action:
+    """What the expert wanted at a frame, or the command that was sent to the motors."""
+    return Action(
+        joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),
+        gripper_target=float(getattr(columns, f"{kind}_gripper")[frame]),
+        base_from_tcp_target=pose_of(getattr(columns, f"{kind}_base_from_tcp")[frame]),
+    )
+
+
+def frames_of(recording: Recording, columns: Columns | None = None) -> Iterator[Frame]:
+    """Every frame without its images, bit-exact: numbers, phase, events, and the joint samples before it.
+
+    Args:
+        recording: An open recording.
+        columns: Its columns, where the caller has read (or changed) them already.
+    """
+    columns = recording.columns() if columns is None else columns
+    times = columns.time_ns.tolist()
+    events: dict[int, list[Event]] = {}
+    for time_ns, event in recording.events():
+        frame = max(int(np.searchsorted(columns.time_ns, time_ns, side="right")) - 1, 0)
+        events.setdefault(frame, []).append(event)
+    samples = _samples_before_frames(recording, times)
+    for index, time_ns in enumerate(times):
+        yield Frame(
+            frame_index=index,
+            time_ns=time_ns,
+            observation=Observation(
+                joint_position=columns.joint_position[index].copy(),
+                joint_velocity=columns.joint_velocity[index].copy(),
+                joint_effort=columns.joint_effort[index].copy(),
+                gripper_width=float(columns.gripper_width[index]),
+                base_from_tcp=pose_of(columns.base_from_tcp[index]),
+                object_poses={name: pose_of(rows[index]) for name, rows in columns.object_poses.items()},
+                contact_force=float(columns.contact_force[index]),
+                sensed={name: values[index].copy() for name, values in columns.sensed.items()},
+            ),
+            action=action_at(columns, index, "action"),
+            command=action_at(columns, index, "command"),
+            phase=columns.phase[index],
+            events=tuple(events.get(index, ())),
+            joint_samples=samples.get(index, ()),
+            is_deliberate_miss=bool(columns.is_deliberate_miss[index]),
+        )
+
+
+def _samples_before_frames(recording: Recording, times: list[int]) -> dict[int, tuple[JointSample, ...]]:
+    number = {time_ns: index for index, time_ns in enumerate(times)}
+    result: dict[int, tuple[JointSample, ...]] = {}
+    waiting: list[JointSample] = []
+    for sample in recording.joint_samples():
+        if sample.time_ns in number:
+            if waiting:
+                result[number[sample.time_ns]] = tuple(waiting)
+            waiting = []
+        else:
+            waiting.append(sample)
+    return result
+
+
+def decoded_images(recording: Recording, columns: Columns) -> Iterator[Mapping[str, CameraImages]]:
+    """The recorded images of every frame, decoded (so not those that were encoded), with the recorded camera poses."""
+    return _images_from(recording, columns, 0, {name: recording.images(name) for name in recording.cameras})
+
+
+def images_at(recording: Recording, columns: Columns, frame: int) -> Mapping[str, CameraImages]:
+    """The images of one frame; only those from the keyframe before it on are decoded."""
+    colors = {name: recording.images_at(name, [frame]) for name in recording.cameras}
+    return next(_images_from(recording, columns, frame, colors))
+
+
+def _images_from(
+    recording: Recording, columns: Columns, first: int, colors: Mapping[str, Iterator[NDArray[np.uint8]]]
+) -> Iterator[Mapping[str, CameraImages]]:
+    """The images of a frame and of those after it, given the colours from that frame on."""
+    nothing: Iterator[None] = repeat(None)
+    streams = {
+        name: (
+            color,
+            islice(recording.depth(name), first, None) if recording.has_depth(name) else nothing,
+            islice(recording.segmentation(name), first, None) if recording.has_segmentation(name) else nothing,
+        )
+        for name, color in colors.items()
+    }
+    for index in range(first, columns.num_frames):
+        yield {
+            name: CameraImages(
+                color=next(color),
+                depth=next(depth),
+                segmentation=next(labels),
+                world_from_camera=pose_of(columns.world_from_camera[name][index]),
+            )
+            for name, (color, depth, labels) in streams.items()
+        }

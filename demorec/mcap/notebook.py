@@ -1,0 +1,109 @@
+"""A recording in notebooks: its facts in a line or on a page, its numbers as a table."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.core.errors import MissingDependencyError
+from demorec.core.text import printable
+from demorec.episode.episode import Columns
+from demorec.episode.info import EpisodeInfo
+from demorec.episode.sensed import STREAMS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from demorec.mcap.recording import Recording
+
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_MOMENTS, _IMAGE_HEIGHT = 5, 120
+_OUTCOMES = {True: "success", None: "unknown"}
+
+
+def line_of(recording: Recording) -> str:
+    """The facts about a recording in one line, without control characters."""
+    return printable(", ".join(f"{name} {value}" if name else value for name, value in _facts(recording)))
+
+
+def page_of(recording: Recording) -> str:
+    """The facts, and images of every camera from the first to the last frame, as one piece of HTML."""
+    facts = (("instruction", recording.info.instruction), *_facts(recording), ("file", str(recording.path)))
+    rows = [(name or "length", html.escape(printable(value))) for name, value in facts]
+    moments = np.linspace(0, recording.num_frames - 1, _MOMENTS).round().astype(int).tolist()
+    for camera in (name for name in recording.cameras if recording.num_frames and recording.num_images(name)):
+        rows.append((camera, "".join(map(_image, recording.images_at(camera, moments)))))
+    cells = (
+        f"<tr><th>{html.escape(printable(name))}</th><td style='text-align: left'>{cell}</td></tr>"
+        for name, cell in rows
+    )
+    return f"<table>{''.join(cells)}</table>"
+
+
+def _facts(recording: Recording) -> Iterator[tuple[str, str]]:
+    info, outcome = recording.info, recording.outcome
+    yield "", f"{recording.num_frames} frames ({recording.num_frames / info.fps:.1f} s at {info.fps} Hz)"
+    task = info.instruction if info.simulation is None else info.task
+    yield "task", f"{task} with {info.robot_name}"
+    yield "episode", f"{info.episode_index}, attempt {info.attempt}"
+    if outcome is None:
+        yield "outcome", "unknown: recovered after a crash"
+    else:
+        phase = f" in phase {outcome.failure_phase}" if outcome.failure_phase else ""
+        yield "outcome", _OUTCOMES.get(outcome.success) or f"{outcome.failure_reason}{phase}"
+    yield "cameras", " and ".join(recording.cameras) or "none"
+
+
+def _image(pixels: NDArray[np.uint8]) -> str:
+    buffer = io.BytesIO()
+    image = Image.fromarray(pixels)
+    image.thumbnail((4 * _IMAGE_HEIGHT, _IMAGE_HEIGHT))
+    image.save(buffer, format="JPEG", quality=85)
+    data = base64.b64encode(buffer.getvalue()).decode()
+    return f"<img style='display: inline' src='data:image/jpeg;base64,{data}'>"
+
+
+def table_of(info: EpisodeInfo, columns: Columns) -> pd.DataFrame:
+    """The table of `Recording.to_pandas`."""
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise MissingDependencyError("A table of the frames", "pandas", "pip install pandas") from error
+    table: dict[str, Any] = {"time_ns": columns.time_ns}
+    for feature in info.features:
+        table |= _components(feature.name, columns.features[feature.name], feature.names)
+    if info.simulation is not None:
+        table |= _simulated_table(info, columns)
+    return pd.DataFrame(table, index=pd.RangeIndex(columns.num_frames, name="frame_index"))
+
+
+def _simulated_table(info: EpisodeInfo, columns: Columns) -> dict[str, Any]:
+    table: dict[str, Any] = {"phase": columns.phase}
+    joints, arm = info.robot.joint_names, info.robot.arm_joints
+    for name in ("joint_position", "joint_velocity", "joint_effort"):
+        table |= _components(name, getattr(columns, name), joints)
+    table |= {"gripper_width": columns.gripper_width, "contact_force": columns.contact_force}
+    for name, values in columns.sensed.items():
+        table |= _components(name, values, STREAMS[name][1].components(info.robot))
+    table |= _components("base_from_tcp", columns.base_from_tcp, _POSE)
+    for kind in ("action", "command"):
+        table |= _components(f"{kind}_joint_target", getattr(columns, f"{kind}_joint_target"), arm)
+        table[f"{kind}_gripper"] = getattr(columns, f"{kind}_gripper")
+        table |= _components(f"{kind}_base_from_tcp", getattr(columns, f"{kind}_base_from_tcp"), _POSE)
+    for group in ("object_poses", "world_from_camera"):
+        poses: Mapping[str, NDArray[np.float64]] = getattr(columns, group)
+        for name, rows in poses.items():
+            table |= _components(f"{group}.{name}", rows, _POSE)
+    return {**table, "is_deliberate_miss": columns.is_deliberate_miss}
+
+
+def _components(name: str, rows: NDArray[np.float64], parts: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """The columns of (T, D) rows, named by their components."""
+    return {f"{name}.{part}": rows[:, number] for number, part in enumerate(parts)}
