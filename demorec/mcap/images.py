@@ -116,9 +116,7 @@ class CameraWriter:
             self._encoder = make_encoder(video, camera.width, camera.height, fps)
             settings = self._encoder.settings
         self.streams = CameraStreams(video=settings, **dict.fromkeys(beside, True))
-        self._codec, self._frame_id = settings.codec, camera_frame(camera.name)
-        self._layout = messages.ImageMessages(self._frame_id, DEPTH_FORMAT if self._codec == "16UC1" else self._codec)
-        self._layouts = {kind: messages.ImageMessages(self._frame_id, form) for kind, (form, _) in _BESIDE.items()}
+        self._frame_id = camera_frame(camera.name)
         self._waiting: list[tuple[int, list[Message]]] = []
         self._packets: list[bytes] = []
         self._num_images = self.num_ready = self.num_video_bytes = self.last_ns = 0
@@ -134,7 +132,8 @@ class CameraWriter:
         others: list[Message] = []
         for kind, pixels in beside.items():
             if pixels is not None:
-                packed = self._layouts[kind].compressed_image(stamp_ns, _BESIDE[kind][1](pixels))
+                image_format, pack = _BESIDE[kind]
+                packed = messages.compressed_image(stamp_ns, self._frame_id, image_format, pack(pixels))
                 others.append((camera_topic(self.camera.name, kind), messages.COMPRESSED_IMAGE, packed))
         self._waiting.append((stamp_ns, others))
         self.last_ns = stamp_ns
@@ -161,17 +160,19 @@ class CameraWriter:
 
     def _messages(self, time_ns: int, packet: bytes) -> list[Message]:
         """Those of one image, be it of colours or of distances."""
-        camera, codec = self.camera, self._codec
+        camera, codec, frame_id = self.camera, self.streams.video.codec, self._frame_id
         topic = video_topic(camera.name, codec)
         if codec == "av1":
-            return [(topic, messages.PROTOBUF_VIDEO, messages.protobuf_video(time_ns, self._frame_id, codec, packet))]
+            return [(topic, messages.PROTOBUF_VIDEO, messages.protobuf_video(time_ns, frame_id, codec, packet))]
         if codec == "32FC1":
-            data = messages.image(time_ns, self._frame_id, codec, (camera.height, camera.width), packet)
+            data = messages.image(time_ns, frame_id, codec, (camera.height, camera.width), packet)
             return [(topic, messages.IMAGE, data)]
-        result = [(topic, messages.COMPRESSED_IMAGE, self._layout.compressed_image(time_ns, packet))]
+        image_format = DEPTH_FORMAT if codec == "16UC1" else codec
+        data = messages.compressed_image(time_ns, frame_id, image_format, packet)
+        result = [(topic, messages.COMPRESSED_IMAGE, data)]
         if codec in ("h264", "h265"):
             # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
-            again = self._layout.compressed_video(time_ns, packet)
+            again = messages.compressed_video(time_ns, frame_id, codec, packet)
             result.append((camera_topic(camera.name, "video"), messages.COMPRESSED_VIDEO, again))
         return result
 

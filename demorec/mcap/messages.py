@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -64,44 +65,32 @@ def _stamp(time_ns: int) -> tuple[int, int]:
     return divmod(time_ns, 1_000_000_000)
 
 
-class ImageMessages:
-    """sensor_msgs/CompressedImage and foxglove_msgs/CompressedVideo of one camera and format, laid out once.
-
-    Args:
-        frame_id: Coordinate frame of the camera.
-        image_format: As the type wants it.
-    """
-
-    def __init__(self, frame_id: str, image_format: str) -> None:
-        header = (_stamp(0), frame_id)
-        self._image = encode(COMPRESSED_IMAGE, header, image_format, b"")
-        self._video = encode(COMPRESSED_VIDEO, *header, b"")
-        self._format = struct.pack("<I", len(image_format) + 1) + image_format.encode() + b"\x00"
-
-    def compressed_image(self, time_ns: int, data: bytes) -> bytes:
-        """sensor_msgs/CompressedImage."""
-        return self._filled(self._image, time_ns, data)
-
-    def compressed_video(self, time_ns: int, data: bytes) -> bytes:
-        """foxglove_msgs/CompressedVideo."""
-        message = self._filled(self._video, time_ns, data)
-        return message + b"\x00" * (-len(message) % 4) + self._format
-
-    @staticmethod
-    def _filled(head: bytes, time_ns: int, data: bytes) -> bytes:
-        # Encapsulation, stamp, the constant fields, length of the data, data.
-        stamp = struct.pack("<II", *_stamp(time_ns))
-        return head[:4] + stamp + head[12:-4] + struct.pack("<I", len(data)) + data
-
-
 _U32 = struct.Struct("<I")
+_head = lru_cache(maxsize=256)(encode)
+"""The constant beginning of messages that differ in their stamp and in what comes last."""
+
+
+def _stamped(head: bytes, time_ns: int, data: bytes) -> bytes:
+    """A message from its beginning, which ends with no octets: with a stamp behind the encapsulation, and with data."""
+    return b"".join((head[:4], struct.pack("<II", *_stamp(time_ns)), head[12:-4], _U32.pack(len(data)), data))
+
+
+def compressed_image(time_ns: int, frame_id: str, image_format: str, data: bytes) -> bytes:
+    """sensor_msgs/CompressedImage."""
+    return _stamped(_head(COMPRESSED_IMAGE, (_stamp(0), frame_id), image_format, b""), time_ns, data)
+
+
+def compressed_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:
+    """foxglove_msgs/CompressedVideo."""
+    message = _stamped(_head(COMPRESSED_VIDEO, _stamp(0), frame_id, b""), time_ns, data)
+    text = video_format.encode() + b"\x00"
+    return message + b"\x00" * (-len(message) % 4) + _U32.pack(len(text)) + text
 
 
 def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], data: bytes) -> bytes:
     """sensor_msgs/Image of (height, width) pixels in little endian."""
-    height, width = size
-    head = encode(IMAGE, (_stamp(time_ns), frame_id), height, width, encoding, False, len(data) // height)
-    return head + _U32.pack(len(data)) + data
+    head = _head(IMAGE, (_stamp(0), frame_id), *size, encoding, False, len(data) // size[0], b"")
+    return _stamped(head, time_ns, data)
 
 
 def read_image(data: bytes) -> bytes:

@@ -10,7 +10,7 @@ import pytest
 
 from demorec.mcap.chunks import blocks_of
 from demorec.mcap.limits import Limits
-from demorec.mcap.messages import ImageMessages, coded_images
+from demorec.mcap.messages import coded_images, compressed_image
 
 LIMITS = Limits.of_file(1000)
 
@@ -37,8 +37,8 @@ def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> Non
 
 
 def test_images_of_several_formats_and_cut_off_ones() -> None:
-    made = [ImageMessages("a", "h264").compressed_image(0, b"one")]
-    made += [ImageMessages("a longer frame", "jpeg").compressed_image(7, b"three")]
+    made = [compressed_image(0, "a", "h264", b"one")]
+    made += [compressed_image(7, "a longer frame", "jpeg", b"three")]
     for messages in (made, made[:1] * 2):
         block = blocks_of([b"".join(message(1, 0, data) for data in messages)], {"/x": 1}, LIMITS)["/x"]
         assert list(coded_images(block, "h264").messages()) == (
