@@ -95,8 +95,7 @@ class ExportEpisode:
         self.info = info = recording.info
         if info.simulation is not None:
             self.fps = info.fps // _frame_stride(info.fps, options.fps)
-            streams = {name: row.stream for name, row in SENSED.items()}
-            sensed = [name for name, stream in streams.items() if stream is None or stream.topic in recording.topics]
+            sensed = [name for name, row in SENSED.items() if not row.topic or row.topic in recording.topics]
             on_request = (*sensed, COMMAND)
             self._sensed = [name for name in sensed if name in options.features]
             robot, scene = info.robot, info.scene

@@ -62,24 +62,6 @@ class ObservationRows:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stream:
-    """How recordings hold a quantity that has messages of its own, one a frame.
-
-    Attributes:
-        topic: Where.
-        components: Names of its elements, as tables of frames have them.
-        layout: Of its messages: "wrench" is a force and a torque on the hand, along the axes of its link
-            (geometry_msgs/WrenchStamped); "array" is any vector (std_msgs/Float64MultiArray).
-        since: The first format version that has it.
-    """
-
-    topic: str
-    components: Callable[[RobotSpec], tuple[str, ...]]
-    layout: Literal["wrench", "array"]
-    since: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class Plot:
     """A plot of some elements, those after the ones of the plot before.
 
@@ -98,21 +80,30 @@ class Plot:
 class Sensed:
     """A sensed quantity, which datasets have only when they are asked for it by name.
 
+    One with a topic has messages of its own, one a frame; the others are part of those of /joint_states or /gripper.
+
     Attributes:
         quantity: What observations and columns call it.
         meaning: In words, with units and coordinate frame.
         names: Of the D elements that datasets have: the first ones of the quantity.
         plots: Of all D elements, in order.
-        stream: None where it is part of the messages of /joint_states or /gripper.
         may_rest: Whether it stays zero as long as nothing happens to it, while the arm moves.
+        topic: Where its own messages are.
+        components: Names of their elements, as tables of frames have them.
+        layout: Of them: "wrench" is a force and a torque on the hand, along the axes of its link
+            (geometry_msgs/WrenchStamped); "array" is any vector (std_msgs/Float64MultiArray).
+        since: The first format version that has them.
     """
 
     quantity: str
     meaning: str
     names: Callable[[RobotSpec], tuple[str, ...]]
     plots: tuple[Plot, ...]
-    stream: Stream | None = None
     may_rest: bool = False
+    topic: str = ""
+    components: Callable[[RobotSpec], tuple[str, ...]] = lambda robot: ()
+    layout: Literal["wrench", "array"] = "array"
+    since: int = 1
 
     def values(self, sensed: Mapping[str, Array], robot: RobotSpec) -> Array | None:
         """(T, D) of quantities (T, ...); None where it was not sensed."""
@@ -144,20 +135,16 @@ SENSED: Mapping[str, Sensed] = {
             Plot(curves="hand force", title="force on the hand (N)", names=("x", "y", "z")),
             Plot(curves="hand torque", title="torque on the hand (N m)", names=("x", "y", "z")),
         ),
-        stream=Stream(
-            topic="/wrench",
-            components=lambda robot: ("fx", "fy", "fz", "tx", "ty", "tz"),
-            layout="wrench",
-            since=2,
-        ),
+        topic="/wrench",
+        components=lambda robot: ("fx", "fy", "fz", "tx", "ty", "tz"),
+        layout="wrench",
+        since=2,
     ),
 }
 """Feature -> what it is."""
 
-STREAMS: Mapping[str, tuple[Sensed, Stream]] = {
-    row.quantity: (row, row.stream) for row in SENSED.values() if row.stream is not None
-}
-"""Quantity -> the row of one that has messages of its own, and these."""
+STREAMS: Mapping[str, Sensed] = {row.quantity: row for row in SENSED.values() if row.topic}
+"""Quantity -> the row of one that has messages of its own."""
 
 MAY_REST = frozenset(name for feature, row in SENSED.items() if row.may_rest for name in (feature, row.quantity))
 """Features and quantities that stay zero as long as nothing happens to them."""

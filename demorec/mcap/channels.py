@@ -88,12 +88,7 @@ _VIDEO_STREAMS = {
     "16UC1": "depth",
     "32FC1": "depth",
 }
-IMAGE_STREAMS = (
-    *(stream for codec, stream in _VIDEO_STREAMS.items() if codec in ("h264", "av1", "jpeg")),
-    "depth",
-    "segmentation",
-    "histogram",
-)
+IMAGE_STREAMS = ("h264", "video", "image/compressed", "depth", "segmentation", "histogram")
 """Streams of a camera that come from its images; H.265 is only kept, in external episodes."""
 
 

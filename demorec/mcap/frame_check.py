@@ -47,9 +47,7 @@ class FrameCheck:
         self._objects = {body.name for body in info.scene.movable}
         self._cameras = {camera.name for camera in info.scene.cameras}
         self._sensed = {
-            name: (len(row.names(info.robot)),)
-            for name, (row, stream) in STREAMS.items()
-            if stream.since <= info.format_version
+            name: (len(row.names(info.robot)),) for name, row in STREAMS.items() if row.since <= info.format_version
         }
 
     def __call__(self, frame: Frame) -> None:

@@ -28,14 +28,9 @@ OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
 """Of a recording that a crash cut off."""
 _OUTCOME_KEYS: Mapping[str, Mapping[str, str]] = {
-    EPISODE: {
-        name: name
-        for name in (
-            "success", "checks", "failure_phase", "failure_reason", "num_frames", "num_retries", "final_state_digest"
-        )
-    },
+    EPISODE: {field.name: field.name for field in dataclasses.fields(Outcome) if field.name != "drops"},
     EXTERNAL: {"success": "success", "num_frames": "num_frames", "drops": "drops", "reason": "failure_reason"},
-}  # fmt: skip
+}
 """Record at the start -> key in that at the end -> field of `Outcome`."""
 _CHECKSUM = "crc32"
 
@@ -64,19 +59,20 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
 
     A URDF is not in it but a message of its own; its SHA-256 is.
     """
-    for_people = {"instruction": info.instruction, "episode_index": str(info.episode_index)}
-    streams: Mapping[str, object] = cameras
+    streams: dict[str, object] = dict(cameras)
     if info.simulation is None:
-        for_people |= {"robot": info.robot_name, "urdf_sha256": urdf_sha256(info.urdf)}
+        about = {"robot": info.robot_name, "urdf_sha256": urdf_sha256(info.urdf)}
         streams = {name: camera.video for name, camera in cameras.items()}
     else:
-        for_people |= {"task": info.task, "attempt": str(info.attempt), "root_seed": str(info.root_seed)}
+        about = {"task": info.task, "attempt": str(info.attempt), "root_seed": str(info.root_seed)}
     return sealed(
         {
-            **for_people,
+            "instruction": info.instruction,
+            "episode_index": str(info.episode_index),
+            **about,
             "format_version": str(info.format_version),
             "info": to_json(dataclasses.replace(info, urdf="")),
-            "cameras": to_json(dict(streams)),
+            "cameras": to_json(streams),
         }
     )
 

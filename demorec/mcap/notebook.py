@@ -91,7 +91,7 @@ def _simulated_table(info: EpisodeInfo, columns: Columns) -> dict[str, Any]:
         table |= _components(name, getattr(columns, name), joints)
     table |= {"gripper_width": columns.gripper_width, "contact_force": columns.contact_force}
     for name, values in columns.sensed.items():
-        table |= _components(name, values, STREAMS[name][1].components(info.robot))
+        table |= _components(name, values, STREAMS[name].components(info.robot))
     table |= _components("base_from_tcp", columns.base_from_tcp, _POSE)
     for kind in ("action", "command"):
         table |= _components(f"{kind}_joint_target", getattr(columns, f"{kind}_joint_target"), arm)

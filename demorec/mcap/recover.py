@@ -60,7 +60,6 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         raise ConfigError(f"The recovered recording needs another name than the damaged one: {source}")
     try:
         survey = _survey(source)
-        frames = survey.frames
     except RecordingError as error:
         raise RecordingError(f"{without_path(error, source)}: {source}") from error
     make_folder(target.parent)
@@ -70,14 +69,14 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     part = target.with_name(f"{target.name}.recovering")
     file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
     try:
-        file.metadata(*survey.episode)
+        file.metadata(survey.record, survey.episode)
         for item in _items(source):
             if isinstance(item, str):
                 break
             if isinstance(item, ScannedMessage):
                 channel = item.channel
                 seen[channel.topic] += 1
-                if frames.keeps(item, seen[channel.topic]) and channel.type in _KNOWN_TYPES:
+                if survey.keeps(item, seen[channel.topic]) and channel.type in _KNOWN_TYPES:
                     file.log(channel.topic, channel.type, item.data, item.log_ns, latched=channel.has_qos)
                     num_messages += 1
             elif item is None:
@@ -85,7 +84,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         if survey.outcome is not None:
             file.metadata(metadata.OUTCOME, survey.outcome)
         else:
-            file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(frames.num_frames)}))
+            file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(survey.num_frames)}))
         file.end()
         with Recording(part) as recording:
             recording.columns()  # a recovered file that cannot be read would be worse than none
@@ -95,7 +94,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         raise
     return Recovered(
         path=target,
-        num_frames=frames.num_frames,
+        num_frames=survey.num_frames,
         num_messages=num_messages,
         is_complete=survey.outcome is not None,
         reason="" if survey.outcome is not None else survey.reason,
@@ -129,33 +128,23 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
     return True  # it ended in order, before the first frame
 
 
-class _Frames(NamedTuple):
-    """What the metadata and the messages of an episode say of its frames.
+class _Survey(NamedTuple):
+    """What is whole in a file.
 
     Attributes:
+        record, episode: Name and values of the metadata that say what is recorded.
+        outcome: Those of how it ended, where all of it is there.
+        reason: Why reading stopped.
         num_frames: That all streams have in common.
         keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
     """
 
+    record: str
+    episode: dict[str, str]
+    outcome: dict[str, str] | None
+    reason: str
     num_frames: int
     keeps: Callable[[ScannedMessage, int], bool]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Survey:
-    """What is whole in a file.
-
-    Attributes:
-        episode: Name and values of the metadata that say what is recorded.
-        outcome: How it ended, where all of it is there.
-        frames: What is there of them.
-        reason: Why reading stopped.
-    """
-
-    episode: tuple[str, dict[str, str]]
-    outcome: dict[str, str] | None
-    frames: _Frames
-    reason: str
 
 
 def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
@@ -196,27 +185,29 @@ def _survey(source: Path) -> _Survey:
     for name in metadata.RECORDS:
         if name not in found:
             continue
-        frames, outcome = _frames(name, found[name], counts), found.get(metadata.OUTCOME)
+        (num_frames, keeps), outcome = _frames(name, found[name], counts), found.get(metadata.OUTCOME)
         reason = reason or "the end is missing"
-        if outcome is not None:
-            ended = metadata.read_outcome_metadata(name, outcome)
-            outcome = outcome if ended.num_frames == frames.num_frames else None
-        if frames.num_frames:
-            return _Survey(episode=(name, found[name]), outcome=outcome, frames=frames, reason=reason)
+        if outcome is not None and metadata.read_outcome_metadata(name, outcome).num_frames != num_frames:
+            outcome = None
+        if num_frames:
+            return _Survey(name, found[name], outcome, reason, num_frames, keeps)
     raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
 
 
-def _frames(record: str, episode: dict[str, str], counts: Counter[str]) -> _Frames:
+def _frames(
+    record: str, episode: dict[str, str], counts: Counter[str]
+) -> tuple[int, Callable[[ScannedMessage, int], bool]]:
+    """`num_frames` and `keeps` of a survey, by the metadata and the number of messages on each topic."""
     info, cameras, _ = metadata.read_episode_metadata(record, episode)
     topics = {stream.topic for stream in frame_streams(info)}
     if info.simulation is None:  # images come before the frames that hold them: what is there of these has its images
         num_frames = min(counts[topic] for topic in topics)
         topics.add(channels.TF)
-        return _Frames(num_frames, lambda message, count: message.channel.topic not in topics or count <= num_frames)
+        return num_frames, lambda message, count: message.channel.topic not in topics or count <= num_frames
     topics.remove(channels.JOINT_STATES)
     for camera, streams in cameras.items():
         topics.add(channels.video_topic(camera, streams.video.codec))
         topics |= {channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)}
     num_frames = min(counts[topic] for topic in topics)
     last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return _Frames(num_frames, lambda message, count: message.log_ns <= last_ns)
+    return num_frames, lambda message, count: message.log_ns <= last_ns

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import NO_IMAGE, Action, Frame, Observation, SampledFrame
 from demorec.episode.info import EpisodeInfo, Feature
-from demorec.episode.sensed import STREAMS, Sensed, Stream
+from demorec.episode.sensed import STREAMS, Sensed
 from demorec.mcap import messages
 from demorec.mcap.cdr import Layout, Slot, layout
 from demorec.mcap.channels import (
@@ -116,7 +116,7 @@ def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
     yield _pose(EE_POSE, base, "observation.base_from_tcp", "base_from_tcp")
     yield _pose(ACTION + EE_POSE, base, "action.base_from_tcp_target", "action_base_from_tcp")
     yield _pose(COMMAND + EE_POSE, base, "command.base_from_tcp_target", "command_base_from_tcp")
-    yield from (_sensed(row, stream, robot) for row, stream in STREAMS.values())
+    yield from (_sensed(row, robot) for row in STREAMS.values())
     for body in scene.movable:
         yield _pose(object_topic(body.name), WORLD, "observation.object_poses", "object_poses", body.name)
     for camera in scene.cameras:
@@ -197,20 +197,20 @@ def _joints(
     )
 
 
-def _sensed(row: Sensed, stream: Stream, robot: RobotSpec) -> FrameStream:
-    if stream.layout == "wrench":
+def _sensed(row: Sensed, robot: RobotSpec) -> FrameStream:
+    if row.layout == "wrench":
         schema, force_and_torque = messages.WRENCH, ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
         messages_layout = layout(schema, (Slot.TIME, robot.hand_link), force_and_torque)
     else:
         schema = messages.FLOAT64_ARRAY
         messages_layout = _array_layout(schema, row.names(robot))
     return FrameStream(
-        topic=stream.topic,
+        topic=row.topic,
         schema=schema,
         layout=messages_layout,
         rows=_gathered(lambda values: (values.observation.sensed[row.quantity],)),
         columns=lambda values: {"sensed": {row.quantity: values}},
-        since=stream.since,
+        since=row.since,
     )
 
 

@@ -13,8 +13,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Literal, cast
 
 import av
 import numpy as np
@@ -110,18 +111,6 @@ class VideoPacket:
     is_keyframe: bool
 
 
-class Encoder(Protocol):
-    """Codes the images of one camera, in order."""
-
-    settings: VideoSettings
-
-    def encode(self, image: Rgb) -> list[bytes]:
-        """Take one image; return the packets that are ready, oldest first."""
-
-    def finish(self) -> list[bytes]:
-        """Return the packets that were held back."""
-
-
 def size_problem(video: VideoConfig, width: int, height: int) -> str:
     """Why images of this size cannot be encoded so, and what can be done; "" when they can.
 
@@ -137,12 +126,28 @@ def size_problem(video: VideoConfig, width: int, height: int) -> str:
 
 def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
     """An encoder as configured; RecordingError when this build of FFmpeg lacks the codec."""
-    if video.codec == "jpeg":
-        return _JpegEncoder(video, width, height, fps)
-    return _StreamEncoder(video, width, height, fps)
+    return Encoder(video, width, height, fps) if video.codec == "jpeg" else _StreamEncoder(video, width, height, fps)
 
 
-class _StreamEncoder:
+class Encoder:
+    """Codes the images of one camera, in order: as JPEG files, each by itself."""
+
+    def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
+        settings = settings_of_coded(video.codec, width, height, fps)
+        self.settings = replace(settings, jpeg_quality=video.jpeg_quality)
+
+    def encode(self, image: Rgb) -> list[bytes]:
+        """Take one image; return the packets that are ready, oldest first."""
+        buffer = io.BytesIO()
+        Image.fromarray(image).save(buffer, format="JPEG", quality=self.settings.jpeg_quality, subsampling="4:2:0")
+        return [buffer.getvalue()]
+
+    def finish(self) -> list[bytes]:
+        """Return the packets that were held back."""
+        return []
+
+
+class _StreamEncoder(Encoder):
     def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
         if video.codec == "h264":
             # Keyframes at a fixed distance; no reordering, no delay. Zero latency also leaves x264's macroblock tree
@@ -209,20 +214,6 @@ def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
     return result
 
 
-class _JpegEncoder:
-    def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
-        settings = settings_of_coded("jpeg", width, height, fps)
-        self.settings = replace(settings, jpeg_quality=video.jpeg_quality)
-
-    def encode(self, image: Rgb) -> list[bytes]:
-        buffer = io.BytesIO()
-        Image.fromarray(image).save(buffer, format="JPEG", quality=self.settings.jpeg_quality, subsampling="4:2:0")
-        return [buffer.getvalue()]
-
-    def finish(self) -> list[bytes]:
-        return []
-
-
 def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
     """Decode packets in order, from a keyframe on: (H, W, 3) uint8 RGB, one a packet.
 
@@ -262,16 +253,14 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
     num_packets = num_images = 0
     reformatter = VideoReformatter()  # one for all images: a frame's own is set up anew for it, as long as it decodes
     try:
-        for packet in packets:
-            raw = av.Packet(packet.data)
-            raw.pts = num_packets
-            num_packets += 1
+        for packet in chain(packets, [None]):
+            raw = None if packet is None else av.Packet(packet.data)
+            if raw is not None:
+                raw.pts = num_packets
+                num_packets += 1
             for frame in context.decode(raw):
                 num_images += 1
                 yield cast(Rgb, reformatter.reformat(frame, format="rgb24").to_ndarray())
-        for frame in context.decode(None):
-            num_images += 1
-            yield cast(Rgb, reformatter.reformat(frame, format="rgb24").to_ndarray())
     except (av.FFmpegError, ValueError) as error:
         raise RecordingError(f"The {settings.codec} video cannot be decoded near frame {num_images}.") from error
     if num_images != num_packets:
