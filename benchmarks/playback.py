@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from demorec.view.bodies import joint_columns, log_robot, robot_model
+from demorec.mcap.transforms import MovingJoints
+from demorec.view.bodies import log_robot, robot_model
 from demorec.view.episode import PlayedEpisode
 from demorec.view.layout import episode_layout
 from demorec.view.motion import log_curves, log_ee_path, log_events, log_phases
@@ -52,15 +53,14 @@ def row_by_row(episode: PlayedEpisode, target: Path) -> None:
     info, positions = episode.info, episode.joint_position
     assert episode.base_from_tcp is not None
     urdf, _ = robot_model(info.robot.urdf, info.scene.robot.scale, episode.robot_description)
-    motions = [
-        (joint.child, *joint_columns(joint, positions[joint.name])) for joint in urdf.joints if joint.name in positions
-    ]
+    joints = MovingJoints(urdf, [*positions])
+    poses = joints.values(np.array([*positions.values()]).T)
     points = episode.base_from_tcp[:, :3]
     for frame, time_ns in enumerate(episode.time_ns):
         stream.set_time("time", duration=np.timedelta64(int(time_ns), "ns"))
         stream.set_time("frame", sequence=frame)
-        for link, translation, quaternion in motions:
-            stream.log(f"robot/{link}", rr.Transform3D(translation=translation[frame], quaternion=quaternion[frame]))
+        for (_, link), pose in zip(joints.moving, poses[frame], strict=True):
+            stream.log(f"robot/{link}", rr.Transform3D(translation=pose[:3], quaternion=pose[3:]))
         if frame:
             stream.log("ee_path", rr.LineStrips3D([points[frame - 1 : frame + 1]]))
         stream.log("phase", rr.StateChange(state=episode.phase[frame]))

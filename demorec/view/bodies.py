@@ -13,11 +13,12 @@ import trimesh
 from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, as_reason
-from demorec.core.geometry import Array, Pose, quat_multiply
+from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba, Scene, Shape, Texture
+from demorec.mcap.transforms import MovingJoints
 from demorec.render.procedural import texture_pixels
 from demorec.robots.assets import asset_path, surface_file
-from demorec.robots.urdf import Urdf, UrdfJoint
+from demorec.robots.urdf import Urdf
 from demorec.view.episode import PlayedEpisode
 from demorec.view.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, skeleton_meshes, sphere_mesh, urdf_meshes
 from demorec.view.paths import Paths, log_pose, send_poses
@@ -158,19 +159,15 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
     else:
         return
     entities = {urdf.root: f"{paths.robot}/{urdf.root}"}
-    waiting = list(urdf.joints)
-    while waiting:
-        for joint in [joint for joint in waiting if joint.parent in entities]:
-            entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
-            waiting.remove(joint)
+    for joint in urdf.depth_first():
+        entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
     log_pose(recording, entities[urdf.root], episode.world_from_base.vector())
-    for joint in urdf.joints:
-        entity = entities[joint.child]
-        if joint.kind == "fixed" or joint.name not in positions:
-            log_pose(recording, entity, joint.parent_from_joint.vector())
-        else:
-            poses = np.concatenate(joint_columns(joint, positions[joint.name]), axis=1)
-            send_poses(recording, entity, episode.time_ns, poses)
+    joints = MovingJoints(urdf, [*positions])
+    for _, child, pose in joints.static:
+        log_pose(recording, entities[child], pose.vector())
+    poses = joints.values(np.array([*positions.values()]).reshape(len(positions), episode.num_frames).T)
+    for number, (_, child) in enumerate(joints.moving):
+        send_poses(recording, entities[child], episode.time_ns, poses[:, number])
     for link, mesh in meshes.items():
         recording.log(entities[link], as_mesh3d(mesh, tint), static=True)
 
@@ -193,18 +190,6 @@ def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:
         vertex_colors=mesh.colors,
         albedo_factor=None if tint is None else list(tint),
     )
-
-
-def joint_columns(joint: UrdfJoint, position: Array) -> tuple[Array, Array]:
-    """(T, 3) and (T, 4): parent_from_child of a joint at each position (rad or m)."""
-    fixed, axis = joint.parent_from_joint, np.array(joint.axis)
-    origin = np.tile(fixed.position, (len(position), 1))
-    if joint.kind == "prismatic":
-        direction = fixed.apply(axis) - fixed.position
-        return origin + position[:, None] * direction, np.tile(fixed.quat_xyzw, (len(position), 1))
-    half = position / 2
-    turned = quat_multiply(fixed.quat_xyzw, (*joint.axis, 0.0))
-    return origin, np.sin(half)[:, None] * turned + np.cos(half)[:, None] * fixed.quat_xyzw
 
 
 @functools.lru_cache(maxsize=4)

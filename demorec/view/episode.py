@@ -144,16 +144,37 @@ class PlayedEpisode:
         return "success" if self.outcome.success else f"failure: {self.outcome.failure_reason or 'no reason given'}"
 
 
-def sensed_curves(sensed: Mapping[str, Array], robot: RobotSpec, time_ns: NDArray[np.int64]) -> dict[str, Curves]:
-    """The plots of sensed quantities (T, ...)."""
-    result = {}
+def simulated_curves(
+    robot: RobotSpec,
+    time_ns: NDArray[np.int64],
+    sensed: Mapping[str, Array],
+    *,
+    joints: Mapping[str, Array],
+    opening: Array,
+    target: Array,
+    base_from_tcp: Array,
+) -> dict[str, Curves]:
+    """The curves of a simulated episode.
+
+    Args:
+        robot: The robot.
+        time_ns: (T,) of the frames.
+        sensed: Quantity -> (T, ...), of those that were sensed.
+        joints: Name of the curves -> (T, ...) of the arm's joints, and maybe of others behind them.
+        opening, target: (T,) of the gripper: measured, and what was asked for, metres.
+        base_from_tcp: (T, 7).
+    """
+    shown = [(name, values, robot.arm_joints) for name, values in joints.items()]
     for row in SENSED.values():
         if (values := row.values(sensed, robot)) is not None:
             for plot in row.plots:
                 names = plot.names or robot.arm_joints
-                result[plot.curves] = Curves(time_ns=time_ns, values=values[:, : len(names)], names=names)
+                shown.append((plot.curves, values, names))
                 values = values[:, len(names) :]
-    return result
+    shown.append(("gripper", opening[:, None], ("opening",)))
+    shown.append(("gripper target", target[:, None], ("target",)))
+    shown.append(("ee", base_from_tcp, ("x", "y", "z")))
+    return {name: Curves(time_ns=time_ns, values=values[:, : len(names)], names=names) for name, values, names in shown}
 
 
 def timed[Image](time_ns: NDArray[np.int64], read: Callable[[], Iterator[Image]]) -> Iterator[tuple[int, Image]]:

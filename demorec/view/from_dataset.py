@@ -37,8 +37,8 @@ from demorec.episode.validity import read_episode_info
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.urdf import Urdf, check_primitives
-from demorec.view.episode import Box, Curves, PlayedEpisode, Statements, millimetres, sensed_curves, timed
-from demorec.view.from_recording import played_episode, shown_at, video_of
+from demorec.view.episode import Box, PlayedEpisode, millimetres, simulated_curves, timed
+from demorec.view.from_recording import played_episode
 
 
 def dataset_episodes(root: Path) -> list[int]:
@@ -72,10 +72,15 @@ def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
         raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
     recording = DatasetRecording(dataset, numbers[0])
     group = root.resolve().name
+    last, fps, times = recording.num_frames - 1, dataset.info.fps, recording.columns().time_ns
     known = {
         "name": f"episode_{episode_index:06d}",
         "group": group,
         "source": str(recording.known.get("source", group)),
+        "statements": tuple(
+            (int(times[min(round(row["timestamp"] * fps), last)] - times[0]), str(row["style"]), str(row["content"]))
+            for row in recording.spoken.persistent
+        ),
     }
     if recording.known.get("root_seed") is not None:
         (row,) = dataset.sidecar_rows("episodes", episode_index)
@@ -84,16 +89,7 @@ def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
     if not info.urdf and robot is not None:
         info = with_robot(info, robot)
     known["identity"] = hashlib.sha256(f"{root.resolve()} {episode_index}".encode()).hexdigest()[:16]
-    return replace(played_episode(recording, known, info), statements=_statements(recording))
-
-
-def _statements(recording: DatasetRecording) -> Statements:
-    """(time_ns, style, sentence) of what the language columns say."""
-    last, fps, times = recording.num_frames - 1, recording.dataset.info.fps, recording.columns().time_ns
-    return tuple(
-        (int(times[min(round(row["timestamp"] * fps), last)] - times[0]), str(row["style"]), str(row["content"]))
-        for row in recording.spoken.persistent
-    )
+    return played_episode(recording, known, info)
 
 
 def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str, Any]) -> PlayedEpisode:
@@ -118,28 +114,37 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
     base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, robot)
     fingers = info.robot.gripper.joint_position(state[:, num_arm])
     ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
-    time_ns = columns.time_ns - columns.time_ns[0]
-    return PlayedEpisode(
-        **known,
-        info=info,
+    joints = {"position": state}
+    if "observation.velocity" in data:
+        joints["velocity"] = data["observation.velocity"]
+    if export.get("action") == "joint":
+        joints["target"] = data["action"]
+    episode = played_episode(recording, known, info)
+    return replace(
+        episode,
         outcome=_outcome(row, len(state)),
         robot_description=None if robot is None else robot.urdf,
-        time_ns=time_ns,
         joint_position=dict(zip(info.robot.joint_names, [*state[:, :num_arm].T, *fingers.T], strict=True)),
         base_from_tcp=base_from_tcp,
         object_poses=_object_poses(info, ends, data, described, base_from_tcp),
         end_poses=ends,
         world_from_camera=_camera_poses(recording),
         phase=_phases(row, len(state)),
-        curves=_curves(info, data, base_from_tcp, time_ns, with_targets=export.get("action") == "joint"),
-        videos={name: video_of(recording, name, shown_at(columns, name, time_ns)) for name in recording.cameras},
+        curves=simulated_curves(
+            info.robot,
+            episode.time_ns,
+            {row.quantity: data[name] for name, row in SENSED.items() if name in data},
+            joints=joints,
+            opening=state[:, num_arm],
+            target=data["action"][:, -1],
+            base_from_tcp=base_from_tcp,
+        ),
         depth={
             name.removesuffix(DEPTH_SUFFIX): partial(
-                timed, time_ns, partial(millimetres, partial(recording.distances, name))
+                timed, episode.time_ns, partial(millimetres, partial(recording.distances, name))
             )
             for name in recording.depth_cameras
         },
-        statements=_statements(recording),
         boxes={name: _boxes(recording, name) for name in recording.cameras},
     )
 
@@ -211,36 +216,6 @@ def _camera_poses(recording: DatasetRecording) -> dict[str, Array]:
     rows = recording.dataset.sidecar_rows("camera_poses", recording.place.episode_index)
     names = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
     return {name: np.array([row[name] for row in rows]) for name in names}
-
-
-def _curves(
-    info: EpisodeInfo,
-    data: dict[str, Array],
-    base_from_tcp: Array,
-    time_ns: NDArray[np.int64],
-    *,
-    with_targets: bool,
-) -> dict[str, Curves]:
-    joints = info.robot.arm_joints
-    state, velocity, action = data["observation.state"], data.get("observation.velocity"), data["action"]
-    number = len(joints)
-
-    def curves(values: Array, names: tuple[str, ...]) -> Curves:
-        return Curves(time_ns=time_ns, values=values, names=names)
-
-    sensed = {row.quantity: data[name] for name, row in SENSED.items() if name in data}
-    result = {
-        **sensed_curves(sensed, info.robot, time_ns),
-        "position": curves(state[:, :number], joints),
-        "gripper": curves(state[:, number : number + 1], ("opening",)),
-        "gripper target": curves(action[:, -1:], ("target",)),
-        "ee": curves(base_from_tcp[:, :3], ("x", "y", "z")),
-    }
-    if velocity is not None:
-        result["velocity"] = curves(velocity[:, :number], joints)
-    if with_targets:
-        result["target"] = curves(action[:, :number], joints)
-    return result
 
 
 _STOPPED_BEFORE_TARGET = 1e-3

@@ -18,10 +18,10 @@ from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import ObservationRows
 from demorec.mcap import Recording, open_recording
-from demorec.mcap.channels import description_topic
+from demorec.mcap.channels import JOINT_STATES, description_topic
 from demorec.mcap.transforms import JointPositions
 from demorec.runs.run_file import EPISODES, FAILED
-from demorec.view.episode import Curves, PlayedEpisode, Video, sensed_curves, timed
+from demorec.view.episode import Curves, PlayedEpisode, Video, simulated_curves, timed
 
 
 @contextmanager
@@ -39,14 +39,14 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
         "source": path.name,
     }
     with open_recording(path) as recording:
-        yield _recorded(recording, known)
+        times = recording.columns().time_ns
+        statements = tuple((int(times[frame] - times[0]), "subtask", text) for frame, text in recording.subtasks)
+        episode = played_episode(recording, known | {"statements": statements}, recording.info)
+        yield episode if recording.info.simulation is None else _with_simulation(episode, recording)
 
 
-def _recorded(recording: Recording, known: dict[str, Any]) -> PlayedEpisode:
+def _with_simulation(episode: PlayedEpisode, recording: Recording) -> PlayedEpisode:
     info, columns = recording.info, recording.columns()
-    episode = played_episode(recording, known, info)
-    if info.simulation is None:
-        return episode
     return replace(
         episode,
         robot_description=recording.description(),
@@ -98,7 +98,6 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
             for camera in recording.depth_cameras
             if len(columns.image_stamps[camera])
         },
-        statements=tuple((int(time_ns[frame]), "subtask", text) for frame, text in recording.subtasks),
     )
 
 
@@ -127,23 +126,24 @@ def video_of(recording: Recording | DatasetRecording, camera: str, shown_at: NDA
 def _curves(recording: Recording, columns: Columns) -> dict[str, Curves]:
     """All plots; joints at the rate at which they were recorded, which may be that of the physics."""
     robot = recording.info.robot
-    time_ns = columns.time_ns
-    position, velocity, effort = columns.joint_position, columns.joint_velocity, columns.joint_effort
-    if recording.topics["/joint_states"][1] > recording.num_frames:
+    result = simulated_curves(
+        robot,
+        columns.time_ns,
+        ObservationRows.of_columns(columns).sensed,
+        joints={
+            "position": columns.joint_position,
+            "velocity": columns.joint_velocity,
+            "target": columns.action_joint_target,
+        },
+        opening=columns.gripper_width,
+        target=columns.action_gripper,
+        base_from_tcp=columns.base_from_tcp,
+    )
+    if recording.topics[JOINT_STATES][1] > recording.num_frames:
         samples = list(recording.joint_samples())
         time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
-        position = np.array([sample.joint_position for sample in samples])
-        velocity = np.array([sample.joint_velocity for sample in samples])
-        effort = np.array([sample.joint_effort for sample in samples])
-    num_arm = len(robot.arm_joints)
-    frames = columns.time_ns
-    return {
-        **sensed_curves(ObservationRows.of_columns(columns).sensed, robot, frames),
-        "position": Curves(time_ns=time_ns, values=position[:, :num_arm], names=robot.arm_joints),
-        "velocity": Curves(time_ns=time_ns, values=velocity[:, :num_arm], names=robot.arm_joints),
-        "effort": Curves(time_ns=time_ns, values=effort[:, :num_arm], names=robot.arm_joints),
-        "target": Curves(time_ns=frames, values=columns.action_joint_target, names=robot.arm_joints),
-        "gripper": Curves(time_ns=frames, values=columns.gripper_width[:, None], names=("opening",)),
-        "gripper target": Curves(time_ns=frames, values=columns.action_gripper[:, None], names=("target",)),
-        "ee": Curves(time_ns=frames, values=columns.base_from_tcp[:, :3], names=("x", "y", "z")),
-    }
+        for name in ("position", "velocity", "effort"):
+            values = np.array([getattr(sample, f"joint_{name}") for sample in samples])
+            values = values[:, : len(robot.arm_joints)]
+            result[name] = Curves(time_ns=time_ns, values=values, names=robot.arm_joints)
+    return result

@@ -43,7 +43,8 @@ def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blu
         curves=_curve_views([paths], episode),
         states=[rrb.StateTimelineView(origin=paths.phase, name="phases")] if any(episode.phase) else [],
         texts=[
-            *_pages(episode),
+            *([rrb.TextDocumentView(origin=paths.words, name="in words")] if episode.statements else []),
+            rrb.TextDocumentView(origin=paths.summary, name="episode"),
             *([rrb.TextLogView(origin=paths.events, name="events")] if any(episode.phase) or episode.events else []),
         ],
     )
@@ -52,13 +53,16 @@ def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blu
 def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
     """The layout of two episodes in one recording: below /a and /b, the same streams over each other."""
     roots = [A, B]
-    images: list[rrb.View | rrb.Container] = []
-    for name in [name for name in a.videos if name in b.videos]:
-        views = [
-            rrb.Spatial2DView(origin=paths.camera(name), contents=["$origin"], name=f"{name} {label}")
-            for paths, label in zip(roots, "AB", strict=True)
-        ]
-        images.append(rrb.Horizontal(*views))
+    images: list[rrb.View | rrb.Container] = [
+        rrb.Horizontal(
+            *(
+                rrb.Spatial2DView(origin=paths.camera(name), contents=["$origin"], name=f"{name} {label}")
+                for paths, label in zip(roots, "AB", strict=True)
+            )
+        )
+        for name in a.videos
+        if name in b.videos
+    ]
     return _blueprint(
         a,
         is_alone=True,
@@ -103,24 +107,14 @@ def _blueprint(
     if states:
         parts = [*top, *states, bottom]
         shares = [*[4.6] * len(top), 0.95 if more_curves is None else 1.4, 2.9]
-    return _panels(rrb.Vertical(*parts, row_shares=shares), episode.info.fps, is_alone=is_alone)
-
-
-def _panels(views: rrb.Container, fps: int, *, is_alone: bool) -> rrb.Blueprint:
     return rrb.Blueprint(
-        views,
-        rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(fps), loop_mode="all"),
+        rrb.Vertical(*parts, row_shares=shares),
+        rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(episode.info.fps), loop_mode="all"),
         rrb.BlueprintPanel(state="collapsed" if is_alone else "expanded"),
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
         auto_views=False,
     )
-
-
-def _pages(episode: PlayedEpisode) -> list[rrb.View]:
-    """What is said of the episode, if anything is, and the episode in words."""
-    pages = [rrb.TextDocumentView(origin=Paths().words, name="in words")] if episode.statements else []
-    return [*pages, rrb.TextDocumentView(origin=Paths().summary, name="episode")]
 
 
 def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spatial3DView:
@@ -131,12 +125,7 @@ def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spati
             if episode.scene is None:  # nobody knows where it is
                 contents.append(f"- {paths.camera(camera)}/**")
                 continue
-            hidden = (
-                paths.camera(camera, "/depth"),
-                paths.camera(camera, "/segmentation"),
-                paths.camera(camera, "/boxes"),
-            )
-            contents += [f"- {entity}" for entity in hidden]
+            contents += [f"- {paths.camera(camera)}/{images}" for images in ("depth", "segmentation", "boxes")]
         for body in () if episode.scene is None else episode.scene.bodies:
             if max(body.shape.extents) > _FLOOR:
                 contents.append(f"- {paths.body(body.name)}")

@@ -5,7 +5,6 @@ The time lines are seconds since the episode's start, and frame numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -15,26 +14,25 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array
 
 
-@dataclass(frozen=True)
 class Paths:
-    """Paths below a root, "" for an episode alone or "/a" and "/b" for two that are compared."""
+    """Paths below a root, "" for an episode alone or "/a" and "/b" for two that are compared.
 
-    root: str = ""
+    Attributes:
+        root: As given.
+        world: The scene, z up.
+        robot: The robot's base; its links are nested below.
+        ee_path: One piece of the gripper's path per frame.
+        phase: Phases of the motion as states.
+        events: What happened, as a log.
+        words: What is being done, planned and remembered, in words.
+        summary: The episode in words.
+    """
 
-    @property
-    def world(self) -> str:
-        """The scene, z up."""
-        return f"{self.root}/world"
-
-    @property
-    def robot(self) -> str:
-        """The robot's base; its links are nested below."""
-        return f"{self.world}/robot"
-
-    @property
-    def ee_path(self) -> str:
-        """One piece of the gripper's path per frame."""
-        return f"{self.world}/ee_path"
+    def __init__(self, root: str = "") -> None:
+        self.root, self.world = root, f"{root}/world"
+        self.robot, self.ee_path = f"{self.world}/robot", f"{self.world}/ee_path"
+        self.phase, self.events = f"{root}/phase", f"{root}/events"
+        self.words, self.summary = f"{root}/words", f"{root}/summary"
 
     def body(self, name: str) -> str:
         """A body of the scene."""
@@ -55,26 +53,6 @@ class Paths:
     def curves(self, name: str) -> str:
         """Numbers over time."""
         return f"{self.root}/plots/{name.replace(' ', '_')}"
-
-    @property
-    def phase(self) -> str:
-        """Phases of the motion as states."""
-        return f"{self.root}/phase"
-
-    @property
-    def events(self) -> str:
-        """What happened, as a log."""
-        return f"{self.root}/events"
-
-    @property
-    def words(self) -> str:
-        """What is being done, planned and remembered, in words."""
-        return f"{self.root}/words"
-
-    @property
-    def summary(self) -> str:
-        """The episode in words."""
-        return f"{self.root}/summary"
 
 
 SECONDS = "time"
