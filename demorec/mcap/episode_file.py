@@ -79,10 +79,9 @@ class EpisodeFile(Closing):
         """Read how it ended; RecordingError unless its end is that of as many frames as `topic` has messages."""
         outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
         self.outcome = None if outcome is None else metadata.read_outcome_metadata(record, outcome)
-        self.num_frames = self._container.counts.get(topic, 0)
+        self.num_frames, self.is_recovered = self._container.counts.get(topic, 0), recovered is not None
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
-        self.is_recovered = recovered is not None
         if self.outcome is None and not self.is_recovered:
             raise RecordingError("The recording was never finished; demorec recover keeps what is whole")
         if self.outcome is not None and self.outcome.num_frames != self.num_frames:
@@ -210,11 +209,9 @@ class EpisodeFile(Closing):
     def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
         """Distances in order, as they were recorded: (H, W) uint16 millimetres or float32 metres."""
         codec, size = self._distance_codec(camera), self._size(camera)
-
-        def read(data: bytes) -> NDArray[np.uint16] | NDArray[np.float32]:
-            return decode_distances(codec, _READERS.get(codec, messages.read_compressed_image)(data), size)
-
-        for _, distances in self._read_images(video_topic(camera, codec), read):
+        read = _READERS.get(codec, messages.read_compressed_image)
+        topic = video_topic(camera, codec)
+        for _, distances in self._read_images(topic, lambda data: decode_distances(codec, read(data), size)):
             yield distances
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:

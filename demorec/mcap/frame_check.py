@@ -7,7 +7,7 @@ any other: the features and images that its description names, at stamps that go
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.registry import nearest_match
-from demorec.episode.episode import CameraImages, Frame, JointSample, Observation, SampledFrame
+from demorec.episode.episode import CameraImages, Frame, JointSample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
 from demorec.episode.sensed import STREAMS
 from demorec.mcap.lossless import DEPTH_TYPES
@@ -28,14 +28,12 @@ def check_joint_names(info: EpisodeInfo) -> None:
     """Raise RecordingError unless the robot's joints are different ones that its URDF has."""
     robot = info.robot
     known = {joint.name for joint in Urdf.load(asset_path(robot.urdf)).joints if joint.kind != "fixed"}
-    wrong = [name for name in robot.joint_names if name not in known]
-    if wrong:
+    if wrong := [name for name in robot.joint_names if name not in known]:
         raise RecordingError(
             f"The robot {robot.name!r} has no joints {', '.join(wrong)}; those of its URDF are "
             f"{', '.join(sorted(known))}: {robot.urdf}"
         )
-    twice = [name for name, count in Counter(robot.joint_names).items() if count > 1]
-    if twice:
+    if twice := [name for name, count in Counter(robot.joint_names).items() if count > 1]:
         raise RecordingError(f"The robot {robot.name!r} names the joints {', '.join(twice)} twice.")
 
 
@@ -76,11 +74,8 @@ class FrameCheck:
     def _vectors(self, frame: Frame) -> Iterator[tuple[str, str, Any, tuple[int, ...]]]:
         """Where, what, numbers, their shape; None for the numbers of what is missing."""
         seen = frame.observation
-        states: Iterable[tuple[str, Observation | JointSample]] = (
-            ("observation", seen),
-            *((f"joint sample at {sample.time_ns} ns", sample) for sample in frame.joint_samples),
-        )
-        for owner, state in states:
+        for state in (seen, *frame.joint_samples):
+            owner = f"joint sample at {state.time_ns} ns" if isinstance(state, JointSample) else "observation"
             for name in ("joint_position", "joint_velocity", "joint_effort"):
                 yield owner, name, getattr(state, name), self._joints
         for name in ("gripper_width", "contact_force"):
@@ -144,7 +139,7 @@ class SampledFrameCheck:
                 f"{', '.join(self._cameras) or 'none'}."
             )
         _check_image(known, data)
-        self._check_stamp(f"the image of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
+        self._check_stamp(f"The image of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
 
     def note_image(self, camera: str, stamp_ns: int) -> None:
         """The camera's next image was taken."""
@@ -154,7 +149,15 @@ class SampledFrameCheck:
     def check_frame(self, frame: SampledFrame) -> None:
         """Raise RecordingError unless it can be the next frame."""
         what = f"frame {self._num_frames}"
-        _check_names(what, "feature", frame.samples, self._features)
+        if unknown := [name for name in frame.samples if name not in self._features]:
+            raise RecordingError(
+                f"{what.capitalize()} has an unknown feature {unknown[0]!r}."
+                f"{nearest_match(unknown[0], self._features)} The features are: {', '.join(self._features)}."
+            )
+        if missing := [name for name in self._features if name not in frame.samples]:
+            raise RecordingError(
+                f"{what.capitalize()} lacks the feature {', '.join(missing)}: every frame has every feature."
+            )
         for name, feature in self._features.items():
             vector, count = frame.samples[name].vector, len(feature.names)
             if not isinstance(vector, np.ndarray) or vector.dtype != feature.dtype or vector.shape != (count,):
@@ -176,8 +179,8 @@ class SampledFrameCheck:
             raise RecordingError(f"The subtask of {what} is no single line of at most {MAX_SUBTASK} characters.")
         for name in self._features:
             stamp = frame.samples[name].stamp_ns
-            self._check_stamp(f"the feature {name!r} of {what}", "feature " + name, stamp, may_repeat=True)
-        self._check_stamp(what, "frames", frame.time_ns, may_repeat=False)
+            self._check_stamp(f"The feature {name!r} of {what}", "feature " + name, stamp, may_repeat=True)
+        self._check_stamp(what.capitalize(), "frames", frame.time_ns, may_repeat=False)
 
     def note_frame(self, frame: SampledFrame) -> None:
         """The next frame was taken."""
@@ -187,7 +190,6 @@ class SampledFrameCheck:
         self._num_frames += 1
 
     def _check_stamp(self, what: str, key: str, stamp_ns: int, *, may_repeat: bool) -> None:
-        what = what[0].upper() + what[1:]
         if not isinstance(stamp_ns, int | np.integer) or isinstance(stamp_ns, bool):
             raise RecordingError(f"{what} has the stamp {stamp_ns!r}, it must be a whole number of nanoseconds.")
         if not 0 <= stamp_ns <= MAX_STAMP_NS:
@@ -215,16 +217,3 @@ def _check_image(camera: Camera, data: NDArray[Any] | bytes) -> None:
             f"The image of the camera {camera.name!r} is {found}, it must be {kind} of shape {shape}: height, "
             f"width{'' if camera.is_depth else ', RGB'}."
         )
-
-
-def _check_names(what: str, kind: str, found: Mapping[str, object], known: Mapping[str, object]) -> None:
-    if found.keys() == known.keys():
-        return
-    unknown = [name for name in found if name not in known]
-    if unknown:
-        raise RecordingError(
-            f"{what[0].upper()}{what[1:]} has an unknown {kind} {unknown[0]!r}.{nearest_match(unknown[0], known)} The "
-            f"{kind}s are: {', '.join(known)}."
-        )
-    missing = ", ".join(name for name in known if name not in found)
-    raise RecordingError(f"{what[0].upper()}{what[1:]} lacks the {kind} {missing}: every frame has every {kind}.")

@@ -13,6 +13,7 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CompressedVideo
 
 from demorec.core.errors import ConfigError, RecordingError, describe_error
+from demorec.core.files import sync_path
 from demorec.core.replacing import RECORDING, check_replaceable, lock_part
 from demorec.mcap import messages
 from demorec.mcap.ros2 import DEFINITIONS
@@ -91,7 +92,7 @@ class PartFile:
         is_worthless: Callable[[Path], bool] = lambda part: False,
     ) -> None:
         self.path, self.part, self._overwrite = path, part or path.with_name(f"{path.name}.part"), overwrite
-        self._check_free()
+        check_replaceable(path, RECORDING, overwrite=overwrite)
         try:
             # Held until the file has its name or is left: no other process takes it for what a dead one left.
             self._lock: int | None = lock_part(self.part, RECORDING)
@@ -109,7 +110,6 @@ class PartFile:
         except OSError as error:
             raise self._unwritable(error) from error
         self._channels: dict[str, foxglove.Channel] = {}
-        self._log: dict[str, Callable[..., None]] = {}
         self._context = foxglove.Context()
         self._mcap = foxglove.open_mcap(
             self._disk,
@@ -120,9 +120,6 @@ class PartFile:
         )
         self._is_open = True
 
-    def _check_free(self) -> None:
-        check_replaceable(self.path, RECORDING, overwrite=self._overwrite)
-
     def _unwritable(self, error: Exception) -> RecordingError:
         return RecordingError(f"The recording cannot be written ({describe_error(error)}): {self.path}")
 
@@ -132,25 +129,21 @@ class PartFile:
 
     def logger(self, topic: str, schema: str, *, latched: bool = False) -> Callable[..., None]:
         """What adds messages to a topic, for many of them: called with the data and, by name, log_time."""
-        log = self._log.get(topic)
-        if log is None:
-            channel = self._channels[topic] = self._open_channel(topic, schema, latched)
-            log = self._log[topic] = channel.base.log  # without the wrapper, which looks for JSON in every message
+        if topic not in self._channels:
+            if schema == messages.PROTOBUF_VIDEO:
+                encoding, definition = "protobuf", CompressedVideo.get_schema()
+            else:
+                encoding = "cdr"
+                definition = foxglove.Schema(name=schema, encoding="ros2msg", data=DEFINITIONS[schema].encode())
+            self._channels[topic] = foxglove.Channel(
+                topic,
+                message_encoding=encoding,
+                schema=definition,
+                context=self._context,
+                metadata={"offered_qos_profiles": _LATCHED_QOS} if latched else {},
+            )
+        log: Callable[..., None] = self._channels[topic].base.log  # not the wrapper's, which looks for JSON in each
         return log
-
-    def _open_channel(self, topic: str, schema: str, latched: bool) -> foxglove.Channel:
-        if schema == messages.PROTOBUF_VIDEO:
-            encoding, definition = "protobuf", CompressedVideo.get_schema()
-        else:
-            encoding = "cdr"
-            definition = foxglove.Schema(name=schema, encoding="ros2msg", data=DEFINITIONS[schema].encode())
-        return foxglove.Channel(
-            topic,
-            message_encoding=encoding,
-            schema=definition,
-            context=self._context,
-            metadata={"offered_qos_profiles": _LATCHED_QOS} if latched else {},
-        )
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record."""
@@ -215,13 +208,9 @@ class PartFile:
         """
         try:
             self.end()
-            self._check_free()
+            check_replaceable(self.path, RECORDING, overwrite=self._overwrite)
             self.part.replace(self.path)
-            folder = os.open(self.path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            sync_path(self.path.parent)
         except OSError as error:
             raise self._unwritable(error) from error
         finally:
