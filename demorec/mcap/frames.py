@@ -132,6 +132,20 @@ def pose_of(row: Array) -> Pose:
     return Pose(position=row[:3], quat_xyzw=row[3:])
 
 
+def observation_at(columns: Columns, frame: int) -> Observation:
+    """The observation of a frame, bit-exact."""
+    return Observation(
+        joint_position=columns.joint_position[frame].copy(),
+        joint_velocity=columns.joint_velocity[frame].copy(),
+        joint_effort=columns.joint_effort[frame].copy(),
+        gripper_width=float(columns.gripper_width[frame]),
+        base_from_tcp=pose_of(columns.base_from_tcp[frame]),
+        object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
+        contact_force=float(columns.contact_force[frame]),
+        sensed={name: values[frame].copy() for name, values in columns.sensed.items()},
+    )
+
+
 def action_at(columns: Columns, frame: int, kind: Literal["action", "command"]) -> Action:
     """What the expert wanted at a frame, or the command that was sent to the motors."""
     return Action(
@@ -159,16 +173,7 @@ def frames_of(recording: Recording, columns: Columns | None = None) -> Iterator[
         yield Frame(
             frame_index=index,
             time_ns=time_ns,
-            observation=Observation(
-                joint_position=columns.joint_position[index].copy(),
-                joint_velocity=columns.joint_velocity[index].copy(),
-                joint_effort=columns.joint_effort[index].copy(),
-                gripper_width=float(columns.gripper_width[index]),
-                base_from_tcp=pose_of(columns.base_from_tcp[index]),
-                object_poses={name: pose_of(rows[index]) for name, rows in columns.object_poses.items()},
-                contact_force=float(columns.contact_force[index]),
-                sensed={name: values[index].copy() for name, values in columns.sensed.items()},
-            ),
+            observation=observation_at(columns, index),
             action=action_at(columns, index, "action"),
             command=action_at(columns, index, "command"),
             phase=columns.phase[index],
