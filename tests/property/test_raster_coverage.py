@@ -26,21 +26,16 @@ def hits(corners: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     geometry.vertices[place + layout.SCREEN_Y] = corners[:, 1]
     geometry.vertices[place + layout.INVERSE_W] = 1.0
     heights = np.zeros((SIZE, SIZE), dtype=np.float32)
-    none = np.zeros(1, dtype=np.int32)
     draw_casters(
         0,
         1,
-        geometry.face_start,
-        geometry.face_end,
-        geometry.faces,
-        geometry.vertices,
+        geometry,
         SIZE,
         heights.reshape(-1),
         np.zeros((SIZE // 8, SIZE // 8), dtype=np.uint8),
         False,
         np.zeros(4, dtype=np.int64),
-        none,
-        none,
+        np.zeros(1, dtype=np.int32),
     )
     return heights > 0
 

@@ -3,42 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.render.raster import textures
 from demorec.render.raster.kernels import layout
+from demorec.render.raster.kernels.layout import Geometry
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.shapes import Instance
 from demorec.render.raster.textures import Pixels
 
-Ints = NDArray[np.int64]
 Floats32 = NDArray[np.float32]
 SPECULAR_FACES = 100
 """Shapes with more faces than this shine; boxes and boards stay matt, or whole faces would flash."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Geometry:
-    """Vertices and faces of all instances, the vertices numbered in their order.
-
-    Attributes:
-        vertex_start, vertex_count: (n,) of each instance.
-        face_start, face_end: (n,) of each instance.
-        vertices: Blocks of vertices (kernels.layout), room for `spare` more at the end.
-        num_vertices: Without the spare ones.
-        faces: (f, 3) int32 vertex addresses.
-    """
-
-    vertex_start: Ints
-    vertex_count: Ints
-    face_start: Ints
-    face_end: Ints
-    vertices: Floats32
-    num_vertices: int
-    faces: NDArray[np.int32]
 
 
 def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *, spare: int = 0) -> Geometry:
@@ -78,22 +57,14 @@ def caster_geometry(instances: Sequence[Instance], levels: Sequence[int | None],
     return merge(points, faces)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Batch:
-    """All that is drawn for one camera.
-
-    Attributes:
-        geometry: Vertices and faces.
-        face_table: (f, 4) int32: flags, texture, segment, group (faces of equal look, which need no edge between).
-        face_color: (f, 4) float32: red, green, blue, specular, 0..255 (0..1 with a texture).
-        texels, mips: Packed textures.
-    """
+class Batch(NamedTuple):
+    """All that is drawn for one camera; the rest as of `layout.Looks`."""
 
     geometry: Geometry
     face_table: NDArray[np.int32]
     face_color: Floats32
     texels: NDArray[np.uint32]
-    mips: Ints
+    mips: NDArray[np.int64]
 
 
 SPARE_VERTICES = 4096

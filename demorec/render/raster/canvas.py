@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +9,7 @@ from demorec.episode.scene import Light, SceneCamera
 from demorec.render.raster.batch import Batch, Floats32
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.antialias import STILL, centre_of_mixed, resolve, shade_edges
+from demorec.render.raster.kernels.layout import Images, Looks, Records
 from demorec.render.raster.kernels.records import flag_owners, set_up_records
 from demorec.render.raster.kernels.shade import shade_rows
 from demorec.render.raster.kernels.triangles import draw_instances
@@ -25,19 +23,6 @@ coarser meshes than the image, and half of it leaves blotches."""
 SHADOW_OFFSET_TEXELS = 2.2
 """And in texels: less leaves stripes where the light grazes a surface, since 3x3 texels are looked at."""
 Int32s = NDArray[np.int32]
-
-
-@dataclass(eq=False)
-class Images:
-    """(H, W, 3) colour, (H, W) depth and segmentation; the latter two of size (1, 1) when not wanted."""
-
-    color: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    segments: Int32s
-
-    def copy(self) -> Images:
-        """The same images in memory of their own."""
-        return Images(self.color.copy(), self.depth.copy(), self.segments.copy())
 
 
 class Canvas:
@@ -56,7 +41,9 @@ class Canvas:
         values, ids: (H * samples, W * samples) inverse depths, and the records that they came from.
         pixel_ids: (H, W) records of pixels, or what stands for them (layout); not antialiased: `ids` itself.
         edges: y * W + x of pixels that are shaded sample by sample.
-        records, origins: Planes of the triangles (layout), and where they start.
+        geometry: The batch's, with vertices of its own.
+        records: The triangles that were drawn.
+        looks, still_looks: What decides the colour of pixels, and of what stands still with its own shadows alone.
     """
 
     def __init__(
@@ -71,7 +58,6 @@ class Canvas:
         segmentation: bool,
     ) -> None:
         self.camera = camera
-        self._batch = batch
         self._stage = stage
         self.samples = 2 if antialias else 1
         self.want_depth, self.want_segments = depth, segmentation
@@ -85,33 +71,23 @@ class Canvas:
         self.ids = np.zeros((sh, sw), dtype=np.int32)
         self.pixel_ids = np.full((h, w), STILL, dtype=np.int32) if antialias else self.ids
         self.edges = np.zeros(h * w if antialias else 1, dtype=np.int32)
-        self._mixed = np.zeros(h * w if antialias and (depth or segmentation) else 1, dtype=np.int32)
-        self._no_still = np.zeros((1, 1, layout.STILL_SIZE), dtype=np.float32)
+        self._mixed = np.zeros(h * w if antialias and (depth or segmentation) else 0, dtype=np.int32)
         self._far_value = np.float32(1 / camera.far)
-        self._vertices = batch.geometry.vertices.copy()
-        self._make_records(len(batch.geometry.faces) + 1024)
+        self.geometry = batch.geometry._replace(vertices=batch.geometry.vertices.copy())
+        self.records = _empty_records(len(batch.geometry.faces) + 1024)
         k = camera.intrinsics
         self._lens = np.array([2 * k[0, 0] / w, 2 * k[1, 1] / h])
         self._focal = float(k[0, 0])
         self._clip_from_world = np.zeros((3, 4))
-        self._sky = _sky_table(light)
-
-    @property
-    def num_vertices(self) -> int:
-        """Of the scene, without those that clipping makes."""
-        return self._batch.geometry.num_vertices
-
-    def _make_records(self, count: int) -> None:
-        self._corners = np.zeros((count, 3), dtype=np.int32)
-        self._faces = np.zeros(count, dtype=np.int32)
-        self._flags = np.zeros(count, dtype=np.uint8)
-        self.records = np.zeros((count, layout.RECORD), dtype=np.float32)
-        self.origins = np.zeros((count, 2), dtype=np.int32)
+        self.looks = Looks(
+            *batch[1:], stage.light_table, _sky_table(light), stage.heights.reshape(-1), stage.shadow_size
+        )
+        self.still_looks = self.looks._replace(heights=stage.still_heights.reshape(-1))
 
     def aim(self, pose: Floats) -> None:
         """Matrices of the camera and of every instance, and the sky's rays."""
         stage, camera = self._stage, self.camera
-        aim_camera(pose, self._lens, self._focal, camera.width, camera.height, self._clip_from_world, self._sky)
+        aim_camera(pose, self._lens, self._focal, camera.width, camera.height, self._clip_from_world, self.looks.sky)
         project_instances(
             stage.world_from_shape,
             stage.centre,
@@ -130,8 +106,8 @@ class Canvas:
         h, w = self.camera.height, self.camera.width
         return Images(
             np.empty((h, w, 3), dtype=np.uint8),
-            np.empty((h, w) if self.want_depth else (1, 1), dtype=np.float32),
-            np.empty((h, w) if self.want_segments else (1, 1), dtype=np.int32),
+            np.empty((h, w) if self.want_depth else (0, 0), dtype=np.float32),
+            np.empty((h, w) if self.want_segments else (0, 0), dtype=np.int32),
         )
 
     def clear(self) -> None:
@@ -143,15 +119,13 @@ class Canvas:
         self, first: int, last: int, record: int, vertex: int, left: Int32s, right: Int32s
     ) -> tuple[int, int]:
         """Draw instances; returns the next free record and vertex, or -1 after the buffers have been enlarged."""
-        geometry, stage = self._batch.geometry, self._stage
+        stage = self._stage
         sh, sw = self.ids.shape
         transform_vertices(
             first,
             last,
             self._visible,
-            geometry.vertex_start,
-            geometry.vertex_count,
-            self._vertices,
+            self.geometry,
             self._clip_from_shape,
             stage.shadow_from_shape,
             stage.light_in_shape,
@@ -161,33 +135,26 @@ class Canvas:
             sw,
             sh,
         )
-        capacity = len(self._vertices) // layout.BLOCK * layout.LANES
         record, vertex = draw_instances(
-            record,
             first,
             last,
-            self._visible,
-            geometry.face_start,
-            geometry.face_end,
-            geometry.faces,
-            self._vertices,
+            record,
             vertex,
-            capacity,
-            sw,
-            sh,
+            self.geometry,
+            self._visible,
+            self.values,
+            self.ids,
             np.float32(self.camera.near),
-            self.values.reshape(-1),
-            self.ids.reshape(-1),
-            self._corners,
-            self._faces,
+            self.records,
             left,
             right,
         )
         if record < 0:
             # More triangles were clipped than there was room for.
-            blocks = max(4, capacity // layout.LANES)
-            self._vertices = np.concatenate([self._vertices, np.zeros(blocks * layout.BLOCK, dtype=np.float32)])
-            self._make_records(2 * len(self._faces))
+            vertices = self.geometry.vertices
+            more = np.zeros(max(4 * layout.BLOCK, len(vertices)), dtype=np.float32)
+            self.geometry = self.geometry._replace(vertices=np.concatenate([vertices, more]))
+            self.records = _empty_records(2 * len(self.records.faces))
         return record, vertex
 
     def shade(
@@ -203,91 +170,50 @@ class Canvas:
     ) -> tuple[int, int]:
         """Shade the pixels of records from `first` (all with `everything`); returns the numbers of edges and mixed."""
         lowest = layout.BACKGROUND if everything else first
-        heights = self._stage.heights if still is None else self._stage.still_heights
-        self._flags[first:last] = 0
-        edge_count, mixed_count = self._find_owners(left, right, first, lowest)
-        set_up_records(
-            first,
-            last,
-            self._flags,
-            self._corners,
-            self._faces,
-            self._batch.face_table,
-            self._vertices,
-            self.records,
-            self.origins,
-        )
-        shade_rows(
-            left,
-            right,
-            lowest,
-            self.pixel_ids,
-            self.samples,
-            *self._surfaces(heights),
-            images.color,
-            still is not None,
-            self._no_still if still is None else still,
-            self.want_depth,
-            images.depth,
-            self.want_segments,
-            images.segments,
-        )
-        return edge_count, mixed_count
+        records, face_table, looks = self.records, self.looks.face_table, self.looks
+        if still is None:
+            still = np.zeros((0, 0, layout.STILL_SIZE), dtype=np.float32)
+        else:
+            looks = self.still_looks
+        records.flags[first:last] = 0
+        counts = 0, 0
+        if self.samples == 2:
+            counts = resolve(
+                left, right, lowest, self.ids, self.values, records, face_table, self.pixel_ids, self.edges, self._mixed
+            )
+        else:
+            flag_owners(left, right, first, self.ids, records.flags)
+        set_up_records(first, last, records, face_table, self.geometry.vertices)
+        shade_rows(left, right, lowest, self.pixel_ids, self.samples, records, looks, images, still)
+        return counts
 
-    def _surfaces(self, heights: Floats32) -> tuple[Any, ...]:
-        """What shading asks about what lies under a sample: records, faces, light and shadow, textures, sky."""
-        batch, stage = self._batch, self._stage
-        faces = self._faces, batch.face_table, batch.face_color, self.records, self.origins
-        shadow = heights.reshape(-1), stage.shadow_size
-        return (*faces, stage.light_table, *shadow, batch.texels, batch.mips, self._sky)
-
-    def _find_owners(self, left: Int32s, right: Int32s, first: int, lowest: int) -> tuple[int, int]:
-        """Flag the records that own pixels, list the edges between them; returns the numbers of edges and mixed."""
-        if self.samples != 2:
-            flag_owners(left, right, first, self.ids, self._flags)
-            return 0, 0
-        edge_count, mixed_count = resolve(
-            left,
-            right,
-            lowest,
-            self.ids,
-            self.values,
-            self._faces,
-            self._batch.face_table,
-            self.pixel_ids,
-            self.edges,
-            0,
-            self._mixed,
-            self.want_depth or self.want_segments,
-            self._flags,
-        )
-        return edge_count, mixed_count
-
-    def finish_edges(self, images: Images, edge_count: int, mixed_count: int, heights: Floats32) -> None:
+    def finish_edges(self, images: Images, edge_count: int, mixed_count: int, looks: Looks) -> None:
         """Shade the listed edges, and see what lies at the centres of mixed pixels; nothing when not antialiased."""
         if self.samples == 1:
             return
-        width = self.camera.width
-        shade_edges(0, edge_count, self.edges, self.ids, width, *self._surfaces(heights), images.color)
-        if self.want_depth or self.want_segments:
+        shade_edges(edge_count, self.edges, self.ids, self.records, looks, images.color)
+        if self._mixed.size:
             centre_of_mixed(
                 self._mixed,
                 mixed_count,
-                width,
                 self.ids,
                 self.values,
-                self._corners,
-                self._faces,
-                self._batch.face_table,
-                self._vertices,
                 self.records,
-                self.origins,
+                looks.face_table,
+                self.geometry.vertices,
                 self._far_value,
-                self.want_depth,
-                images.depth,
-                self.want_segments,
-                images.segments,
+                images,
             )
+
+
+def _empty_records(count: int) -> Records:
+    return Records(
+        corners=np.zeros((count, 3), dtype=np.int32),
+        faces=np.zeros(count, dtype=np.int32),
+        flags=np.zeros(count, dtype=np.uint8),
+        planes=np.zeros((count, layout.RECORD), dtype=np.float32),
+        origins=np.zeros((count, 2), dtype=np.int32),
+    )
 
 
 def _sky_table(light: Light) -> Floats32:

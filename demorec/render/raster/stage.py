@@ -76,7 +76,6 @@ class Stage:
         self.still_heights = self.heights.copy()
         self.touched = np.zeros((tiles, tiles), dtype=np.uint8)
         self._bounds = np.array([shadow_size, 0, shadow_size, 0], dtype=np.int64)
-        self._no_ids = np.zeros(1, dtype=np.int32)
 
     def _fit_shadow(self) -> tuple[Floats, float]:
         """(3, 4) world to shadow map (texels, texels, metres), and metres a texel.
@@ -143,24 +142,17 @@ class Stage:
         self._draw(self.num_still, len(self.instances), self.heights, mark=True)
 
     def _draw(self, first: int, last: int, heights: NDArray[np.float32], *, mark: bool) -> None:
-        casters = self._casters
-        transform_casters(
-            first, last, casters.vertex_start, casters.vertex_count, casters.vertices, self.shadow_from_shape
-        )
+        transform_casters(first, last, self._casters, self.shadow_from_shape)
         draw_casters(
             first,
             last,
-            casters.face_start,
-            casters.face_end,
-            casters.faces,
-            casters.vertices,
+            self._casters,
             self.shadow_size,
             heights.reshape(-1),
             self.touched,
             mark,
             self._bounds,
-            self._no_ids,
-            self._no_ids,
+            np.zeros(1, dtype=np.int32),
         )
 
 

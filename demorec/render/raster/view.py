@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Pose
 from demorec.episode.episode import CameraImages
 from demorec.render.raster.batch import Floats32
-from demorec.render.raster.canvas import Canvas, Images, Int32s
+from demorec.render.raster.canvas import Canvas, Int32s
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.antialias import STILL, halve_extents
+from demorec.render.raster.kernels.layout import Images
 from demorec.render.raster.kernels.still import clear_queued, gather_still, list_tiles, restore_samples, shade_still
 from demorec.render.raster.mesh import Floats
 from demorec.render.raster.stage import Stage
@@ -87,16 +88,16 @@ class CameraView:
         Returns:
             The images, and how many records and vertices they have used up.
         """
-        canvas, stage = self._canvas, self._stage
+        canvas = self._canvas
         records = -1
         while records < 0:  # the buffers grow until there is room for all
             canvas.clear()
             records, vertices = canvas.draw_instances(
-                0, count, 0, canvas.num_vertices, self._scratch_left, self._scratch_right
+                0, count, 0, canvas.geometry.num_vertices, self._scratch_left, self._scratch_right
             )
         images = canvas.new_images()
         counts = canvas.shade(images, self._whole_left, self._whole_right, 0, records, everything=True, still=still)
-        canvas.finish_edges(images, *counts, stage.heights if still is None else stage.still_heights)
+        canvas.finish_edges(images, *counts, canvas.looks if still is None else canvas.still_looks)
         return images, records, vertices
 
     def _draw_changes(self, pose: Floats) -> Images:
@@ -106,15 +107,7 @@ class CameraView:
             if self._still is None or self._still.key != key:
                 self._still = self._draw_still(key)
             still = self._still
-            restore_samples(
-                canvas.values.reshape(-1),
-                still.values.reshape(-1),
-                canvas.ids.reshape(-1),
-                still.ids.reshape(-1),
-                self._left,
-                self._right,
-                canvas.ids.shape[1],
-            )
+            restore_samples(canvas.values, still.values, canvas.ids, still.ids, self._left, self._right)
             first = still.num_records
             records, _ = canvas.draw_instances(
                 stage.num_still, len(stage.instances), first, still.num_vertices, self._left, self._right
@@ -126,7 +119,8 @@ class CameraView:
         if canvas.samples == 2:
             left, right = self._pixel_left, self._pixel_right
             halve_extents(self._left, self._right, left, right, canvas.pixel_ids)
-        images = still.images.copy()
+        color, depth, segments = still.images
+        images = Images(color.copy(), depth.copy(), segments.copy())
         edge_count, mixed_count = canvas.shade(images, left, right, first, records, everything=False, still=None)
         all_edges = shade_still(
             stage.touched,
@@ -136,14 +130,12 @@ class CameraView:
             first,
             canvas.pixel_ids,
             still.pixel_ids,
-            stage.light_table,
-            stage.heights.reshape(-1),
-            stage.shadow_size,
+            canvas.looks,
             images.color,
             canvas.edges,
             edge_count,
         )
-        canvas.finish_edges(images, all_edges, mixed_count, stage.heights)
+        canvas.finish_edges(images, all_edges, mixed_count, canvas.looks)
         if canvas.samples == 2:
             clear_queued(canvas.edges, edge_count, all_edges, canvas.pixel_ids, STILL)
         return images
@@ -158,19 +150,11 @@ class CameraView:
         tile_start = np.zeros(tiles * tiles + 1, dtype=np.int64)
         tile_pixels = np.zeros(h * w * canvas.samples**2, dtype=np.int32)
         list_tiles(
-            terms,
-            canvas.pixel_ids,
-            canvas.ids,
-            canvas.records,
-            canvas.origins,
-            tiles,
-            stage.shadow_size,
-            tile_start,
-            tile_pixels,
+            terms, canvas.pixel_ids, canvas.ids, canvas.records, tiles, stage.shadow_size, tile_start, tile_pixels
         )
         count = int(tile_start[-1])
         gathered = np.zeros((count + 1, layout.STILL_SIZE), dtype=np.float32)
-        gather_still(terms, tile_pixels, count, w, gathered)
+        gather_still(terms, tile_pixels, count, gathered)
         pixel_ids = canvas.pixel_ids.copy()
         if canvas.samples == 2:
             canvas.pixel_ids.fill(STILL)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from demorec.render.raster.kernels import layout as at
+from demorec.render.raster.kernels.fill import doubled_area, screen
 from demorec.render.raster.kernels.jit import f4, f8, i4, index, inlined, kernel
 from demorec.render.raster.kernels.lookups import mip_level, shadow_at, texel_at, tone
 from demorec.render.raster.kernels.shade import sky_pixel
@@ -15,7 +16,6 @@ STILL = -2
 """In the image of pixel records: what stood still and was shaded before."""
 FLAT_ENOUGH = 0.012
 """Samples of one surface whose depths differ by less than this share are shaded as one."""
-SX, SY = at.SCREEN_X, at.SCREEN_Y
 
 
 @kernel
@@ -29,35 +29,25 @@ def halve_extents(sample_left, sample_right, left, right, pixel_ids):
 
 
 @kernel
-def resolve(
-    left,
-    right,
-    first_record,
-    ids,
-    values,
-    record_face,
-    face_table,
-    pixel_ids,
-    edges,
-    edge_count,
-    mixed,
-    want_mixed,
-    flags,
-):
+def resolve(left, right, first_record, ids, values, records, face_table, pixel_ids, edges, mixed):
     """Sort the pixels inside the extents: one surface, background, standing still, or an edge.
 
     Args:
         first_record: Records below it stand still and were shaded before.
         ids, values: (2H, 2W) records and inverse depths of the samples.
         pixel_ids: (H, W) result: record, BACKGROUND, STILL or EDGE.
-        edges: Appended from `edge_count` on: y * W + x of pixels to be shaded sample by sample.
-        mixed: Likewise, of all pixels whose samples differ (when `want_mixed`).
-        flags: Set of each record from `first_record` on that owns a sample.
+        records: Those from `first_record` on that own a sample are flagged.
+        edges: Result: y * W + x of pixels to be shaded sample by sample.
+        mixed: Likewise, of all pixels whose samples differ; of size 0 when they are not wanted.
 
     Returns:
         Numbers of entries in `edges` and in `mixed`.
     """
     width = pixel_ids.shape[1]
+    want_mixed = mixed.size > 0
+    record_face = records.faces
+    flags = records.flags
+    edge_count = 0
     mixed_count = 0
     lowest = max(first_record, 0)
     for y in range(pixel_ids.shape[0]):
@@ -105,27 +95,16 @@ def resolve(
 
 
 @kernel
-def shade_edges(
-    first,
-    last,
-    edges,
-    ids,
-    width,
-    record_face,
-    face_table,
-    face_color,
-    records,
-    origins,
-    light,
-    heights,
-    size,
-    texels,
-    mips,
-    sky,
-    color,
-):
+def shade_edges(count, edges, ids, triangles, looks, color):
     """Shade the listed pixels sample by sample and mix; equal samples are shaded once."""
-    for e in range(first, last):
+    width = color.shape[1]
+    records = triangles.planes
+    origins = triangles.origins
+    face_table = looks.face_table
+    face_color = looks.face_color
+    light = looks.light
+    mips = looks.mips
+    for e in range(count):
         y = edges[e] // width
         x = edges[e] - y * width
         red = f4(0)
@@ -135,23 +114,23 @@ def shade_edges(
             sample_x = 2 * x + (s & 1)
             sample_y = 2 * y + (s >> 1)
             record = ids[sample_y, sample_x]
-            count = 1
+            alike = 1
             repeated = False
             for r in range(4):
                 if r != s and ids[2 * y + (r >> 1), 2 * x + (r & 1)] == record:
-                    count += 1
+                    alike += 1
                     if r < s:
                         repeated = True
             if repeated:
                 continue
-            share = f4(0.25) * f4(count)
+            share = f4(0.25) * f4(alike)
             if record < 0:
-                r0, g0, b0 = sky_pixel(sky, f4(x), f4(y))
+                r0, g0, b0 = sky_pixel(looks.sky, f4(x), f4(y))
                 red += share * r0
                 green += share * g0
                 blue += share * b0
                 continue
-            face = record_face[record]
+            face = triangles.faces[record]
             flags = face_table[face, at.FACE_FLAGS]
             fx = f4(sample_x - origins[record, 0])
             fy = f4(sample_y - origins[record, 1])
@@ -173,8 +152,8 @@ def shade_edges(
             if facing > f4(0):
                 diffuse = light[at.DIFFUSE] * facing
                 lit = shadow_at(
-                    heights,
-                    size,
+                    looks.heights,
+                    looks.size,
                     (p[3] + p[5] * fy + p[4] * fx) * z,
                     (p[6] + p[8] * fy + p[7] * fx) * z,
                     (p[9] + p[11] * fy + p[10] * fx) * z,
@@ -195,7 +174,7 @@ def shade_edges(
                 level = mip_level(f4(4) * p[at.TEXEL_DENSITY] * z * z * z, log2_side)
                 u = (p[21] + p[23] * fy + p[22] * fx) * z
                 v = (p[24] + p[26] * fy + p[25] * fx) * z
-                r0, g0, b0 = texel_at(texels, mips[texture, level], log2_side - level, u, v)
+                r0, g0, b0 = texel_at(looks.texels, mips[texture, level], log2_side - level, u, v)
                 c0 *= r0
                 c1 *= g0
                 c2 *= b0
@@ -208,53 +187,39 @@ def shade_edges(
 
 
 @inlined
-def covers(record, x, y, record_corners, vertices):
-    """Whether a triangle contains a point of the screen (1/256 sample)."""
-    a = index(record_corners[record, 0])
-    b = index(record_corners[record, 1])
-    c = index(record_corners[record, 2])
-    x0 = f8(vertices[a + index(SX)])
-    y0 = f8(vertices[a + index(SY)])
-    x1 = f8(vertices[b + index(SX)])
-    y1 = f8(vertices[b + index(SY)])
-    x2 = f8(vertices[c + index(SX)])
-    y2 = f8(vertices[c + index(SY)])
-    e0 = (y0 - y1) * (x - x0) + (x1 - x0) * (y - y0)
-    e1 = (y1 - y2) * (x - x1) + (x2 - x1) * (y - y1)
-    e2 = (y2 - y0) * (x - x2) + (x0 - x2) * (y - y2)
-    return e0 >= 0.0 and e1 >= 0.0 and e2 >= 0.0
+def covers(record, point, corners, vertices):
+    """Whether a triangle contains a point of the screen, as of `screen`."""
+    a = screen(vertices, index(corners[record, 0]))
+    b = screen(vertices, index(corners[record, 1]))
+    c = screen(vertices, index(corners[record, 2]))
+    return doubled_area(a, b, point) >= 0.0 and doubled_area(b, c, point) >= 0.0 and doubled_area(c, a, point) >= 0.0
+
+
+@inlined
+def value_at_centre(x, y, record, triangles):
+    """Inverse depth of a triangle's plane at the centre of a pixel."""
+    fx = f4(2 * x - triangles.origins[record, 0]) + f4(0.5)
+    fy = f4(2 * y - triangles.origins[record, 1]) + f4(0.5)
+    planes = triangles.planes
+    return planes[record, 0] + planes[record, 2] * fy + planes[record, 1] * fx
 
 
 @kernel
-def centre_of_mixed(
-    mixed,
-    mixed_count,
-    width,
-    ids,
-    values,
-    record_corners,
-    record_face,
-    face_table,
-    vertices,
-    records,
-    origins,
-    far_value,
-    want_depth,
-    depth,
-    want_segments,
-    segments,
-):
+def centre_of_mixed(mixed, mixed_count, ids, values, triangles, face_table, vertices, far_value, images):
     """Depth and segmentation, at the pixel's centre, of pixels whose samples differ.
 
     Of the triangles that own a sample of the pixel, or else of its neighbours, the nearest that covers the centre is
     seen there. Where none does (it lies on a triangle that fell between the samples), the owner of most samples
     stands for it, its plane kept within the depths of its samples.
     """
+    depth = images.depth
+    segments = images.segments
+    corners = triangles.corners
+    width = images.color.shape[1]
     for e in range(mixed_count):
         y = mixed[e] // width
         x = mixed[e] - y * width
-        centre_x = f8((2 * x + 1) * 256)
-        centre_y = f8((2 * y + 1) * 256)
+        centre = (f8((2 * x + 1) * 256), f8((2 * y + 1) * 256))
         best = -1
         best_value = f4(0)
         most = -1
@@ -284,10 +249,8 @@ def centre_of_mixed(
                 most = record
                 low = lowest
                 high = highest
-            if record >= 0 and covers(record, centre_x, centre_y, record_corners, vertices):
-                fx = f4(2 * x - origins[record, 0]) + f4(0.5)
-                fy = f4(2 * y - origins[record, 1]) + f4(0.5)
-                value = records[record, 0] + records[record, 2] * fy + records[record, 1] * fx
+            if record >= 0 and covers(record, centre, corners, vertices):
+                value = value_at_centre(x, y, record, triangles)
                 if value > far_value and (best < 0 or value > best_value):
                     best = record
                     best_value = value
@@ -298,20 +261,15 @@ def centre_of_mixed(
                 sample_y = 2 * y - 1 + (s >> 2)
                 if 0 <= sample_x < 2 * width and 0 <= sample_y < ids.shape[0]:
                     record = ids[sample_y, sample_x]
-                    if record >= 0 and covers(record, centre_x, centre_y, record_corners, vertices):
-                        fx = f4(2 * x - origins[record, 0]) + f4(0.5)
-                        fy = f4(2 * y - origins[record, 1]) + f4(0.5)
-                        value = records[record, 0] + records[record, 2] * fy + records[record, 1] * fx
+                    if record >= 0 and covers(record, centre, corners, vertices):
+                        value = value_at_centre(x, y, record, triangles)
                         if value > far_value and (best < 0 or value > best_value):
                             best = record
                             best_value = value
         if best < 0 and most >= 0 and background_count < 2:
-            fx = f4(2 * x - origins[most, 0]) + f4(0.5)
-            fy = f4(2 * y - origins[most, 1]) + f4(0.5)
             best = most
-            best_value = records[most, 0] + records[most, 2] * fy + records[most, 1] * fx
-            best_value = min(max(best_value, low), high)
-        if want_depth:
+            best_value = min(max(value_at_centre(x, y, most, triangles), low), high)
+        if depth.size > 0:
             depth[y, x] = f4(1) / best_value if best >= 0 else f4(0)
-        if want_segments:
-            segments[y, x] = face_table[record_face[best], at.FACE_SEGMENT] if best >= 0 else -1
+        if segments.size > 0:
+            segments[y, x] = face_table[triangles.faces[best], at.FACE_SEGMENT] if best >= 0 else -1

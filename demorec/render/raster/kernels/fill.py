@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from demorec.render.raster.kernels.jit import f4, f8, i4, index, inlined
+from demorec.render.raster.kernels.layout import SCREEN_X, SCREEN_Y
 
 STRIP = 16
 """Samples of a row that are tested at once. Fewer, and the compiler would unroll the loop instead of making vector code
@@ -19,11 +20,29 @@ NARROW = 3 * STRIP
 
 
 @inlined
-def fill_triangle(x0, y0, v0, x1, y1, v1, x2, y2, v2, area, width, height, values, ids, record, with_ids, left, right):
+def screen(vertices, address):
+    """Where a vertex is: (x, y) in 1/256 sample, whole numbers in float64."""
+    return f8(vertices[address + index(SCREEN_X)]), f8(vertices[address + index(SCREEN_Y)])
+
+
+@inlined
+def doubled_area(a, b, c):
+    """Of a triangle (x, y); positive where its corners go round clockwise, y pointing down."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+
+
+@inlined
+def covered(low, high, count):
+    """The first and the last of `count` samples in a row between two places (1/256 sample)."""
+    return max(0, math.ceil((low - 128.0) / 256.0)), min(count - 1, math.floor((high - 128.0) / 256.0))
+
+
+@inlined
+def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record, with_ids, left, right):
     """Draw one triangle of positive area where its value is greater than what is there.
 
     Args:
-        x0 .. y2: Corners, 1/256 sample, whole numbers in float64.
+        a, b, c: Corners, as of `screen`.
         v0, v1, v2: Value at the corners (inverse depth, height), linear over the image.
         values, ids: (height * width,) greatest value so far, and the record it came from.
         with_ids: Whether ids, left and right are kept.
@@ -32,12 +51,13 @@ def fill_triangle(x0, y0, v0, x1, y1, v1, x2, y2, v2, area, width, height, value
     Returns:
         Whether it may own a sample.
     """
-    y_first = max(0, math.ceil((min(y0, y1, y2) - 128.0) / 256.0))
-    y_last = min(height - 1, math.floor((max(y0, y1, y2) - 128.0) / 256.0))
+    x0, y0 = a
+    x1, y1 = b
+    x2, y2 = c
+    y_first, y_last = covered(min(y0, y1, y2), max(y0, y1, y2), height)
     if y_first > y_last:
         return False
-    x_first = max(0, math.ceil((min(x0, x1, x2) - 128.0) / 256.0))
-    x_last = min(width - 1, math.floor((max(x0, x1, x2) - 128.0) / 256.0))
+    x_first, x_last = covered(min(x0, x1, x2), max(x0, x1, x2), width)
     if x_first > x_last:
         return False
     inverse_area = 1.0 / area

@@ -8,6 +8,8 @@ first attribute. LANES is no power of two, or all attributes would fall on the s
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,6 +61,74 @@ TILE_SHIFT = 3
 """Shadow tiles are 8x8 texels."""
 MIP_LEVELS = 11
 """Columns of the mip table: the first texel of each level; then the log2 of the texture's side."""
+
+
+class Geometry(NamedTuple):
+    """Vertices and faces of all instances, the vertices numbered in their order.
+
+    Attributes:
+        vertex_start, vertex_count: (n,) of each instance.
+        face_start, face_end: (n,) of each instance.
+        vertices: Blocks of vertices, room for spare ones at the end.
+        num_vertices: Without the spare ones.
+        faces: (f, 3) vertex addresses, counter-clockwise from outside.
+    """
+
+    vertex_start: NDArray[np.int64]
+    vertex_count: NDArray[np.int64]
+    face_start: NDArray[np.int64]
+    face_end: NDArray[np.int64]
+    vertices: NDArray[np.float32]
+    num_vertices: int
+    faces: NDArray[np.int32]
+
+
+class Records(NamedTuple):
+    """Triangles that cover a sample at least, in the order in which they were drawn.
+
+    Attributes:
+        corners: (r, 3) vertex addresses.
+        faces: (r,) of which face they are, or a part.
+        flags: (r,) 1 where one owns a sample, so that its planes are needed.
+        planes: (r, RECORD).
+        origins: (r, 2) the samples where the planes start.
+    """
+
+    corners: NDArray[np.int32]
+    faces: NDArray[np.int32]
+    flags: NDArray[np.uint8]
+    planes: NDArray[np.float32]
+    origins: NDArray[np.int32]
+
+
+class Looks(NamedTuple):
+    """What decides the colour of a surface, and of the background.
+
+    Attributes:
+        face_table: (f, 4) flags, texture, segment, group (faces of equal look, which need no edge between).
+        face_color: (f, 4) red, green, blue, specular, 0..255 (0..1 with a texture).
+        texels, mips: Packed texels, and (textures, MIP_LEVELS + 1) where their levels start.
+        light: (LIGHT_SIZE,) parameters.
+        sky: (SKY_SIZE,) rays and colours.
+        heights, size: (size * size,) shadow map, and its side.
+    """
+
+    face_table: NDArray[np.int32]
+    face_color: NDArray[np.float32]
+    texels: NDArray[np.uint32]
+    mips: NDArray[np.int64]
+    light: NDArray[np.float32]
+    sky: NDArray[np.float32]
+    heights: NDArray[np.float32]
+    size: int
+
+
+class Images(NamedTuple):
+    """(H, W, 3) colour, (H, W) depth and segmentation; the latter two of size (0, 0) when not wanted."""
+
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    segments: NDArray[np.int32]
 
 
 def addresses(count: int, start: int = 0) -> NDArray[np.int64]:

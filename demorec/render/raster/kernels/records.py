@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 from demorec.render.raster.kernels import layout as at
+from demorec.render.raster.kernels.fill import doubled_area, screen
 from demorec.render.raster.kernels.jit import f4, f8, index, inlined, kernel
 
-SX, SY, IW = at.SCREEN_X, at.SCREEN_Y, at.INVERSE_W
-TO_LIGHT, UPWARD, HALFWAY, TEX_U, TEX_V = at.TO_LIGHT, at.UPWARD, at.HALFWAY, at.TEX_U, at.TEX_V
-LX, LY, LZ = at.SHADOW_X, at.SHADOW_Y, at.SHADOW_Z
+LANES, IW, TEX_U, TEX_V = at.LANES, at.INVERSE_W, at.TEX_U, at.TEX_V
 
 
 @kernel
@@ -26,47 +25,43 @@ def flag_owners(left, right, first_record, ids, flags):
 
 
 @inlined
-def set_plane(records, record, column, vertices, attribute, a, b, c, step_x, step_y, value):
-    """Plane of one attribute over the image; the weights hold each corner's share, divided by its depth."""
-    p = vertices[a + attribute]
-    q = vertices[b + attribute]
-    r = vertices[c + attribute]
-    records[record, column] = value[0] * p + value[1] * q + value[2] * r
-    records[record, column + 1] = step_x[0] * p + step_x[1] * q + step_x[2] * r
-    records[record, column + 2] = step_y[0] * p + step_y[1] * q + step_y[2] * r
-
-
-@inlined
-def set_constant(records, record, column, value):
-    """Plane of a quantity that is the same all over the triangle: the inverse depth's, scaled."""
-    records[record, column] = value * records[record, 0]
-    records[record, column + 1] = value * records[record, 1]
-    records[record, column + 2] = value * records[record, 2]
+def set_planes(planes, record, column, vertices, attribute, count, corners, value, step_x, step_y):
+    """Planes of attributes that follow each other, over the image; the weights hold each corner's share over depth."""
+    a, b, c = corners
+    for k in range(count):
+        p = vertices[a + index(attribute + k * LANES)]
+        q = vertices[b + index(attribute + k * LANES)]
+        r = vertices[c + index(attribute + k * LANES)]
+        planes[record, column + 3 * k] = value[0] * p + value[1] * q + value[2] * r
+        planes[record, column + 3 * k + 1] = step_x[0] * p + step_x[1] * q + step_x[2] * r
+        planes[record, column + 3 * k + 2] = step_y[0] * p + step_y[1] * q + step_y[2] * r
 
 
 @kernel
-def set_up_records(first, last, flags, record_corners, record_face, face_table, vertices, records, origins):
-    """Fill (n, RECORD) `records` and (n, 2) `origins` (the sample where the planes start) of the flagged ones."""
+def set_up_records(first, last, records, face_table, vertices):
+    """Fill the planes and origins of the flagged records `first` .. `last` - 1."""
+    planes = records.planes
     for t in range(first, last):
-        if flags[t] == 0:
+        if records.flags[t] == 0:
             continue
-        a = index(record_corners[t, 0])
-        b = index(record_corners[t, 1])
-        c = index(record_corners[t, 2])
-        x0 = f8(vertices[a + index(SX)])
-        y0 = f8(vertices[a + index(SY)])
-        x1 = f8(vertices[b + index(SX)])
-        y1 = f8(vertices[b + index(SY)])
-        x2 = f8(vertices[c + index(SX)])
-        y2 = f8(vertices[c + index(SY)])
-        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        a = index(records.corners[t, 0])
+        b = index(records.corners[t, 1])
+        c = index(records.corners[t, 2])
+        corners = (a, b, c)
+        pa = screen(vertices, a)
+        pb = screen(vertices, b)
+        pc = screen(vertices, c)
+        x0, y0 = pa
+        x1, y1 = pb
+        x2, y2 = pc
+        area = doubled_area(pa, pb, pc)
         scale = 256.0 / area
         origin_x = int(min(x0, x1, x2)) >> 8
         origin_y = int(min(y0, y1, y2)) >> 8
         px = f8((origin_x << 8) + 128)
         py = f8((origin_y << 8) + 128)
-        origins[t, 0] = origin_x
-        origins[t, 1] = origin_y
+        records.origins[t, 0] = origin_x
+        records.origins[t, 1] = origin_y
         # Barycentric weights: steps a sample, and values at the origin.
         a1 = (y2 - y0) * scale
         b1 = (x0 - x2) * scale
@@ -80,13 +75,11 @@ def set_up_records(first, last, flags, record_corners, record_face, face_table, 
         step_x = (f4(-(a1 + a2) * wa), f4(a1 * wb), f4(a2 * wc))
         step_y = (f4(-(b1 + b2) * wa), f4(b1 * wb), f4(b2 * wc))
         value = (f4((1.0 - c1 - c2) * wa), f4(c1 * wb), f4(c2 * wc))
-        records[t, 0] = value[0] + value[1] + value[2]
-        records[t, 1] = step_x[0] + step_x[1] + step_x[2]
-        records[t, 2] = step_y[0] + step_y[1] + step_y[2]
-        set_plane(records, t, at.SHADOW_X_PLANE, vertices, index(LX), a, b, c, step_x, step_y, value)
-        set_plane(records, t, at.SHADOW_Y_PLANE, vertices, index(LY), a, b, c, step_x, step_y, value)
-        set_plane(records, t, at.SHADOW_Z_PLANE, vertices, index(LZ), a, b, c, step_x, step_y, value)
-        kind = face_table[record_face[t], at.FACE_FLAGS]
+        planes[t, 0] = value[0] + value[1] + value[2]
+        planes[t, 1] = step_x[0] + step_x[1] + step_x[2]
+        planes[t, 2] = step_y[0] + step_y[1] + step_y[2]
+        set_planes(planes, t, at.SHADOW_X_PLANE, vertices, at.SHADOW_X, 3, corners, value, step_x, step_y)
+        kind = face_table[records.faces[t], at.FACE_FLAGS]
         if kind & at.SMOOTH:
             e0 = (x1 - x0) ** 2 + (y1 - y0) ** 2
             e1 = (x2 - x1) ** 2 + (y2 - y1) ** 2
@@ -94,40 +87,24 @@ def set_up_records(first, last, flags, record_corners, record_face, face_table, 
             if area * area < 65536.0 * max(e0, e1, e2):
                 # Thinner than a sample: the mean normal, where the gradient would run wild.
                 third = f4(1.0 / 3.0)
-                set_constant(
-                    records,
-                    t,
-                    at.TO_LIGHT_PLANE,
-                    (vertices[a + index(TO_LIGHT)] + vertices[b + index(TO_LIGHT)] + vertices[c + index(TO_LIGHT)])
-                    * third,
-                )
-                set_constant(
-                    records,
-                    t,
-                    at.UPWARD_PLANE,
-                    (vertices[a + index(UPWARD)] + vertices[b + index(UPWARD)] + vertices[c + index(UPWARD)]) * third,
-                )
-                set_constant(
-                    records,
-                    t,
-                    at.HALFWAY_PLANE,
-                    (vertices[a + index(HALFWAY)] + vertices[b + index(HALFWAY)] + vertices[c + index(HALFWAY)])
-                    * third,
-                )
+                for k in range(3):
+                    place = at.TO_LIGHT + k * LANES
+                    mean = (
+                        vertices[a + index(place)] + vertices[b + index(place)] + vertices[c + index(place)]
+                    ) * third
+                    for j in range(3):
+                        planes[t, at.TO_LIGHT_PLANE + 3 * k + j] = mean * planes[t, j]
             else:
-                set_plane(records, t, at.TO_LIGHT_PLANE, vertices, index(TO_LIGHT), a, b, c, step_x, step_y, value)
-                set_plane(records, t, at.UPWARD_PLANE, vertices, index(UPWARD), a, b, c, step_x, step_y, value)
-                set_plane(records, t, at.HALFWAY_PLANE, vertices, index(HALFWAY), a, b, c, step_x, step_y, value)
+                set_planes(planes, t, at.TO_LIGHT_PLANE, vertices, at.TO_LIGHT, 3, corners, value, step_x, step_y)
         else:
             # Flat: the value itself, no plane.
-            records[t, at.TO_LIGHT_PLANE] = vertices[a + index(TO_LIGHT)]
-            records[t, at.UPWARD_PLANE] = vertices[a + index(UPWARD)]
+            planes[t, at.TO_LIGHT_PLANE] = vertices[a + index(at.TO_LIGHT)]
+            planes[t, at.UPWARD_PLANE] = vertices[a + index(at.UPWARD)]
         if kind & at.TEXTURED:
-            set_plane(records, t, at.TEX_U_PLANE, vertices, index(TEX_U), a, b, c, step_x, step_y, value)
-            set_plane(records, t, at.TEX_V_PLANE, vertices, index(TEX_V), a, b, c, step_x, step_y, value)
+            set_planes(planes, t, at.TEX_U_PLANE, vertices, TEX_U, 2, corners, value, step_x, step_y)
             du1 = f8(vertices[b + index(TEX_U)] - vertices[a + index(TEX_U)])
             du2 = f8(vertices[c + index(TEX_U)] - vertices[a + index(TEX_U)])
             dv1 = f8(vertices[b + index(TEX_V)] - vertices[a + index(TEX_V)])
             dv2 = f8(vertices[c + index(TEX_V)] - vertices[a + index(TEX_V)])
             # The ratio of areas on texture and screen falls with the cube of inverse depth.
-            records[t, at.TEXEL_DENSITY] = f4(abs(du1 * dv2 - du2 * dv1) * 65536.0 * wa * wb * wc / area)
+            planes[t, at.TEXEL_DENSITY] = f4(abs(du1 * dv2 - du2 * dv1) * 65536.0 * wa * wb * wc / area)

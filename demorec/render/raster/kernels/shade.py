@@ -109,9 +109,10 @@ def texture_run(
 
 
 @inlined
-def finish_chunk(y, count, columns, scratch, places, heights, size, in_shadow, color, keep, still):
+def finish_chunk(y, count, columns, scratch, places, looks, color, keep, still):
     """Shadow, tone and colour of the pixels gathered in scratch."""
-    look_up_row(scratch, places, count, heights, size)
+    look_up_row(scratch, places, count, looks.heights, looks.size)
+    in_shadow = looks.light[at.IN_SHADOW]
     for j in range(count):
         lit = in_shadow + (f4(1) - in_shadow) * scratch[index(j + LIT)]
         scratch[index(j + RED)] = tone(scratch[index(j + AMBIENT_R)] + lit * scratch[index(j + DIRECT_R)])
@@ -132,44 +133,26 @@ def finish_chunk(y, count, columns, scratch, places, heights, size, in_shadow, c
 
 
 @kernel
-def shade_rows(
-    left,
-    right,
-    first_record,
-    ids,
-    samples,
-    record_face,
-    face_table,
-    face_color,
-    records,
-    origins,
-    light,
-    heights,
-    size,
-    texels,
-    mips,
-    sky,
-    color,
-    keep,
-    still,
-    want_depth,
-    depth,
-    want_segments,
-    segments,
-):
+def shade_rows(left, right, first_record, ids, samples, triangles, looks, images, still):
     """Shade the pixels inside the extents whose record is at least `first_record` (-1: background too).
 
     Args:
         left, right: (H,) extents of each row.
         ids: (H, W) int32 record of each pixel.
         samples: Samples along a pixel's side; records are planes over samples.
-        face_table, face_color: See layout.
-        light: (LIGHT_SIZE,) parameters.
-        heights, size: Shadow map and its side.
-        texels, mips: Packed texels, and (textures, MIP_LEVELS + 1) where their levels start.
-        color, depth, segments: (H, W, 3), (H, W), (H, W) results; the latter two when wanted.
-        keep, still: Whether to note (H, W, STILL_SIZE) what re-shading needs; x is -9 where nothing is.
+        triangles, looks, images: See layout.
+        still: (H, W, STILL_SIZE) what re-shading needs, x being -9 where nothing is; of size 0 when it is not wanted.
     """
+    records = triangles.planes
+    origins = triangles.origins
+    face_table = looks.face_table
+    face_color = looks.face_color
+    light = looks.light
+    mips = looks.mips
+    color, depth, segments = images
+    want_depth = depth.size > 0
+    want_segments = segments.size > 0
+    keep = still.size > 0
     scratch = np.empty(COLUMNS * PITCH, np.float32)
     columns = np.empty(PITCH, np.int32)
     places = np.empty(3 * PITCH, np.int32)
@@ -180,7 +163,6 @@ def shade_rows(
     ambient = light[at.AMBIENT]
     ambient_up = light[at.AMBIENT_UP]
     diffuse = light[at.DIFFUSE]
-    in_shadow = light[at.IN_SHADOW]
     light_r = light[at.LIGHT_RED]
     light_g = light[at.LIGHT_GREEN]
     light_b = light[at.LIGHT_BLUE]
@@ -198,7 +180,7 @@ def shade_rows(
                 continue
             if record < 0:
                 for i in range(xa, x):
-                    red, green, blue = sky_pixel(sky, f4(i), f4(y))
+                    red, green, blue = sky_pixel(looks.sky, f4(i), f4(y))
                     color[y, i, 0] = np.uint8(i4(red + f4(0.5)))
                     color[y, i, 1] = np.uint8(i4(green + f4(0.5)))
                     color[y, i, 2] = np.uint8(i4(blue + f4(0.5)))
@@ -216,11 +198,11 @@ def shade_rows(
                 x = xa + CHUNK  # the rest comes round again
             n = x - xa
             if filled + n > CHUNK:
-                finish_chunk(y, filled, columns, scratch, places, heights, size, in_shadow, color, keep, still)
+                finish_chunk(y, filled, columns, scratch, places, looks, color, keep, still)
                 filled = np.int64(0)
             m = filled
             filled += n
-            face = record_face[record]
+            face = triangles.faces[record]
             flags = face_table[face, at.FACE_FLAGS]
             sy = f4(y * samples - origins[record, 1]) + middle
             sx = f4(xa * samples - origins[record, 0]) + middle
@@ -322,7 +304,7 @@ def shade_rows(
                         i_end - i,
                         places,
                         corners,
-                        texels,
+                        looks.texels,
                         mips[texture, level],
                         log2_side - level,
                         tu,
@@ -358,4 +340,4 @@ def shade_rows(
                 for i in range(xa, x):
                     segments[y, i] = segment
         if filled > 0:
-            finish_chunk(y, filled, columns, scratch, places, heights, size, in_shadow, color, keep, still)
+            finish_chunk(y, filled, columns, scratch, places, looks, color, keep, still)

@@ -15,8 +15,13 @@ SHIFT = at.TILE_SHIFT
 
 
 @kernel
-def restore_samples(values, still_values, ids, still_ids, left, right, width):
+def restore_samples(values, still_values, ids, still_ids, left, right):
     """Undo the moving layer of the last image, row by row, and empty the extents."""
+    width = ids.shape[1]
+    values = values.reshape(-1)
+    still_values = still_values.reshape(-1)
+    ids = ids.reshape(-1)
+    still_ids = still_ids.reshape(-1)
     for y in range(left.shape[0]):
         start = y * width + left[y]
         n = right[y] - left[y]
@@ -29,7 +34,7 @@ def restore_samples(values, still_values, ids, still_ids, left, right, width):
 
 
 @kernel
-def list_tiles(still, pixel_ids, ids, records, origins, tiles, size, tile_start, tile_pixels):
+def list_tiles(still, pixel_ids, ids, triangles, tiles, size, tile_start, tile_pixels):
     """For each tile of the shadow map, the pixels that look into it: a pixel y * W + x for each lookup.
 
     Args:
@@ -38,6 +43,8 @@ def list_tiles(still, pixel_ids, ids, records, origins, tiles, size, tile_start,
         tile_pixels: Result, large enough for four lookups a pixel.
     """
     height, width = pixel_ids.shape
+    records = triangles.planes
+    origins = triangles.origins
     limit = f4(size - 1)
     tile_start[:] = 0
     for fill in range(2):
@@ -78,8 +85,9 @@ def list_tiles(still, pixel_ids, ids, records, origins, tiles, size, tile_start,
 
 
 @kernel
-def gather_still(still, tile_pixels, count, width, gathered):
+def gather_still(still, tile_pixels, count, gathered):
     """Copy the pixels' terms into the order of the tiles, (count, STILL_SIZE)."""
+    width = still.shape[1]
     for i in range(count):
         y = tile_pixels[i] // width
         x = tile_pixels[i] - y * width
@@ -89,27 +97,15 @@ def gather_still(still, tile_pixels, count, width, gathered):
 
 @kernel
 def shade_still(
-    touched,
-    tile_start,
-    tile_pixels,
-    gathered,
-    first_record,
-    pixel_ids,
-    still_pixel_ids,
-    light,
-    heights,
-    size,
-    color,
-    edges,
-    edge_count,
+    touched, tile_start, tile_pixels, gathered, first_record, pixel_ids, still_pixel_ids, looks, color, edges, count
 ):
     """Shade anew what stands still and looks into a touched tile; edge pixels are appended to `edges` instead.
 
     Returns:
-        The number of entries in `edges`; the pixels appended here are marked QUEUED.
+        The number of entries in `edges`, of which there were `count`; the pixels appended here are marked QUEUED.
     """
     width = pixel_ids.shape[1]
-    in_shadow = light[at.IN_SHADOW]
+    in_shadow = looks.light[at.IN_SHADOW]
     flat = touched.reshape(-1)
     for tile in range(flat.shape[0]):
         if flat[index(tile)] == 0:
@@ -122,16 +118,16 @@ def shade_still(
             if now >= first_record or now in (EDGE, QUEUED):
                 continue
             if still_pixel_ids[y, x] == EDGE:
-                edges[edge_count] = pixel
-                edge_count += 1
+                edges[count] = pixel
+                count += 1
                 pixel_ids[y, x] = QUEUED
                 continue
-            lit = shadow_at(heights, size, gathered[i, 6], gathered[i, 7], gathered[i, 8])
+            lit = shadow_at(looks.heights, looks.size, gathered[i, 6], gathered[i, 7], gathered[i, 8])
             lit = in_shadow + (f4(1) - in_shadow) * lit
             color[y, x, 0] = np.uint8(i4(tone(gathered[i, 0] + lit * gathered[i, 3]) + f4(0.5)))
             color[y, x, 1] = np.uint8(i4(tone(gathered[i, 1] + lit * gathered[i, 4]) + f4(0.5)))
             color[y, x, 2] = np.uint8(i4(tone(gathered[i, 2] + lit * gathered[i, 5]) + f4(0.5)))
-    return edge_count
+    return count
 
 
 @kernel

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from demorec.render.raster.kernels import layout as at
-from demorec.render.raster.kernels.fill import fill_triangle
+from demorec.render.raster.kernels.fill import covered, doubled_area, fill_triangle, screen
 from demorec.render.raster.kernels.jit import f4, f8, index, inlined, kernel
 
 LANES, BLOCK = at.LANES, at.BLOCK
@@ -47,69 +45,59 @@ def clip_distance(vertices, a, plane, near):
     return f4(GUARD) * w + vertices[a + CY]
 
 
+@inlined
+def note_record(records, record, a, b, c, face):
+    """Write down the corners of a triangle, and whose it is."""
+    records.corners[record, 0] = a
+    records.corners[record, 1] = b
+    records.corners[record, 2] = c
+    records.faces[record] = face
+
+
 @kernel
-def draw_instances(
-    record,
-    first,
-    last,
-    visible,
-    face_start,
-    face_end,
-    faces,
-    vertices,
-    next_vertex,
-    vertex_limit,
-    width,
-    height,
-    near,
-    values,
-    ids,
-    record_corners,
-    record_face,
-    left,
-    right,
-):
+def draw_instances(first, last, record, next_vertex, geometry, visible, values, ids, near, records, left, right):
     """Draw the faces of the visible instances `first` .. `last` - 1 that look towards the camera.
 
     Args:
         record: Number of the first record to write; a record is one triangle that covers at least one sample.
-        faces: (f, 3) vertex addresses, counter-clockwise from outside.
-        next_vertex, vertex_limit: Numbers of the first vertex free for clipping, and of the first too many.
-        values, ids: (height * width,) inverse depth and record numbers.
-        record_corners, record_face: (r, 3), (r,) results.
+        next_vertex: Number of the first vertex free for clipping.
+        values, ids: (height, width) inverse depth and record numbers of the samples.
+        records: Of which the corners and faces are written.
         left, right: (height,) extents of what was drawn.
 
     Returns:
         The next free record and vertex; a record of -1 when the room for clipped vertices or records ran out.
     """
     with_ids = np.bool_(True)  # no literal, for which all that is inlined would be compiled once more
+    height, width = ids.shape
+    values = values.reshape(-1)
+    ids = ids.reshape(-1)
+    vertices = geometry.vertices
     guard = f4(GUARD)
     half_width = f4(width * 128.0)
     half_height = f4(height * 128.0)
     inside = np.empty(12, np.int64)
     outside = np.empty(12, np.int64)
     clip_near = near * f4(1.001)
-    record_limit = record_face.shape[0] - 8
+    record_limit = records.faces.shape[0] - 8
+    vertex_limit = vertices.shape[0] // BLOCK * LANES
     for k in range(first, last):
         if not visible[k]:
             continue
-        for f in range(face_start[k], face_end[k]):
-            a = index(faces[f, 0])
-            b = index(faces[f, 1])
-            c = index(faces[f, 2])
+        for f in range(geometry.face_start[k], geometry.face_end[k]):
+            a = index(geometry.faces[f, 0])
+            b = index(geometry.faces[f, 1])
+            c = index(geometry.faces[f, 2])
             wa = vertices[a + index(CW)]
             wb = vertices[b + index(CW)]
             wc = vertices[c + index(CW)]
             if record >= record_limit:
                 return -1, next_vertex
             if min(wa, wb, wc) > near:
-                x0 = f8(vertices[a + index(SX)])
-                y0 = f8(vertices[a + index(SY)])
-                x1 = f8(vertices[b + index(SX)])
-                y1 = f8(vertices[b + index(SY)])
-                x2 = f8(vertices[c + index(SX)])
-                y2 = f8(vertices[c + index(SY)])
-                area = (x2 - x0) * (y1 - y0) - (x1 - x0) * (y2 - y0)
+                pa = screen(vertices, a)
+                pb = screen(vertices, b)
+                pc = screen(vertices, c)
+                area = doubled_area(pa, pc, pb)
                 if area <= 0.0:
                     continue
                 cx = max(
@@ -127,29 +115,9 @@ def draw_instances(
                     vb = f8(vertices[b + index(IW)])
                     vc = f8(vertices[c + index(IW)])
                     if fill_triangle(
-                        x0,
-                        y0,
-                        va,
-                        x2,
-                        y2,
-                        vc,
-                        x1,
-                        y1,
-                        vb,
-                        area,
-                        width,
-                        height,
-                        values,
-                        ids,
-                        record,
-                        with_ids,
-                        left,
-                        right,
+                        pa, pc, pb, va, vc, vb, area, width, height, values, ids, record, with_ids, left, right
                     ):
-                        record_corners[record, 0] = a
-                        record_corners[record, 1] = c
-                        record_corners[record, 2] = b
-                        record_face[record] = f
+                        note_record(records, record, a, c, b, f)
                         record += 1
                     continue
             if max(wa, wb, wc) <= near:
@@ -197,36 +165,28 @@ def draw_instances(
                 if corners < 3:
                     break
             for q in range(1, corners - 1):
-                u = inside[0]
-                v = inside[q]
-                w = inside[q + 1]
-                x0 = f8(vertices[u + SX])
-                y0 = f8(vertices[u + SY])
-                x1 = f8(vertices[v + SX])
-                y1 = f8(vertices[v + SY])
-                x2 = f8(vertices[w + SX])
-                y2 = f8(vertices[w + SY])
-                area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+                u = index(inside[0])
+                v = index(inside[q])
+                w = index(inside[q + 1])
+                pu = screen(vertices, u)
+                pv = screen(vertices, v)
+                pw = screen(vertices, w)
+                area = doubled_area(pu, pv, pw)
                 if area <= 0.0:
                     continue
-                va = f8(vertices[u + IW])
-                vb = f8(vertices[v + IW])
-                vc = f8(vertices[w + IW])
+                vu = f8(vertices[u + index(IW)])
+                vv = f8(vertices[v + index(IW)])
+                vw = f8(vertices[w + index(IW)])
                 if fill_triangle(
-                    x0, y0, va, x1, y1, vb, x2, y2, vc, area, width, height, values, ids, record, with_ids, left, right
+                    pu, pv, pw, vu, vv, vw, area, width, height, values, ids, record, with_ids, left, right
                 ):
-                    record_corners[record, 0] = u
-                    record_corners[record, 1] = v
-                    record_corners[record, 2] = w
-                    record_face[record] = f
+                    note_record(records, record, u, v, w, f)
                     record += 1
     return record, next_vertex
 
 
 @kernel
-def draw_casters(
-    first, last, face_start, face_end, faces, vertices, size, heights, touched, mark, bounds, no_ids, no_extents
-):
+def draw_casters(first, last, geometry, size, heights, touched, mark, bounds, nothing):
     """Draw the faces of instances `first` .. `last` - 1 into the shadow map, both sides of each.
 
     Back faces are drawn too: a decimated mesh leaves gaps at its silhouette, and culling would let light through.
@@ -236,37 +196,32 @@ def draw_casters(
         heights: (size * size,) greatest height towards the light.
         touched: (tiles, tiles) uint8, set where a lookup may see what was drawn (when `mark`).
         bounds: (4,) x from, x to, y from, y to of what was drawn, widened (when `mark`).
-        no_ids, no_extents: Empty int32 arrays.
+        nothing: An empty int32 array, in the place of record numbers and extents.
     """
     record = np.int64(0)  # no literals, see draw_instances
     with_ids = np.bool_(False)
+    vertices = geometry.vertices
     for k in range(first, last):
-        for f in range(face_start[k], face_end[k]):
-            a = index(faces[f, 0])
-            b = index(faces[f, 1])
-            c = index(faces[f, 2])
-            x0 = f8(vertices[a + index(SX)])
-            y0 = f8(vertices[a + index(SY)])
-            v0 = f8(vertices[a + index(IW)])
-            x1 = f8(vertices[b + index(SX)])
-            y1 = f8(vertices[b + index(SY)])
-            v1 = f8(vertices[b + index(IW)])
-            x2 = f8(vertices[c + index(SX)])
-            y2 = f8(vertices[c + index(SY)])
-            v2 = f8(vertices[c + index(IW)])
-            area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        for f in range(geometry.face_start[k], geometry.face_end[k]):
+            a = index(geometry.faces[f, 0])
+            b = index(geometry.faces[f, 1])
+            c = index(geometry.faces[f, 2])
+            pa = screen(vertices, a)
+            pb = screen(vertices, b)
+            pc = screen(vertices, c)
+            va = f8(vertices[a + index(IW)])
+            vb = f8(vertices[b + index(IW)])
+            vc = f8(vertices[c + index(IW)])
+            area = doubled_area(pa, pb, pc)
             if area == 0.0:
                 continue
             if area < 0.0:
                 area = -area
-                x1, x2 = x2, x1
-                y1, y2 = y2, y1
-                v1, v2 = v2, v1
+                pb, pc = pc, pb
+                vb, vc = vc, vb
             if mark:
-                y_first = max(0, math.ceil((min(y0, y1, y2) - 128.0) / 256.0))
-                y_last = min(size - 1, math.floor((max(y0, y1, y2) - 128.0) / 256.0))
-                x_first = max(0, math.ceil((min(x0, x1, x2) - 128.0) / 256.0))
-                x_last = min(size - 1, math.floor((max(x0, x1, x2) - 128.0) / 256.0))
+                y_first, y_last = covered(min(pa[1], pb[1], pc[1]), max(pa[1], pb[1], pc[1]), size)
+                x_first, x_last = covered(min(pa[0], pb[0], pc[0]), max(pa[0], pb[0], pc[0]), size)
                 if y_first > y_last or x_first > x_last:
                     continue
                 bounds[0] = min(bounds[0], x_first)
@@ -278,22 +233,5 @@ def draw_casters(
                     for tile_x in range(max(0, x_first - 2) >> SHIFT, (min(size - 1, x_last + 1) >> SHIFT) + 1):
                         touched[tile_y, tile_x] = 1
             fill_triangle(
-                x0,
-                y0,
-                v0,
-                x1,
-                y1,
-                v1,
-                x2,
-                y2,
-                v2,
-                area,
-                size,
-                size,
-                heights,
-                no_ids,
-                record,
-                with_ids,
-                no_extents,
-                no_extents,
+                pa, pb, pc, va, vb, vc, area, size, size, heights, nothing, record, with_ids, nothing, nothing
             )

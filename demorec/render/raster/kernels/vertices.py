@@ -132,9 +132,7 @@ def transform_vertices(
     first,
     last,
     visible,
-    start,
-    count,
-    vertices,
+    geometry,
     clip_from_shape,
     shadow_from_shape,
     light_in_shape,
@@ -147,11 +145,10 @@ def transform_vertices(
     """Fill the per-camera attributes of the vertices of the visible instances `first` .. `last` - 1.
 
     Args:
-        start, count: (n,) number of each instance's first vertex, and how many it has.
-        vertices: Blocks of vertices (see layout).
         offset: How far along the normal a vertex is moved before it is looked up in the shadow map, metres.
         width, height: Samples.
     """
+    vertices = geometry.vertices
     half_width = f4(width * 128.0)
     half_height = f4(height * 128.0)
     for k in range(first, last):
@@ -169,8 +166,8 @@ def transform_vertices(
         w = world_from_shape[k]
         u0, u1, u2 = f4(w[2, 0]), f4(w[2, 1]), f4(w[2, 2])
         e0, e1, e2 = f4(eye_in_shape[k, 0]), f4(eye_in_shape[k, 1]), f4(eye_in_shape[k, 2])
-        vertex = start[k]
-        end = start[k] + count[k]
+        vertex = geometry.vertex_start[k]
+        end = vertex + geometry.vertex_count[k]
         while vertex < end:
             block = vertex // LANES
             lane = vertex - block * LANES
@@ -219,15 +216,16 @@ def transform_vertices(
 
 
 @kernel
-def transform_casters(first, last, start, count, vertices, shadow_from_shape):
+def transform_casters(first, last, geometry, shadow_from_shape):
     """Fill screen position (1/256 texel) and height of the vertices of shadow casters `first` .. `last` - 1."""
+    vertices = geometry.vertices
     for k in range(first, last):
         s = shadow_from_shape[k]
         s00, s01, s02, s03 = f4(s[0, 0]), f4(s[0, 1]), f4(s[0, 2]), f4(s[0, 3])
         s10, s11, s12, s13 = f4(s[1, 0]), f4(s[1, 1]), f4(s[1, 2]), f4(s[1, 3])
         s20, s21, s22, s23 = f4(s[2, 0]), f4(s[2, 1]), f4(s[2, 2]), f4(s[2, 3])
-        vertex = start[k]
-        end = start[k] + count[k]
+        vertex = geometry.vertex_start[k]
+        end = vertex + geometry.vertex_count[k]
         while vertex < end:
             block = vertex // LANES
             lane = vertex - block * LANES
