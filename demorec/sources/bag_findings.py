@@ -25,7 +25,7 @@ from demorec.sources.findings import (
     of_stream,
     stream_findings,
 )
-from demorec.sources.mapping import SourceMapping
+from demorec.sources.mapping import Source, SourceMapping
 from demorec.sources.rows import RATE, EpisodeRows, Timelines
 from demorec.sources.streams import BagStreams
 
@@ -62,7 +62,7 @@ def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
     yield from _camera_findings(bag.streams)
     yield from _frozen_findings(lines)
     yield from _slow_findings(lines, bag.mapping.clock.fps)
-    yield from _unit_findings(bag.streams, bag.mapping)
+    yield from _unit_findings(bag.streams)
     yield from _action_findings(bag.streams, bag.mapping)
 
 
@@ -101,7 +101,7 @@ def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Findi
 def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
     """Joints that stop coming while others of their topic, or the same ones from another publisher, go on."""
     for line in regular:
-        joints = line.stream.layout.joints if line.stream.layout else ()
+        joints = line.stream.reader.joints if line.stream.reader else ()
         key = (line.stream.topic, line.is_header)
         others = [other for other in regular if (other.stream.topic, other.is_header) == key]
         early = max(int(other.times_ns[-1]) for other in others) - int(line.times_ns[-1])
@@ -174,7 +174,7 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
         within = values[line.order[(line.times_ns >= begin_ns) & (line.times_ns <= end_ns)]].astype(np.float64)
         if len(within) < 2:
             continue
-        for start in line.stream.layout.quaternions if line.stream.layout else ():
+        for start in line.stream.quaternions:
             within[:, start : start + 4] *= signs_of_course(within[:, start : start + 4])[:, None]
         whole = np.linalg.norm(np.ptp(np.nan_to_num(values), axis=0))
         moves.append(not np.linalg.norm(np.ptp(within, axis=0)) <= _RESTS * whole)  # nor where a number is none
@@ -214,10 +214,13 @@ def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
             yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
 
 
-def _unit_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
-    for (name, index), stream in streams.sources.items():
-        source = mapping.features[name][index]
-        if stream.values is None or source.next or (source.to or source.unit) != "rad":
+def _unit_findings(streams: BagStreams) -> Iterator[Finding]:
+    for stream in streams.all.values():
+        if (
+            stream.values is None
+            or not isinstance(stream.part, Source)
+            or (stream.part.to or stream.part.unit) != "rad"
+        ):
             continue
         largest = float(np.nanmax(np.abs(stream.values), initial=0.0))
         if largest > _FULL_TURNS:
@@ -228,15 +231,14 @@ def _action_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Fi
     """State and action that do not speak of the same thing."""
     if any(source.next for source in mapping.features[ACTION]):
         return
-    state, action = streams.sources[STATE, 0], streams.sources[ACTION, 0]
-    if state.values is None or action.values is None or state.layout is None or action.layout is None:
-        return
-    shared = [(state.layout.names.index(name), column) for column, name in enumerate(action.layout.names)
-              if name in state.layout.names]  # fmt: skip
+    state, action = streams.all[STATE, 0], streams.all[ACTION, 0]
+    assert state.values is not None
+    assert action.values is not None
+    shared = [(state.names.index(name), column) for column, name in enumerate(action.names) if name in state.names]
     moving = [pair for pair in shared if _spread(action.values[:, pair[1]]) > 0.05]
     dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]
     if dead:
-        name = state.layout.names[dead[0][0]]
+        name = state.names[dead[0][0]]
         yield of_stream(state, "stuck", f"{name!r} never changes while the action of the same name does")
     ratios = [_spread(state.values[:, ours]) / _spread(action.values[:, theirs]) for ours, theirs in moving]
     ratio = float(np.median(ratios)) if len(ratios) > 1 else 1.0
@@ -270,7 +272,7 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
     line, clock = lines.lines[name], lines.mapping.clock
     num_repeated = num_free = num_skipped = num_images = 0
     for rows in episodes:
-        shown = lines.chosen(name, rows.times_ns).index
+        shown = line.chosen(rows.times_ns).index
         steps = np.diff(shown)
         repeated = shown[1:][steps == 0]
         num_repeated += len(repeated)

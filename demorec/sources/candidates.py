@@ -16,12 +16,11 @@ import numpy as np
 
 from demorec.mcap.cdr import Values
 from demorec.sources.fields import (
-    SourceLayout,
     SourceReader,
     follow,
-    layout_of,
     numbers_in,
     parse_path,
+    reader_of,
 )
 from demorec.sources.mapping import MAX_ELEMENTS, Source
 from demorec.sources.words import first_numbers
@@ -66,7 +65,8 @@ class Vector:
 
     Attributes:
         topic, type: Where they are.
-        field, layout: As of a source.
+        field: As of a source.
+        reader: Of its numbers.
         kind: Of what: joints of an arm, a gripper or a base (wheels, legs), a pose, a velocity in space, or others.
         role: state, action, or "" where no word says which.
         is_sure: Whether nothing in the message suits that role better.
@@ -81,7 +81,7 @@ class Vector:
     topic: str
     type: str
     field: str
-    layout: SourceLayout
+    reader: SourceReader
     kind: Kind
     role: str
     is_sure: bool = True
@@ -95,7 +95,7 @@ class Vector:
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of its elements without a prefix for the topic."""
-        return tuple(self.prefix + name for name in self.names or self.layout.names)
+        return tuple(self.prefix + name for name in self.names or self.reader.names)
 
     @property
     def words(self) -> list[str]:
@@ -135,22 +135,22 @@ class Vector:
 
     def of_joints(self, joints: Sequence[str], messages: Iterable[Values]) -> Vector:
         """A part of it, which some of the messages may hold."""
-        layout = replace(self.layout, names=tuple(joints), joints=tuple(joints))
         leads = self.role == "state" and all(re.search(_LEADER, joint.lower()) for joint in joints)
         role = "action" if leads else self.role
-        source = Source(topic=self.topic, field=self.field, joints=tuple(joints))
+        source = replace(self.reader.source, joints=tuple(joints))
+        reader, first = replace(self.reader, source=source, names=tuple(joints), joints=tuple(joints)), ""
         for values in messages:
             with suppress(ValueError):
-                first = first_numbers(SourceReader(source, layout).read(values))
-                return replace(self, layout=layout, kind=_kind_of(joints), role=role, first=first)
-        return replace(self, layout=layout, kind=_kind_of(joints), role=role, first="")
+                first = first_numbers(reader.read(values))
+                break
+        return replace(self, reader=reader, kind=_kind_of(joints), role=role, first=first)
 
 
 def vectors_of(topic: str, type_name: str, values: Values) -> Iterator[Vector]:
     """What a message holds, the likeliest joint positions first."""
     if "/_action/" in topic or topic.endswith("/tf_static"):
         return
-    empty = Vector(topic=topic, type=type_name, field="", layout=_NOTHING, kind="numbers", role=_role(topic, type_name))
+    empty = Vector(topic=topic, type=type_name, field="", reader=_NOTHING, kind="numbers", role=_role(topic, type_name))
     found = [*_positions(empty, values)]
     if not found and empty.role == "action":
         found = [*_any_command(empty, values)][:1]
@@ -178,23 +178,23 @@ def transforms_of(topic: str, type_name: str, messages: Iterable[Values]) -> Ite
                 continue
             seen.add(frame)
             inner = f"transforms[{key}={frame}]" + (".transform" if "transform" in item else "")
-            empty = Vector(topic=topic, type=type_name, field="", layout=_NOTHING, kind="numbers", role="")
+            empty = Vector(topic=topic, type=type_name, field="", reader=_NOTHING, kind="numbers", role="")
             yield from (replace(made, prefix=f"{frame}.") for made in _made(empty, values, inner))
 
 
-_NOTHING = SourceLayout(names=(), joints=(), steps=(), names_steps=None, quaternions=())
+_NOTHING = SourceReader(source=Source())
 
 
 def _made(empty: Vector, values: Values, path: str) -> Iterator[Vector]:
     """The vector of a path, if it is one."""
     try:
-        layout = layout_of(Source(topic=empty.topic, field=path), values)
-        parts = [np.ravel(item) for _, item in numbers_in(follow(values, layout.steps))]
+        reader = reader_of(Source(topic=empty.topic, field=path), values)
+        parts = [np.ravel(item) for _, item in numbers_in(follow(values, reader.steps))]
     except ValueError:  # it has none, or one of another shape
         return
-    count = len(layout.names)
-    names = tuple(f"joint_{number}" for number in range(count)) if len(set(layout.names)) < count else ()
-    yield replace(empty, field=path, layout=layout, names=names, first=first_numbers(np.concatenate(parts)))
+    count = len(reader.names)
+    names = tuple(f"joint_{number}" for number in range(count)) if len(set(reader.names)) < count else ()
+    yield replace(empty, field=path, reader=reader, names=names, first=first_numbers(np.concatenate(parts)))
 
 
 def _role(topic: str, type_name: str) -> str:
@@ -252,8 +252,8 @@ def _positions(empty: Vector, values: Values) -> Iterator[Vector]:
         called = values.get("name")
         text = f"{empty.topic} {empty.type} {path} {called if isinstance(called, str) else ''}".lower()
         for vector in _made(empty, values, path):
-            if vector.layout.joints:
-                vector = replace(vector, kind=_kind_of(vector.layout.joints))
+            if vector.reader.joints:
+                vector = replace(vector, kind=_kind_of(vector.reader.joints))
             elif _GRIPPER.search(text):
                 vector = replace(vector, kind="gripper", role=empty.role or "state")
             elif size > 1:
@@ -272,8 +272,8 @@ def _positions(empty: Vector, values: Values) -> Iterator[Vector]:
 def _doubt(vector: Vector) -> tuple[bool, ...]:
     """What makes one field of positions less likely than another one of the same message."""
     words = _words(vector.field)
-    is_few = len(vector.layout.names) < 3
-    return (vector.kind == "gripper", is_few, "motor" in words, not words & _MEASURED, not vector.layout.joints)
+    is_few = len(vector.reader.names) < 3
+    return (vector.kind == "gripper", is_few, "motor" in words, not words & _MEASURED, not vector.reader.joints)
 
 
 def _any_command(empty: Vector, values: Values) -> Iterator[Vector]:

@@ -73,7 +73,7 @@ def _joints(vectors: Sequence[Vector]) -> list[Vector]:
     grippers = [vector for vector in vectors if vector.kind == "gripper"]
     if any(vector.has_gripper for vector in bodies):
         known = {label for vector in bodies for label in vector.labels}
-        grippers = [vector for vector in grippers if vector.layout.joints and not known & set(vector.labels)]
+        grippers = [vector for vector in grippers if vector.reader.joints and not known & set(vector.labels)]
     return [*bodies, *_distinct(grippers)]
 
 
@@ -87,7 +87,7 @@ def _distinct(vectors: Sequence[Vector]) -> list[Vector]:
 
 
 def _rank(vector: Vector) -> tuple[bool, bool, bool, int, int]:
-    is_named = bool(vector.layout.joints)
+    is_named = bool(vector.reader.joints)
     return not vector.is_leader, not is_named, vector.is_other, -len(vector.labels), len(vector.words)
 
 
@@ -95,7 +95,7 @@ def _are_same(one: Vector, other: Vector) -> bool:
     """Whether two vectors are likely the same joints sent twice: a relay, a merged topic, a driver's own message."""
     if one.topic == other.topic:
         return False
-    joints, others = set(one.layout.joints), set(other.layout.joints)
+    joints, others = set(one.reader.joints), set(other.reader.joints)
     if joints and others and not joints & others:
         return False
     # Two arms have topics of the same kind that differ by a word each: left and right, 1 and 2; so do two quantities.

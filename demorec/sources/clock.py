@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.sources.mapping import Sampling
+from demorec.sources.mapping import CameraSource, Clock, Sampling, Source
 from demorec.sources.streams import Stream
 
 NS = 1_000_000_000
@@ -40,11 +40,13 @@ class Timeline:
         stream: Whose it is.
         times_ns: (M,) int64, strictly increasing.
         order: (M,) which of the stream's messages they are. Those of equal times are left out but the first, and so
-            are those whose header has no time where others have.
+            are those whose header has no time where others have, and video before its first keyframe.
         is_header: Whether times are those of the headers.
         period_ns: The usual distance of two, 0 for fewer than two.
         is_regular: Whether distances are alike; a stream that speaks only when something changes is not.
         is_log_asked: Whether the mapping asks for the times of recording.
+        sample: How rows take messages.
+        max_age_ns: How old what they take may be.
     """
 
     stream: Stream
@@ -53,7 +55,19 @@ class Timeline:
     is_header: bool
     period_ns: int
     is_regular: bool
-    is_log_asked: bool = False
+    is_log_asked: bool
+    sample: Sampling
+    max_age_ns: int
+
+    @property
+    def label(self) -> str:
+        """Which it is, for people."""
+        return f"{self.stream.label} ({self.stream.topic})"
+
+    @property
+    def rule(self) -> str:
+        """By which rows take messages, for people."""
+        return f"{self.sample} by {'header' if self.is_header else 'log'} time"
 
     @property
     def stamps_ns(self) -> Int:
@@ -71,9 +85,29 @@ class Timeline:
         known = self.stamps_ns[self.stamps_ns > 0]
         return len(known) - len(np.unique(known))
 
+    def chosen(self, rows_ns: Int) -> Chosen:
+        """What rows of these times (R,) take."""
+        return choose(self.times_ns, rows_ns, self.sample)
 
-def timeline(stream: Stream, *, by_header: bool) -> Timeline:
+    def sampled(self, chosen: Chosen) -> Numbers:
+        """(R, D) the numbers of these rows, of a source."""
+        part, values = self.stream.part, self.stream.values
+        assert isinstance(part, Source)
+        assert values is not None
+        return sampled(values, self.order, chosen, unit=part.to or part.unit, quaternions=self.stream.quaternions)
+
+    def within(self, begin_ns: int, end_ns: int) -> Int:
+        """Its times from one moment to another."""
+        return self.times_ns[(self.times_ns >= begin_ns) & (self.times_ns <= end_ns)]
+
+
+def timeline(stream: Stream, clock: Clock) -> Timeline:
     """The timeline of a stream, by header stamps if they are wanted and most messages have one."""
+    by_header = (stream.part.stamp or clock.stamp) == "header"
+    sample: Sampling = stream.part.sample or clock.sample
+    if isinstance(stream.part, CameraSource) and sample == "linear":
+        sample = "latest"  # images are not mixed
+    age_s = clock.max_age_s if stream.part.max_age_s is None else stream.part.max_age_s
     stamped = stream.header_ns > 0
     is_header = by_header and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns
@@ -87,6 +121,10 @@ def timeline(stream: Stream, *, by_header: bool) -> Timeline:
         is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
         ordered, order = ordered[is_first], order[is_first]
     period, is_regular = _period(ordered)
+    if stream.heads:
+        keyframes = np.flatnonzero(stream.heads.are_keyframes[order])
+        first = int(keyframes[0]) if len(keyframes) else len(order)
+        ordered, order = ordered[first:], order[first:]
     return Timeline(
         stream=stream,
         times_ns=ordered,
@@ -95,6 +133,8 @@ def timeline(stream: Stream, *, by_header: bool) -> Timeline:
         period_ns=period,
         is_regular=is_regular,
         is_log_asked=not by_header,
+        sample=sample,
+        max_age_ns=MISSING - 1 if age_s >= 1e9 else round(age_s * NS),
     )
 
 
@@ -129,15 +169,12 @@ def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
     """The messages for some rows.
 
     Args:
-        times_ns: (M,) strictly increasing.
+        times_ns: (M,) strictly increasing; one at least.
         rows_ns: (R,) increasing.
         sample: latest: the last message at or before the row; nearest: the earlier one of two that are as near;
             linear: both neighbours, or one that is at the row.
     """
     count = len(times_ns)
-    if not count:
-        nothing = np.full(len(rows_ns), MISSING)
-        return Chosen(index=np.full(len(rows_ns), -1), fraction=None, age_ns=nothing, reach_ns=nothing)
     before = np.searchsorted(times_ns, rows_ns, side="right") - 1
     after = np.minimum(before + 1, count - 1)
     since = np.where(before >= 0, rows_ns - times_ns[np.maximum(before, 0)], MISSING)
@@ -157,30 +194,23 @@ def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
     return Chosen(index=before, fraction=fraction, age_ns=np.where(is_outside, MISSING, since), reach_ns=reach)
 
 
-def sampled(
-    values: Numbers, chosen: Chosen, *, unit: str, quaternions: tuple[int, ...], order: Int | None = None
-) -> Numbers:
+def sampled(values: Numbers, order: Int, chosen: Chosen, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:
     """(R, D) the numbers of some rows.
 
     Args:
-        values: (M, D) in the order of the timeline, or of the bag if `order` is given.
+        values: (N, D) in the order of the bag.
+        order: (M,) of the timeline.
         chosen: For the rows; all of them have a message.
         unit: Of the values: the line between two angles (rad, degree) is the short way round.
         quaternions: First elements of x, y, z, w, which are mixed on the sphere.
-        order: Of the timeline; None where `values` are in it.
 
     Returns:
         The very bits of a message where one is taken; where two are mixed, float64.
     """
-
-    def at(index: Int) -> Numbers:
-        return values[index if order is None else order[index]]
-
     if chosen.fraction is None or not np.any(chosen.fraction):
-        return at(chosen.index)
-    last = len(values if order is None else order) - 1
-    first = at(chosen.index).astype(np.float64)
-    second = at(np.minimum(chosen.index + 1, last)).astype(np.float64)
+        return values[order[chosen.index]]
+    first = values[order[chosen.index]].astype(np.float64)
+    second = values[order[np.minimum(chosen.index + 1, len(order) - 1)]].astype(np.float64)
     fraction = chosen.fraction[:, np.newaxis]
     step = second - first
     turn = {"rad": 2 * np.pi, "degree": 360.0}.get(unit)

@@ -172,15 +172,13 @@ def described_feature(name: str, feature: FeatureRows, lines: Timelines, joints:
         if source.next:
             rules.append(f"{source.next} of the next frame")
             continue
-        clock = "header" if lines.lines[name, index].is_header else "log"
-        rules.append(f"{source.topic} {source.field}, {lines.rule((name, index))[0]} by {clock} time")
+        rules.append(f"{source.topic} {source.field}, {lines.lines[name, index].rule}")
     moved = (element if element in joints else "" for element in feature.names)
     return imported_feature(name, feature.values.dtype, feature.names, feature.units, moved, "; ".join(rules))
 
 
 def described_camera(name: str, plan: CameraRows, lines: Timelines) -> Camera:
     """A camera as recordings know it."""
-    clock = "header" if lines.lines[name].is_header else "log"
     info = lines.streams.infos.get(name, {})
     matrix, distortion = _first(info, "k", "K"), _first(info, "d", "D")
     size = (plan.head.width, plan.head.height)
@@ -193,7 +191,7 @@ def described_camera(name: str, plan: CameraRows, lines: Timelines) -> Camera:
         kept=plan.kept,
         intrinsics=tuple(matrix) if known else None,
         distortion=tuple(distortion) if known and len(distortion) == 5 and np.isfinite(distortion).all() else (),
-        source=f"{plan.topic}, {lines.rule(name)[0]} by {clock} time",
+        source=f"{plan.topic}, {lines.lines[name].rule}",
     )
 
 

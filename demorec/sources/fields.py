@@ -6,7 +6,7 @@ import base64
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -163,28 +163,77 @@ def numbers_in(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-@dataclass(frozen=True, kw_only=True)
-class SourceLayout:
-    """What the first message of a source says about all of them.
+_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+
+
+@dataclass(kw_only=True)
+class SourceReader:
+    """Reads the vector of a source from message after message, as its first message lays it out.
 
     Attributes:
+        source: That one.
         names: Of the elements of the feature.
         joints: What messages call these elements, which may stand at another place in each; empty where elements have
             no names, or one name is that of several.
         steps: Path of the numbers.
         names_steps: Path of the names beside them; None where elements have none.
         quaternions: First element of each x, y, z, w among them.
+        others: Names in messages beside those of the first one, where the source takes all that there are.
     """
 
-    names: tuple[str, ...]
-    joints: tuple[str, ...]
-    steps: tuple[Step, ...]
-    names_steps: tuple[Step, ...] | None
-    quaternions: tuple[int, ...]
+    source: Source
+    names: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+    steps: tuple[Step, ...] = ()
+    names_steps: tuple[Step, ...] | None = None
+    quaternions: tuple[int, ...] = ()
+    others: dict[str, None] = field(init=False, compare=False, default_factory=dict)
+    _orders: dict[tuple[str, ...], list[int]] = field(init=False, compare=False, default_factory=dict)
+
+    def read(self, values: Values) -> NDArray[np.floating[Any]]:
+        """(D,) float32 or float64, in the unit of the bag.
+
+        Raises:
+            FieldError: The message does not have what the first one had.
+            OtherPublisherError: It has none of the joints.
+        """
+        found = follow(values, self.steps)
+        if isinstance(found, np.ndarray) and found.ndim == 1 and found.dtype in _FLOATS:
+            vector: NDArray[np.floating[Any]] = found  # as it is in most messages, of which there are many
+        else:
+            vector = _joined([found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)])
+        if self.joints:
+            assert self.names_steps is not None
+            names = tuple(_names_at(values, self.names_steps))
+            order = self._orders.get(names) or self._order_of(names)
+            if len(vector) != len(names):
+                raise FieldError(f"{len(vector)} values have {len(names)} names")
+            return vector[order]
+        if elements := self.source.elements:
+            if max(elements) >= len(vector):
+                raise FieldError(f"there are {len(vector)} values, too few")
+            return vector[list(elements)]
+        if len(vector) != len(self.names):
+            raise FieldError(f"there are {len(vector)} values where the first message has {len(self.names)}")
+        return vector
+
+    def _order_of(self, names: tuple[str, ...]) -> list[int]:
+        takes_all = not self.source.joints and not self.source.elements
+        if takes_all and len(self.others) < MAX_ELEMENTS:
+            self.others |= dict.fromkeys(name for name in names if name not in self.joints)
+        missing = [joint for joint in self.joints if joint not in names]
+        if missing and len(missing) == len(self.joints):
+            raise OtherPublisherError("it names none of the joints")
+        if missing:
+            raise FieldError(f"the joint {missing[0]!r} is missing")
+        order = [names.index(joint) for joint in self.joints]
+        if len(self._orders) < 1000:
+            self._orders[names] = order
+        return order
 
 
-def layout_of(source: Source, values: Values) -> SourceLayout:
-    """The layout of a source, from a message.
+def reader_of(source: Source, values: Values) -> SourceReader:
+    """What reads a source, from its first message.
 
     Raises:
         FieldError: The message does not have what the source names.
@@ -220,7 +269,8 @@ def layout_of(source: Source, values: Values) -> SourceLayout:
         raise FieldError(f"names has {len(source.names)} names for the {len(labels)} elements of {source.field!r}")
     if source.limits and len(source.limits) != len(labels):
         raise FieldError(f"limits has {len(source.limits)} rows for the {len(labels)} elements of {source.field!r}")
-    return SourceLayout(
+    return SourceReader(
+        source=source,
         names=tuple(source.prefix + name for name in source.names or labels),
         joints=tuple(labels) if is_named else (),
         steps=steps,
@@ -272,67 +322,6 @@ def _quaternions(labels: Sequence[str]) -> tuple[int, ...]:
         if [name for _, _, name in four] == ["x", "y", "z", "w"] and len({parent for parent, _, _ in four}) == 1:
             starts.append(index)
     return tuple(starts)
-
-
-_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
-
-
-class SourceReader:
-    """Reads the vector of a source from message after message.
-
-    Attributes:
-        layout: As given.
-        others: Names in messages beside those of the first one, where the source takes all that there are.
-    """
-
-    def __init__(self, source: Source, layout: SourceLayout) -> None:
-        self._source = source
-        self.layout = layout
-        self._orders: dict[tuple[str, ...], list[int]] = {}
-        self._takes_all = not source.joints and not source.elements
-        self.others: dict[str, None] = {}
-
-    def read(self, values: Values) -> NDArray[np.floating[Any]]:
-        """(D,) float32 or float64, in the unit of the bag.
-
-        Raises:
-            FieldError: The message does not have what the first one had.
-            OtherPublisherError: It has none of the joints.
-        """
-        found = follow(values, self.layout.steps)
-        if isinstance(found, np.ndarray) and found.ndim == 1 and found.dtype in _FLOATS:
-            vector: NDArray[np.floating[Any]] = found  # as it is in most messages, of which there are many
-        else:
-            vector = _joined([found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)])
-        source = self._source
-        if self.layout.joints:
-            assert self.layout.names_steps is not None
-            names = tuple(_names_at(values, self.layout.names_steps))
-            order = self._orders.get(names) or self._order_of(names)
-            if len(vector) != len(names):
-                raise FieldError(f"{len(vector)} values have {len(names)} names")
-            return vector[order]
-        if source.elements:
-            if max(source.elements) >= len(vector):
-                raise FieldError(f"there are {len(vector)} values, too few")
-            return vector[list(source.elements)]
-        if len(vector) != len(self.layout.names):
-            raise FieldError(f"there are {len(vector)} values where the first message has {len(self.layout.names)}")
-        return vector
-
-    def _order_of(self, names: tuple[str, ...]) -> list[int]:
-        joints = self.layout.joints
-        if self._takes_all and len(self.others) < MAX_ELEMENTS:
-            self.others |= dict.fromkeys(name for name in names if name not in joints)
-        missing = [joint for joint in joints if joint not in names]
-        if missing and len(missing) == len(joints):
-            raise OtherPublisherError("it names none of the joints")
-        if missing:
-            raise FieldError(f"the joint {missing[0]!r} is missing")
-        order = [names.index(joint) for joint in joints]
-        if len(self._orders) < 1000:
-            self._orders[names] = order
-        return order
 
 
 def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:

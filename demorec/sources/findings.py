@@ -155,11 +155,11 @@ def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
 
 def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     stream = line.stream
-    if stream.values is None or stream.layout is None or len(line.order) < 2:
+    if stream.values is None or len(line.order) < 2:
         return
-    elements, names = _Elements(stream.values, line.order), stream.layout.names
+    elements, names = _Elements(stream.values, line.order), stream.names
     yield from _number_findings(elements, names)
-    for start in stream.layout.quaternions:
+    for start in stream.quaternions:
         off = float(np.abs(np.linalg.norm(elements.quaternion(start), axis=1) - 1).max())
         if off > 1e-3:
             yield "quaternion", f"the length of a quaternion is off by {off:.3g}"
@@ -168,7 +168,7 @@ def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
         return
     # What is sent may hold until the bag ends.
     yield from _still_findings(elements, names, line, may_rest=stream.label == ACTION)
-    for name, change in _changes(elements, names, stream.layout.quaternions):
+    for name, change in _changes(elements, names, stream.quaternions):
         steps = np.linalg.norm(change, axis=1)
         usual = float(np.percentile(steps, 90))
         # What begins to move after a long rest goes on, as an opening gripper does. At a low rate a shorter way takes

@@ -110,10 +110,10 @@ class BagReport:
 
 def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[StreamReport]:
     """A line for each stream."""
-    for key, line in lines.lines.items():
+    for line in lines.lines.values():
         stream = line.stream
         steps = np.diff(line.times_ns)
-        ages = [lines.chosen(key, rows.times_ns).reach_ns.max() for rows in episodes]
+        ages = [line.chosen(rows.times_ns).reach_ns.max() for rows in episodes]
         usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
         skews = line.skews_ns
         lost = int(lost_in(line).sum()) if line.is_regular else 0

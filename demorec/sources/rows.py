@@ -12,19 +12,17 @@ from numpy.typing import NDArray
 from demorec.episode.info import DEPTH_UNITS, Kept
 from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.bag_files import BagError
-from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, choose, followed, grid, sampled, timeline
+from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, followed, grid, timeline
 from demorec.sources.episodes import Window
 from demorec.sources.image_messages import KEPT_FORMATS, VIDEO_FORMATS, ImageHead
-from demorec.sources.mapping import ROWS, CameraSource, Sampling, Source, SourceMapping
-from demorec.sources.streams import BagStreams, Stream
+from demorec.sources.mapping import ROWS, SourceMapping
+from demorec.sources.streams import BagStreams, Key
 
 RATE = 0.05
 """By which the rate of images that rows follow may differ from fps: as far as the check `rate` takes it for that of the
 episode. Where fps is the rate rounded, half an image a second is more."""
 _SAME_COUNT = 2
 """Images that cameras of one rate differ by: one more or less at each end of an episode."""
-Key = tuple[str, int] | str
-"""A stream: (feature, number of its source), or the name of a camera."""
 
 _ROW_BYTES_PER_BYTE = 32
 """Bytes of rows for each of the bag: a long bag may be brought to a faster clock than any of its streams has."""
@@ -131,29 +129,14 @@ class Timelines:
 
     def __init__(self, streams: BagStreams, mapping: SourceMapping) -> None:
         self.streams, self.mapping = streams, mapping
-        pairs: tuple[tuple[Key, Stream], ...] = (*streams.sources.items(), *streams.cameras.items())
-        self.lines = {
-            key: _from_keyframe(timeline(stream, by_header=(self._owner(key).stamp or mapping.clock.stamp) == "header"))
-            for key, stream in pairs
-        }
-        self._bytes_of_row = _BYTES_OF_WRITING + sum(map(_bytes_of_row, self.lines.values()))
+        self.lines = {key: timeline(stream, mapping.clock) for key, stream in streams.all.items()}
+        # A row takes of a stream, while an episode is made, its numbers, which message, and how old that is.
+        self._bytes_of_row = _BYTES_OF_WRITING + sum(32 + 8 * len(stream.names) for stream in streams.all.values())
         self._free_bytes = self._most_bytes = (
             Limits.of_file(streams.num_bytes).floor // 2 + _ROW_BYTES_PER_BYTE * streams.num_bytes
         )
-        if empty := [key for key, line in self.lines.items() if not len(line.times_ns)]:
-            raise BagError(f"No message of {self._label(empty[0])} has a time at which it could be used")
-
-    def _owner(self, key: Key) -> Source | CameraSource:
-        return self.mapping.cameras[key] if isinstance(key, str) else self.mapping.features[key[0]][key[1]]
-
-    def rule(self, key: Key) -> tuple[Sampling, int]:
-        """How a stream is sampled, and how old what it gives may be, nanoseconds."""
-        clock, owner = self.mapping.clock, self._owner(key)
-        sample: Sampling = owner.sample or clock.sample
-        if isinstance(key, str) and sample == "linear":
-            sample = "latest"  # images are not mixed
-        age = clock.max_age_s if owner.max_age_s is None else owner.max_age_s
-        return sample, MISSING - 1 if age >= 1e9 else round(age * NS)
+        if empty := [line for line in self.lines.values() if not len(line.times_ns)]:
+            raise BagError(f"No message of {empty[0].label} has a time at which it could be used")
 
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
@@ -162,66 +145,59 @@ class Timelines:
         times, follows = self._times(window, begin, end)
         if len(times) < 2:
             raise NoRowsError(f"only {len(times)} rows have all streams")
-        chosen = {key: self.chosen(key, times) for key in self.lines}
-        problems = [text for key, rows in chosen.items() if (text := self._too_old(key, rows, times))]
-        if problems := problems or [text for key, rows in chosen.items() if (text := self._unfit(key, rows, times))]:
+        chosen = {key: line.chosen(times) for key, line in self.lines.items()}
+        problems = [text for key, rows in chosen.items() if (text := _too_old(self.lines[key], rows, times))]
+        if problems := problems or [
+            text for key, rows in chosen.items() if (text := _unfit(self.lines[key], rows, times))
+        ]:
             raise NoRowsError("; ".join(problems))
-        features = {
-            name: self._feature(name, sources, chosen)
-            for name, sources in self.mapping.features.items()
-            if not any(source.next for source in sources)
-        }
-        count = len(times)
-        for name, sources in self.mapping.features.items():
-            if any(source.next for source in sources):
-                features[name] = _next_of(features[sources[0].next], times)
-                count = len(times) - 1
-        cameras = {name: _camera(self.lines[name], chosen[name].index[:count]) for name in self.mapping.cameras}
+        mapped = self.mapping.features
+        taken = {name: self._feature(name, chosen) for name, sources in mapped.items() if not sources[0].next}
+        count = len(times) - any(sources[0].next for sources in mapped.values())
+        features = {}
+        for name, sources in mapped.items():
+            feature, later = taken[sources[0].next or name], 1 if sources[0].next else 0
+            part = slice(later, later + count)
+            # The age of what a feature is next counts from the row that has it, and so is below 0.
+            ages = feature.ages_ns[part] - (times[part] - times[:count])
+            features[name] = replace(feature, values=feature.values[part], ages_ns=ages)
         return EpisodeRows(
             window=window,
             times_ns=times[:count],
-            features={name: _first_rows(features[name], count) for name in self.mapping.features},
-            cameras=cameras,
+            features=features,
+            cameras={name: _camera(self.lines[name], chosen[name].index[:count]) for name in self.mapping.cameras},
             trimmed_ns=(int(times[0]) - window.begin_ns, max(0, window.end_ns - end)),
             follows=follows,
         )
 
-    def chosen(self, key: Key, times: Int) -> Chosen:
-        """What rows of these times take from a stream."""
-        return choose(self.lines[key].times_ns, times, self.rule(key)[0])
+    def _feature(self, name: str, chosen: Mapping[Key, Chosen]) -> FeatureRows:
+        lines = {key: line for key, line in self.lines.items() if key[0] == name and not isinstance(key, str)}
+        units: list[str] = []
+        for (_, index), line in lines.items():
+            source = self.mapping.features[name][index]
+            units += [source.to or source.unit] * len(line.stream.names)
+        return FeatureRows(
+            values=np.concatenate([line.sampled(chosen[key]) for key, line in lines.items()], axis=1),
+            names=tuple(element for line in lines.values() for element in line.stream.names),
+            units=tuple(units),
+            ages_ns=np.max(np.stack([chosen[key].age_ns for key in lines]), axis=0),
+        )
 
     def _extent(self, window: Window) -> tuple[int, int]:
         """From where on and until when all streams have something, within a window."""
-        clock = self.mapping.clock
-        begins = {key: self._first(key, line, window) for key, line in self.lines.items()}
-        ends = {key: self._last(key, line, window) for key, line in self.lines.items()}
-        late, early = max(begins, key=lambda key: begins[key]), min(ends, key=lambda key: ends[key])
-        last = max(int(line.times_ns[-1]) for line in self.lines.values())
-        begin, end = begins[late], min(window.end_ns, ends[early], last)
-        limit = round(clock.max_trim_s * NS)
+        max_trim_s, lines = self.mapping.clock.max_trim_s, list(self.lines.values())
+        begins, ends = [_first(line, window) for line in lines], [_last(line, window) for line in lines]
+        begin, last = max(begins), max(int(line.times_ns[-1]) for line in lines)
+        end = min(window.end_ns, *ends, last)
+        late, early = lines[begins.index(begin)], lines[ends.index(min(ends))]
         problems = []
-        if begin - window.begin_ns > limit:
-            problems.append(f"{self._label(late)} begins {(begin - window.begin_ns) / NS:.2f} s late")
-        if window.end_ns - end > limit:
-            problems.append(f"{self._label(early)} ends {(window.end_ns - end) / NS:.2f} s early")
+        if begin - window.begin_ns > round(max_trim_s * NS):
+            problems.append(f"{late.label} begins {(begin - window.begin_ns) / NS:.2f} s late")
+        if window.end_ns - end > round(max_trim_s * NS):
+            problems.append(f"{early.label} ends {(window.end_ns - end) / NS:.2f} s early")
         if problems:
-            raise NoRowsError(f"{' and '.join(problems)}, allowed are {clock.max_trim_s:g} s")
+            raise NoRowsError(f"{' and '.join(problems)}, allowed are {max_trim_s:g} s")
         return begin, end
-
-    def _first(self, key: Key, line: Timeline, window: Window) -> int:
-        """From when on a stream has something in a window: at once if what came before is still fit to be used."""
-        before = int(np.searchsorted(line.times_ns, window.begin_ns, side="right")) - 1
-        if before >= 0 and window.begin_ns - int(line.times_ns[before]) <= self.rule(key)[1]:
-            return window.begin_ns
-        return int(line.times_ns[min(before + 1, len(line.times_ns) - 1)])
-
-    def _last(self, key: Key, line: Timeline, window: Window) -> int:
-        """Until when it has: what its last message says holds until the next would have come."""
-        sample, age = self.rule(key)
-        last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
-        if sample != "linear" and line.is_regular:
-            age = min(age, line.period_ns if sample == "latest" else line.period_ns // 2)
-        return int(line.times_ns[last]) + (0 if sample == "linear" else age)
 
     def _times(self, window: Window, begin: int, end: int) -> tuple[Int, str]:
         """(R,) of the rows, and what they follow."""
@@ -230,18 +206,17 @@ class Timelines:
             line = next((line for line in self.lines.values() if line.stream.topic == clock.rows), None)
             if line is None:
                 raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
-            times = line.times_ns[(line.times_ns >= begin) & (line.times_ns <= end)]
-            self._reserve(len(times))
-            return times, line.stream.label
-        if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
-            times = self._followed(cameras, window, begin, end)
-            self._reserve(len(times))
-            return times, f"camera {cameras[0]}"
-        # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a stream
-        # that jitters is off by a few hundredths.)
-        slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
-        self._reserve(max(0, (end - begin) * clock.fps // NS + 1))
-        return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
+            times, follows = line.within(begin, end), line.stream.label
+        elif clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
+            times, follows = self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
+        else:
+            # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a
+            # stream that jitters is off by a few hundredths.)
+            slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
+            self._reserve(max(0, (end - begin) * clock.fps // NS + 1))
+            return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
+        self._reserve(len(times))
+        return times, follows
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
         """Cameras that give an image for each row; the one that rows follow first.
@@ -252,8 +227,7 @@ class Timelines:
         fps = self.mapping.clock.fps
         counts: dict[str, int] = {}
         for name in self.mapping.cameras:
-            times = self.lines[name].times_ns
-            times = times[(times >= begin) & (times <= end)]
+            times = self.lines[name].within(begin, end)
             seconds = float(times[-1] - times[0]) / NS if len(times) > 1 else 0.0
             if seconds and abs(len(times) - 1 - fps * seconds) <= max(RATE * fps, 0.5) * seconds + 1:
                 counts[name] = len(times)
@@ -268,9 +242,8 @@ class Timelines:
         line = self.lines[cameras[0]]
         # The image that was there shortly before another stream began is shown as soon as that has something.
         first = max(window.begin_ns, begin - line.period_ns // 2)
-        lead = line.times_ns[(line.times_ns >= first) & (line.times_ns <= end)]
-        lead = np.unique(np.maximum(lead, begin))
-        are_latest = all(self.rule(name)[0] == "latest" for name in cameras)
+        lead = np.unique(np.maximum(line.within(first, end), begin))
+        are_latest = all(self.lines[name].sample == "latest" for name in cameras)
         others = [self.lines[name].times_ns for name in cameras[1:]] if are_latest else []
         return followed(lead, others, period_ns=line.period_ns, end_ns=end)
 
@@ -283,69 +256,58 @@ class Timelines:
                 f"one of its size is read for: lower clock.fps, import a part (episodes.times_s), or raise {VARIABLE}"
             )
 
-    def _label(self, key: Key) -> str:
-        stream = self.lines[key].stream
-        return f"{stream.label} ({stream.topic})"
 
-    def _too_old(self, key: Key, chosen: Chosen, times: Int) -> str:
-        limit = self.rule(key)[1]
-        ages = chosen.reach_ns
-        bad = np.flatnonzero((ages > limit) | (chosen.index < 0))
-        if not len(bad):
-            return ""
-        worst = int(ages[bad].max())
-        first = (times[bad[0]] - times[0]) / NS
-        what = "has nothing" if worst >= MISSING else f"is up to {worst / NS:.3f} s away"
-        return (
-            f"{self._label(key)} {what} at {len(bad)} of {len(times)} rows, from {first:.2f} s on, allowed are "
-            f"{limit / NS:g} s"
-        )
+def _first(line: Timeline, window: Window) -> int:
+    """From when on a stream has something in a window: at once if what came before is still fit to be used."""
+    before = int(np.searchsorted(line.times_ns, window.begin_ns, side="right")) - 1
+    if before >= 0 and window.begin_ns - int(line.times_ns[before]) <= line.max_age_ns:
+        return window.begin_ns
+    return int(line.times_ns[min(before + 1, len(line.times_ns) - 1)])
 
-    def _unfit(self, key: Key, chosen: Chosen, times: Int) -> str:
-        """Why what the rows take cannot be recorded; "" when it can."""
-        line = self.lines[key]
-        stream = line.stream
-        if stream.values is not None:
-            used = stream.values[line.order[chosen.index]]
-            if chosen.fraction is not None:
-                after = np.minimum(chosen.index + 1, len(line.order) - 1)
-                used = np.where(chosen.fraction[:, np.newaxis] > 0, used + stream.values[line.order[after]], used)
-            bad = np.flatnonzero(~np.isfinite(used).all(axis=1))
-            if len(bad):
-                at = (times[bad[0]] - times[0]) / NS
-                return f"{self._label(key)} holds no finite number at {len(bad)} rows, from {at:.2f} s on"
-            return ""
-        first, last = int(chosen.index.min()), int(chosen.index.max())
-        heads = stream.heads.kinds(line.order[first : last + 1])
-        sizes = sorted({(head.width, head.height) for head in heads if head.width})
-        formats = sorted({head.format for head in heads})
-        if len(sizes) > 1:
-            return f"{self._label(key)} changes its size ({', '.join(f'{w}x{h}' for w, h in sizes)})"
-        return f"{self._label(key)} has images of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
 
-    def _feature(self, name: str, sources: tuple[Source, ...], chosen: Mapping[Key, Chosen]) -> FeatureRows:
-        parts, ages = [], []
-        names: list[str] = []
-        units: list[str] = []
-        for index, source in enumerate(sources):
-            key = (name, index)
-            line, rows = self.lines[key], chosen[key]
-            stream = line.stream
-            assert stream.values is not None
-            assert stream.layout is not None
-            unit = source.to or source.unit
-            parts.append(
-                sampled(stream.values, rows, unit=unit, quaternions=stream.layout.quaternions, order=line.order)
-            )
-            names += stream.layout.names
-            units += [unit] * len(stream.layout.names)
-            ages.append(rows.age_ns)
-        return FeatureRows(
-            values=np.concatenate(parts, axis=1),
-            names=tuple(names),
-            units=tuple(units),
-            ages_ns=np.max(np.stack(ages), axis=0),
-        )
+def _last(line: Timeline, window: Window) -> int:
+    """Until when it has: what its last message says holds until the next would have come."""
+    last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
+    age = 0 if line.sample == "linear" else line.max_age_ns
+    if line.is_regular:
+        age = min(age, line.period_ns if line.sample == "latest" else line.period_ns // 2)
+    return int(line.times_ns[last]) + age
+
+
+def _too_old(line: Timeline, chosen: Chosen, times: Int) -> str:
+    """Why what the rows take is missing or too old; "" when it is not."""
+    ages = chosen.reach_ns
+    bad = np.flatnonzero((ages > line.max_age_ns) | (chosen.index < 0))
+    if not len(bad):
+        return ""
+    worst = int(ages[bad].max())
+    what = "has nothing" if worst >= MISSING else f"is up to {worst / NS:.3f} s away"
+    return (
+        f"{line.label} {what} at {len(bad)} of {len(times)} rows, from {(times[bad[0]] - times[0]) / NS:.2f} s on, "
+        f"allowed are {line.max_age_ns / NS:g} s"
+    )
+
+
+def _unfit(line: Timeline, chosen: Chosen, times: Int) -> str:
+    """Why what the rows take cannot be recorded; "" when it can."""
+    stream = line.stream
+    if stream.values is not None:
+        used = stream.values[line.order[chosen.index]]
+        if chosen.fraction is not None:
+            after = np.minimum(chosen.index + 1, len(line.order) - 1)
+            used = np.where(chosen.fraction[:, np.newaxis] > 0, used + stream.values[line.order[after]], used)
+        bad = np.flatnonzero(~np.isfinite(used).all(axis=1))
+        if len(bad):
+            at = (times[bad[0]] - times[0]) / NS
+            return f"{line.label} holds no finite number at {len(bad)} rows, from {at:.2f} s on"
+        return ""
+    first, last = int(chosen.index.min()), int(chosen.index.max())
+    heads = stream.heads.kinds(line.order[first : last + 1])
+    sizes = sorted({(head.width, head.height) for head in heads if head.width})
+    formats = sorted({head.format for head in heads})
+    if len(sizes) > 1:
+        return f"{line.label} changes its size ({', '.join(f'{w}x{h}' for w, h in sizes)})"
+    return f"{line.label} has images of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
 
 
 def _camera(line: Timeline, shown: Int) -> CameraRows:
@@ -367,26 +329,3 @@ def _camera(line: Timeline, shown: Int) -> CameraRows:
         stamps_ns=line.times_ns[taken],
         positions=np.searchsorted(taken, shown),
     )
-
-
-def _from_keyframe(line: Timeline) -> Timeline:
-    """Of video only what can be decoded: from the first keyframe on."""
-    if not line.stream.heads:
-        return line
-    keyframes = np.flatnonzero(line.stream.heads.are_keyframes[line.order])
-    first = int(keyframes[0]) if len(keyframes) else len(line.order)
-    return replace(line, times_ns=line.times_ns[first:], order=line.order[first:]) if first else line
-
-
-def _bytes_of_row(line: Timeline) -> int:
-    """What a row takes of a stream while an episode is made: its numbers, which message, and how old that is."""
-    return 32 + (0 if line.stream.layout is None else 8 * len(line.stream.layout.names))
-
-
-def _first_rows(feature: FeatureRows, count: int) -> FeatureRows:
-    return replace(feature, values=feature.values[:count], ages_ns=feature.ages_ns[:count])
-
-
-def _next_of(feature: FeatureRows, times: Int) -> FeatureRows:
-    """What a feature is one row later; its age counts from the row that has it, and so is below 0."""
-    return replace(feature, values=feature.values[1:], ages_ns=feature.ages_ns[1:] - np.diff(times))

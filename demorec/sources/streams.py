@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -27,22 +27,23 @@ from demorec.sources.bag_files import BagError
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import (
     OtherPublisherError,
-    SourceLayout,
     SourceReader,
     converted,
     follow,
     frame_id_of,
     image_bytes,
-    layout_of,
     parse_path,
+    reader_of,
     stamp_of,
 )
 from demorec.sources.image_messages import ImageHeads, image_head
-from demorec.sources.mapping import Source, SourceMapping
+from demorec.sources.mapping import CameraSource, Source, SourceMapping
 from demorec.sources.ros_types import Budgets
 from demorec.sources.words import quoted
 
 NO_STAMP = -(2**63)
+Key = tuple[str, int] | str
+"""A stream: (feature, number of its source), or the name of a camera."""
 _BYTES_OF_MESSAGE = 40
 """That a stream keeps of each, beside its numbers."""
 _VALUES_OF_ADDING = 15
@@ -62,10 +63,10 @@ class Stream:
 
     Attributes:
         label: Which it is: "observation.state" or "camera front".
-        topic, type: Of its messages.
+        part: What the mapping says of it.
         budgets: What may still be made of the bag.
-        source: Of its numbers; None for cameras.
-        reader: Of the source, since its first message.
+        type: Of its messages.
+        reader: Of a source's numbers, since its first message.
         logged, stamped: `log_ns` and `header_ns` as they grow.
         places: Which of the topic's messages each is, from 0; empty for others than cameras.
         vectors: Of the source, in its unit, behind each other: an array for each of a million messages takes three
@@ -81,9 +82,8 @@ class Stream:
     """
 
     label: str
-    topic: str
+    part: Source | CameraSource
     budgets: Budgets
-    source: Source | None = None
     type: str = ""
     reader: SourceReader | None = None
     logged: array[int] = field(default_factory=lambda: array("q"))
@@ -105,9 +105,8 @@ class Stream:
         try:
             self.budgets.values.take(_VALUES_OF_ADDING)
             self.budgets.numbers.take(_BYTES_OF_MESSAGE)
-            if self.source is not None:
-                if self.reader is None:
-                    self.reader = SourceReader(self.source, layout_of(self.source, values))
+            if isinstance(self.part, Source):
+                self.reader = self.reader or reader_of(self.part, values)
                 self._add_vector(self.reader.read(values))
             else:
                 head, image_sum = image_head(values), zlib.crc32(image_bytes(values))
@@ -145,6 +144,11 @@ class Stream:
         return len(self.logged)
 
     @property
+    def topic(self) -> str:
+        """Of its messages."""
+        return self.part.topic
+
+    @property
     def log_ns(self) -> NDArray[np.int64]:
         """(N,) when each was recorded."""
         return np.asarray(self.logged)
@@ -155,16 +159,21 @@ class Stream:
         return np.asarray(self.stamped)
 
     @property
-    def layout(self) -> SourceLayout | None:
-        """Of the values; None for cameras, and before the first message."""
-        return None if self.reader is None else self.reader.layout
+    def names(self) -> tuple[str, ...]:
+        """(D,) of the elements of a source, since its first message; none of cameras."""
+        return self.reader.names if self.reader else ()
+
+    @property
+    def quaternions(self) -> tuple[int, ...]:
+        """First element of each x, y, z, w among them."""
+        return self.reader.quaternions if self.reader else ()
 
     @cached_property
     def values(self) -> NDArray[np.floating[Any]] | None:
         """(N, D) in the unit of the feature, of the whole stream; None for cameras."""
-        if self.source is None or not self.logged:
+        if isinstance(self.part, CameraSource):
             return None
-        return converted(self.source, np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1))
+        return converted(self.part, np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -189,12 +198,11 @@ def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
     return f"{feature} ({', '.join(source.joints[:2])}{', ...' if len(source.joints) > 2 else ''})"
 
 
-def _unnamed_joints(stream: Stream, others: Sequence[str]) -> str:
+def _unnamed_joints(stream: Stream, reader: SourceReader) -> str:
     """What to write where a source takes whatever its topic names, and that is not the same in all messages."""
-    assert stream.layout is not None
     lists = " and one with ".join(
         f"joints = [{', '.join(map(quoted, joints[:_SHOWN_JOINTS]))}{', ...' if len(joints) > _SHOWN_JOINTS else ''}]"
-        for joints in (stream.layout.joints, others)
+        for joints in (reader.joints, list(reader.others))
     )
     return (
         f"{stream.label} takes all joints of {stream.topic}, whose messages do not name the same ones, as those of two "
@@ -210,7 +218,7 @@ class BagStreams:
         num_bytes: Of the bag's files.
 
     Attributes:
-        sources: (feature, number of the source) -> its stream.
+        all: Every stream.
         cameras: Name of a camera -> its stream.
         infos: Name of a camera -> its first calibration message.
         texts: Topic -> its texts.
@@ -223,21 +231,17 @@ class BagStreams:
         self.problems: list[str] = []
         self._decoder = BagDecoder(num_bytes)
         budgets = self._decoder.budgets
-        self.sources = {
-            (name, index): Stream(
-                label=_label(name, source, sources), topic=source.topic, budgets=budgets, source=source
-            )
+        self.all: dict[Key, Stream] = {
+            (name, index): Stream(label=_label(name, source, sources), part=source, budgets=budgets)
             for name, sources in mapping.features.items()
             for index, source in enumerate(sources)
             if source.topic
         }
-        self.cameras = {
-            name: Stream(label=f"camera {name}", topic=camera.topic, budgets=budgets)
-            for name, camera in mapping.cameras.items()
-        }
-        self._streams: dict[str, list[Stream]] = {}
-        for stream in (*self.sources.values(), *self.cameras.values()):
-            self._streams.setdefault(stream.topic, []).append(stream)
+        for name, camera in mapping.cameras.items():
+            self.all[name] = Stream(label=f"camera {name}", part=camera, budgets=budgets)
+        self._of_topic: dict[str, list[Stream]] = {}
+        for stream in self.all.values():
+            self._of_topic.setdefault(stream.topic, []).append(stream)
         self._fields = {mapping.task.topic: mapping.task.field, mapping.robot.urdf_topic: "data"}
         self._fields[mapping.subtasks.topic] = mapping.subtasks.field
         if mapping.episodes.cut == "marker":
@@ -251,6 +255,11 @@ class BagStreams:
         self._types: dict[str, set[str]] = {}
         self._refused: dict[str, str] = {}
 
+    @property
+    def cameras(self) -> dict[str, Stream]:
+        """Name of a camera -> its stream."""
+        return {key: stream for key, stream in self.all.items() if isinstance(key, str)}
+
     def add(self, message: ScannedMessage) -> None:
         """Take a message."""
         topic = message.channel.topic
@@ -260,7 +269,7 @@ class BagStreams:
             self._types.setdefault(topic, set()).add(message.channel.type)
         if topic not in self._wanted or topic in self._refused:
             return
-        streams = self._streams.get(topic, ())
+        streams = self._of_topic.get(topic, ())
         try:
             values = self._decoder.values(message)
         except UnknownEncodingError as error:
@@ -316,47 +325,39 @@ class BagStreams:
                 problems.append(f"{topic} cannot be read, since {self._refused[topic]}")
             elif len(self._types[topic]) > 1:
                 problems.append(f"{topic} has messages of several types ({', '.join(sorted(self._types[topic]))})")
-        for stream in (*self.sources.values(), *self.cameras.values()):
+        for stream in self.all.values():
             if stream.topic in self._counts and stream.topic not in self._refused and not len(stream):
                 reason = stream.first_problem or stream.first_refusal
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
-            if stream.reader is not None and (others := list(stream.reader.others)):
-                problems.append(_unnamed_joints(stream, others))
-        count = sum(len(stream.layout.names) for stream in self.sources.values() if stream.layout)
+            if stream.reader is not None and stream.reader.others:
+                problems.append(_unnamed_joints(stream, stream.reader))
+        count = sum(len(stream.names) for stream in self.all.values())
         if count > _MAX_NUMBERS:
             problems.append(f"its features have {count:,} numbers, at most {_MAX_NUMBERS:,} are read")
         problems += self._double_names()
-        problems += self._lacking_stamps()
-        for camera in self.cameras.values():
-            if camera.heads and not camera.heads.are_keyframes.any():
-                problems.append(f"{camera.topic} has no keyframe with its parameter sets, so it cannot be decoded")
+        for stream in self.all.values():
+            if stream.part.stamp == "header" and len(stream) and max(stream.stamped) <= 0:
+                problems.append(
+                    f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
+                )
+        for stream in self.all.values():
+            if stream.heads and not stream.heads.are_keyframes.any():
+                problems.append(f"{stream.topic} has no keyframe with its parameter sets, so it cannot be decoded")
         if problems:
             raise BagError(f"The mapping does not fit the bag: {listed(problems)}: {bag.path}")
 
-    def _lacking_stamps(self) -> list[str]:
-        features, cameras = self._mapping.features, self._mapping.cameras
-        chosen = [(features[name][index].stamp, stream) for (name, index), stream in self.sources.items()]
-        chosen += [(cameras[name].stamp, stream) for name, stream in self.cameras.items()]
-        return [
-            f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
-            for stamp, stream in chosen
-            if stamp == "header" and len(stream) and max(stream.stamped) <= 0
-        ]
-
-    def _double_names(self) -> list[str]:
-        problems = []
-        for feature in self._mapping.features:
-            seen: dict[str, str] = {}
-            for (name, _), stream in self.sources.items():
-                for label in stream.layout.names if name == feature and stream.layout else ():
-                    if label in seen:
-                        problems.append(
-                            f"{feature} gets {label!r} from {seen[label]} and from {stream.topic}: leave one out, or "
-                            "tell them apart by prefix or names"
-                        )
-                        break
-                    seen[label] = stream.topic
-        return problems
+    def _double_names(self) -> Iterator[str]:
+        seen: dict[tuple[str, str], str] = {}
+        for key, stream in self.all.items():
+            feature = key[0]
+            for label in stream.names:
+                if (feature, label) in seen:
+                    yield (
+                        f"{feature} gets {label!r} from {seen[feature, label]} and from {stream.topic}: leave one out, "
+                        "or tell them apart by prefix or names"
+                    )
+                    break
+                seen[feature, label] = stream.topic
 
 
 def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:

@@ -174,11 +174,11 @@ def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> N
 
 def _names(vector: Vector, values: Values) -> tuple[str, ...]:
     """Those of the joints in a message whose first fields hold them."""
-    steps = vector.layout.names_steps
+    steps = vector.reader.names_steps
     if steps is None or (len(steps) > 1 and isinstance(values.get(str(steps[0])), Mapping)):
         return ()  # a robot's own message has one publisher
     try:
-        names, count = follow(values, steps), np.size(follow(values, vector.layout.steps))
+        names, count = follow(values, steps), np.size(follow(values, vector.reader.steps))
     except ValueError:
         return ()
     are_texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
@@ -229,7 +229,7 @@ def _vectors(name: str, topic: _Topic) -> Iterator[Vector]:
     yield from transforms_of(name, topic.type, topic.values)
     for vector in topic.vectors:
         groups: dict[frozenset[int], list[str]] = {}
-        if vector.layout.joints and any(topic.publishers):
+        if vector.reader.joints and any(topic.publishers):
             for joint in dict.fromkeys(joint for names in topic.publishers for joint in names):
                 of = frozenset(place for place, names in enumerate(topic.publishers) if joint in names)
                 groups.setdefault(of, []).append(joint)
@@ -367,8 +367,8 @@ def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:
     key = feature if "." not in feature else quoted(feature)
     yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}")
     yield f"field = {quoted(vector.field)}" + (f"  # first: {vector.first}" if vector.first else "")
-    if vector.layout.joints:
-        yield f"joints = [{', '.join(map(quoted, vector.layout.joints))}]"
+    if vector.reader.joints:
+        yield f"joints = [{', '.join(map(quoted, vector.reader.joints))}]"
     if vector.names:
         yield f"names = [{', '.join(map(quoted, vector.names))}]"
     if prefix or vector.prefix:

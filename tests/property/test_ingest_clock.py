@@ -45,7 +45,7 @@ def test_linear(times: list[int], rows: list[int]) -> None:
     assert np.array_equal(chosen.reach_ns == MISSING, ~inside)
     assert chosen.fraction is not None
     part = _chosen(chosen.index[inside], chosen.fraction[inside])
-    mixed = sampled(values, part, unit="", quaternions=())
+    mixed = sampled(values, np.arange(len(times)), part, unit="", quaternions=())
     assert np.allclose(mixed[:, 0], [3.0 * row + 1.0 for row, ok in zip(rows, inside, strict=True) if ok], atol=1e-6)
     widest = max(np.diff(times), default=0)
     assert np.all(chosen.reach_ns[inside] <= widest)
@@ -56,7 +56,7 @@ def test_linear(times: list[int], rows: list[int]) -> None:
 def test_angles_go_the_short_way_round(first: float, turn: float, fraction: float) -> None:
     wrapped = (first + turn + np.pi) % (2 * np.pi) - np.pi
     chosen = _chosen(np.array([0]), np.array([fraction]))
-    (mixed,) = sampled(np.array([[first], [wrapped]]), chosen, unit="rad", quaternions=())[0]
+    (mixed,) = sampled(np.array([[first], [wrapped]]), np.arange(2), chosen, unit="rad", quaternions=())[0]
     assert abs((mixed - (first + fraction * turn) + np.pi) % (2 * np.pi) - np.pi) < 1e-9
 
 
@@ -66,6 +66,6 @@ def test_quaternions_against_scipy(seed: int, fraction: float) -> None:
     chosen = _chosen(np.array([0]), np.array([fraction]))
     values = pair.as_quat()
     values[1] *= -1 if seed % 2 else 1  # the same rotation
-    mixed = sampled(values, chosen, unit="", quaternions=(0,))[0]
+    mixed = sampled(values, np.arange(2), chosen, unit="", quaternions=(0,))[0]
     expected = Slerp([0, 1], pair)([fraction])
     assert (Rotation.from_quat(mixed).inv() * expected[0]).magnitude() < 1e-6

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from demorec.sources.bag_findings import all_findings, row_findings
 from demorec.sources.episodes import Window
-from demorec.sources.fields import SourceReader, layout_of
+from demorec.sources.fields import reader_of
 from demorec.sources.image_messages import ImageHead, ImageHeads
 from demorec.sources.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
 from demorec.sources.ros_types import Budgets
@@ -42,18 +42,18 @@ def _moments(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding
     return [ROUNDINGS[rounding]((100 + phase + k + Fraction(off[k])) * NS / rate) for k in range(COUNT)]
 
 
-def _stream(label: str, times: list[int], *, is_camera: bool) -> Stream:
+def _stream(part: Source | CameraSource, times: list[int]) -> Stream:
     heads = ImageHeads()
-    for _ in times if is_camera else ():
+    for _ in times if isinstance(part, CameraSource) else ():
         heads.append(ImageHead("jpeg", "", 64, 48, True))
-    stream = Stream(label=label, topic=f"/{label}", budgets=Budgets())
+    stream = Stream(label=part.topic[1:], part=part, budgets=Budgets())
     stream.logged, stream.stamped = array("q", [time + 1_000_000 for time in times]), array("q", times)
     stream.sums = array("I", range(len(times)))
-    if is_camera:
+    if isinstance(part, CameraSource):
         stream.heads, stream.places, stream.image_sums = heads, array("q", range(len(times))), stream.sums
     else:
-        stream.source, stream.dtype = SOURCE, np.dtype(np.float64)
-        stream.reader = SourceReader(SOURCE, layout_of(SOURCE, {"name": ["a"], "position": np.zeros(1)}))
+        stream.dtype = np.dtype(np.float64)
+        stream.reader = reader_of(part, {"name": ["a"], "position": np.zeros(1)})
         stream.vectors = bytearray(np.linspace(0, 1, len(times)).tobytes())
     return stream
 
@@ -68,8 +68,8 @@ def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, Episo
         cameras={name: CameraSource(topic=f"/{name}") for name in cameras},
     )  # fmt: skip
     streams = BagStreams(mapping, num_bytes=1 << 30)
-    streams.sources = {(name, 0): _stream("joints", joints, is_camera=False) for name in mapping.features}
-    streams.cameras = {name: _stream(name, times, is_camera=True) for name, times in cameras.items()}
+    streams.all = {(name, 0): _stream(SOURCE, joints) for name in mapping.features}
+    streams.all |= {name: _stream(mapping.cameras[name], times) for name, times in cameras.items()}
     lines = Timelines(streams, mapping)
     return lines, lines.rows(Window(begin_ns=joints[0], end_ns=joints[-1]))
 

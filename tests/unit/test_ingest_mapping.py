@@ -17,8 +17,8 @@ from demorec.sources.fields import (
     OtherPublisherError,
     converted,
     follow,
-    layout_of,
     parse_path,
+    reader_of,
 )
 from demorec.sources.mapping import Source
 from demorec.sources.mapping_file import read_mapping
@@ -93,9 +93,9 @@ def test_a_publisher_of_velocities_alone_is_another_one() -> None:
     """Wheels have no positions, and are no reason to refuse the arm whose messages come later."""
     source = Source(topic="/j", field="position", joints=("a",))
     with pytest.raises(OtherPublisherError):
-        layout_of(source, {"name": ["wheel"], "position": np.empty(0), "velocity": np.array([1.0])})
+        reader_of(source, {"name": ["wheel"], "position": np.empty(0), "velocity": np.array([1.0])})
     with pytest.raises(FieldError, match="have no names"):
-        layout_of(source, {"position": np.array([1.0])})
+        reader_of(source, {"position": np.array([1.0])})
 
 
 def test_a_source_without_a_list_is_refused_where_publishers_differ(tmp_path: Path) -> None:
