@@ -31,12 +31,12 @@ from support.faults import Changed
 from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Form, Result
 from demorec.check.episode import CheckedEpisode
-from demorec.check.evidence import Motion, motion_of_features
-from demorec.check.motion import Motions, point_masses
+from demorec.check.evidence import Motions, motion_of_features
 from demorec.check.rows import matrices
 from demorec.core.config import GenerateConfig
 from demorec.core.tables import CHECKS
 from demorec.episode.episode import frame_time_ns
+from demorec.episode.info import Feature
 
 Rows = NDArray[Any]
 Fault = Callable[[Changed], Changed]
@@ -546,11 +546,10 @@ class Stranger:
     form: ClassVar[Form] = "external"
 
     def __init__(self, features: Features, names: Mapping[str, tuple[str, ...]], fps: int) -> None:
-        self.motions = Motions([motion_of_features(features, names, fps)])
-
-    def dynamics_of(self, motion: Motion) -> Any:
-        """As of an imported recording."""
-        return point_masses(motion)
+        described = [Feature(name=name, names=elements) for name, elements in names.items()]
+        motion = motion_of_features(features, described, fps)
+        assert motion is not None
+        self.motions = Motions([motion])
 
 
 def features_of(episode: CheckedEpisode) -> tuple[Features, dict[str, tuple[str, ...]]]:

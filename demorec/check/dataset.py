@@ -16,11 +16,9 @@ from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import Cells
 from demorec.check.coverage import motion_vector
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, draw, frames_to_draw
-from demorec.check.dynamics import Dynamics
 from demorec.check.episode_drawn import drawable_scene
-from demorec.check.evidence import Motion, Named, course_of, motions_of_dataset, quaternions
+from demorec.check.evidence import Motions, Named, course_of, motions_of_dataset, quaternions
 from demorec.check.films import Film, Films, films_of_dataset, likeness_of_films
-from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.geometry import Array
@@ -163,10 +161,6 @@ class Dataset:
         known = {name: feature.names for name, feature in self.info.features.items() if feature.is_numeric}
         for number, rows in enumerate(self.rows):
             yield from ((f"{name}, episode {number}", table) for name, table in quaternions(rows, known))
-
-    def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
-        """The torques that a motion needs."""
-        return point_masses(motion)
 
     def likeness_of_cameras(self) -> Iterator[tuple[str, float]]:
         """(two cameras, correlation of their images in an episode)."""

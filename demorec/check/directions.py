@@ -12,7 +12,7 @@ from demorec.check.base import Found, Lacking, Measurement, NotMeasured
 from demorec.check.dataset import Dataset
 from demorec.check.evidence import Motion, is_gripper, quaternion_places
 from demorec.check.likeness import CARTESIAN, likeness_check, same_joints
-from demorec.check.motion import Moving
+from demorec.check.motion import Recorded
 from demorec.check.rows import matrices
 from demorec.check.targets import NO_TARGETS, target_check
 from demorec.core.geometry import Array
@@ -38,7 +38,7 @@ _LIVELY, _STILL = 0.25, 0.02
     fail=math.inf,
     group="alignment",
 )
-def targets_go_along(subject: Moving) -> Found:
+def targets_go_along(subject: Recorded) -> Found:
     """Targets go where their joints do: catches those of another episode, or backwards, which are no targets any more.
 
     Positions and targets of a joint may all be on one side of 0 and in one range: speeds and increments are on both

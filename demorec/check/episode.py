@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import ImageKind, correlation
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, strays
-from demorec.check.dynamics import Dynamics, dynamics_by_frames
 from demorec.check.episode_drawn import DrawnEpisode, draw_episode, draw_full_size, drawable_world
-from demorec.check.evidence import Motion, Named, motion_of_recording, motion_of_simulated, quaternions
+from demorec.check.evidence import Motion, Motions, Named, motion_of_features, motion_of_simulated, quaternions
 from demorec.check.films import Films, films_of_recording, likeness_of_films
 from demorec.check.full_size import FullSize, compare_with_encoder, frames_to_compare, share_off, with_lead
-from demorec.check.motion import Motions, point_masses
 from demorec.check.rows import LinkMatrices, matrices
 from demorec.check.summary import ImageSummary, summarise
 from demorec.check.topic_scan import TopicScan, scan_topics
@@ -149,7 +147,8 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def _motion(self) -> Motion | None:
         if self.form == "external":
-            return motion_of_recording(self.info, self.columns, self._named_urdf)
+            info, c = self.info, self.columns
+            return motion_of_features(c.features, info.features, info.fps, self._named_urdf or info.urdf, c.time_ns)
         return motion_of_simulated(self.info, self.columns, self.urdf) if self.num_frames else None
 
     def quaternions(self) -> Iterator[Named]:
@@ -162,15 +161,6 @@ class CheckedEpisode(ExitStack):
         poses |= {f"object {name}": table for name, table in c.object_poses.items()}
         poses |= {f"camera {name}": table for name, table in c.world_from_camera.items()}
         yield from ((name, table[:, 3:]) for name, table in poses.items())
-
-    def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
-        """The torques that its motion needs."""
-        return self.dynamics if self.form == "simulated" else point_masses(motion)
-
-    @cached_property
-    def dynamics(self) -> Dynamics | NotMeasured:
-        """Of its robot, with what the hand carries."""
-        return dynamics_by_frames(self)
 
     @property
     def num_arm(self) -> int:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,14 @@ _GRIPPER_WORDS = ("gripper", "finger")
 _SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
 """What of the name of an element is not that of its joint."""
 _QUATERNION = ("qx", "qy", "qz", "qw")
+
+FEWEST = 30
+"""Frames below which an episode says nothing of lags and orders."""
+_OWN = 0.5
+"""Correlation with its own element above which an action is a target of the state: 0.97 and more in demonstrations of
+Panda and iiwa, where increments and poses have 0.3 and less."""
+MOVES = 1e-3
+"""Range, rad or m, below which an element stands still."""
 
 Flags = NDArray[np.bool_]
 Named = tuple[str, Array]
@@ -109,6 +118,58 @@ class Motion:
         return [f"{name}{where}" for name, is_known in zip(self.names, known, strict=True) if is_known]
 
 
+class Motions:
+    """All motions of a dataset, or the one of a recording.
+
+    Attributes:
+        all: Of every episode that has a state.
+    """
+
+    def __init__(self, motions: Sequence[Motion]) -> None:
+        self.all = motions
+
+    @cached_property
+    def targets(self) -> list[tuple[Array, Array]]:
+        """(T, K) states and actions of each episode, of the K elements that have an action and move; less their means
+        and in units of the state's deviation. Empty where the action is no target of the state."""
+        pairs = [motion for motion in self.all if motion.action is not None and len(motion.state) >= FEWEST]
+        kept = self.moving
+        if not pairs or not kept.any():
+            return []
+        found = [
+            (_scaled(motion.state, motion.state)[:, kept], _scaled(_action(motion), motion.state)[:, kept])
+            for motion in pairs
+        ]
+        own = np.diag(correlations(found))
+        return found if float(np.median(own)) > _OWN else []
+
+    @cached_property
+    def moving(self) -> Flags:
+        """(D,) elements that have an action, and of which state and action change in some episode."""
+        moves = [
+            (np.ptp(motion.state, axis=0) > MOVES) & (np.ptp(_action(motion), axis=0) > MOVES)
+            for motion in self.all
+            if motion.action is not None
+        ]
+        return np.asarray(np.any(moves, axis=0)) if moves else np.zeros(0, dtype=np.bool_)
+
+
+def _action(motion: Motion) -> Array:
+    assert motion.action is not None
+    return motion.action
+
+
+def _scaled(values: Array, state: Array) -> Array:
+    return np.asarray((values - values.mean(axis=0)) / np.maximum(state.std(axis=0), MOVES))
+
+
+def correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
+    """(K, K) of each element of the state with each of the action, over all episodes; 0 where one does not change."""
+    state, action = (np.concatenate(part) for part in zip(*targets, strict=True))
+    size = np.sqrt(np.outer((state**2).sum(axis=0), (action**2).sum(axis=0)))
+    return np.asarray(state.T @ action / np.maximum(size, 1e-12))
+
+
 def quaternion_places(names: Sequence[str]) -> list[int]:
     """Where four elements in a row are x, y, z and w of one thing: orientation.x to orientation.w, qw to qz."""
     fours = [(start, names[start : start + 4]) for start in range(len(names) - 3)]
@@ -125,15 +186,6 @@ def course_of(state: Array, names: Sequence[str]) -> Array:
     for place in quaternion_places(names):
         course[:, place : place + 4] *= signs_of_course(course[:, place : place + 4])[:, None]
     return course
-
-
-def _near(action: Array | None, state: Array, names: Sequence[str]) -> Array | None:
-    """(T, D) actions whose quaternions are as near as they can be to the state's."""
-    for place in [] if action is None else quaternion_places(names):
-        assert action is not None
-        turn = slice(place, place + 4)
-        action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    return action
 
 
 def quaternions(features: Mapping[str, NDArray[Any]], described: Mapping[str, Sequence[str] | None]) -> Iterator[Named]:
@@ -181,20 +233,26 @@ def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:
     )
 
 
-def motion_of_recording(info: EpisodeInfo, columns: Columns, urdf: str) -> Motion | None:
-    """Of a recording that somebody else made, by the URDF that the user names or its own; None without a state."""
-    described = {feature.name: feature for feature in info.features}
-    if STATE not in described or not columns.num_frames:
+def motion_of_features(
+    features: Mapping[str, NDArray[Any]],
+    described: Iterable[Feature],
+    fps: float,
+    urdf: str = "",
+    time_ns: NDArray[np.int64] | None = None,
+) -> Motion | None:
+    """Of arrays (T, D) by their names, each of which is described; None without a state.
+
+    Args:
+        features, described: Name -> what was recorded of it, and what is known of each.
+        fps: Frames per second.
+        urdf: Text of the robot's description; "" for the robot whose joints the state's names are.
+        time_ns: (T,) of the frames, where they have times of their own.
+    """
+    known = {feature.name: feature for feature in described}
+    if STATE not in known or not len(features[STATE]):
         return None
-    state = described[STATE]
-    return _motion(
-        "",
-        info.fps,
-        columns.features,
-        described,
-        arm=_arm(state.names, urdf or info.urdf, state.joints),
-        time_ns=columns.time_ns,
-    )
+    arm = _arm(known[STATE].names, urdf, known[STATE].joints)
+    return _motion("", fps, features, known, arm=arm, time_ns=time_ns)
 
 
 def motions_of_dataset(
@@ -222,14 +280,6 @@ def motions_of_dataset(
         known = {name: robot.record.described(feature) for name, feature in described.items()}
         motion = _motion(where, info.fps, rows, known, arm=arm, opening=opening)
         yield motion if spec is None else replace(motion, tcp_link=spec.tcp_link)
-
-
-def motion_of_features(
-    features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]], fps: float, urdf: str = ""
-) -> Motion:
-    """Of arrays alone, one an element of `names`; by the URDF, or by the robot whose joints the state's names are."""
-    described = {name: Feature(name=name, names=tuple(elements)) for name, elements in names.items()}
-    return _motion("", fps, features, described, arm=_arm(names[STATE], urdf))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,6 +352,11 @@ def _motion(
         missing = np.full(len(state), np.nan)
         return np.stack([missing if column is None else values[:, column] for column in columns], axis=1)
 
+    action = alike(ACTION)
+    for place in [] if action is None else quaternion_places(elements):  # as near as they can be to the state's
+        assert action is not None
+        turn = slice(place, place + 4)
+        action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
     return Motion(
         where=where,
         fps=fps,
@@ -309,7 +364,7 @@ def _motion(
         names=tuple(elements),
         state=state,
         velocity=alike(VELOCITY),
-        action=_near(alike(ACTION), state, elements),
+        action=action,
         effort=alike(EFFORT),
         lower=lower,
         upper=upper,

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Measurement
-from demorec.check.evidence import Flags, Motion
-from demorec.check.motion import FEWEST, MOVES, Moving, motion_check
+from demorec.check.evidence import FEWEST, MOVES, Flags, Motion
+from demorec.check.motion import Recorded, motion_check
 
 _MIDWAY = 1e-6
 """Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
@@ -34,7 +34,7 @@ _STIRS = 1e-3
     simulated=(0.0, 0.0),
     needs=STATE_ALONE,
 )
-def repeated_frames(subject: Moving) -> Iterator[Found]:
+def repeated_frames(subject: Recorded) -> Iterator[Found]:
     """Each frame is one of its own: catches gaps that were filled with what came before. Of simulated recordings, of
     which all numbers are measured anew, in any frame; else where the frames around it differ or a velocity says so."""
     for motion in subject.motions.all:
@@ -64,7 +64,7 @@ def _is_quick(motion: Motion) -> Flags:
     fail=0.2,
     needs=STATE_ALONE,
 )
-def interpolated_frames(subject: Moving) -> Iterator[Found]:
+def interpolated_frames(subject: Recorded) -> Iterator[Found]:
     """States were measured, not made by interpolation between others, which halves velocities where they turn.
 
     A gripper may move at one speed while the arm stands still.
@@ -89,7 +89,7 @@ def interpolated_frames(subject: Moving) -> Iterator[Found]:
     on=("external", "dataset"),
     needs=STATE_ALONE,
 )
-def missing_frames(subject: Moving) -> Iterator[Found]:
+def missing_frames(subject: Recorded) -> Iterator[Found]:
     """An arm is as fast in a frame as in the two before and after, within a few times: catches frames that were lost,
     as the next one then is as far away as several, and angles that wrap.
 

@@ -16,8 +16,8 @@ import numpy as np
 from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check, counted
 from demorec.check.cells import correlation
 from demorec.check.dataset import Dataset, Rows
-from demorec.check.evidence import Flags, Motion, is_gripper, quaternion_places
-from demorec.check.motion import FEWEST_TO_COMPARE, MOVES
+from demorec.check.evidence import MOVES, Flags, Motion, is_gripper, quaternion_places
+from demorec.check.motion import FEWEST_TO_COMPARE
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION, EE_POSE, STATE

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
-from typing import Protocol
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,35 +28,28 @@ from demorec.check.base import (
     worst_entry,
     worst_frame,
 )
-from demorec.check.dynamics import Dynamics, masses_of
-from demorec.check.evidence import Flags, Motion
-from demorec.check.rows import LinkMatrices, longest_run
-from demorec.core.errors import SceneError
+from demorec.check.dataset import Dataset
+from demorec.check.dynamics import Dynamics, dynamics_by_frames, point_masses
+from demorec.check.episode import CheckedEpisode
+from demorec.check.evidence import Motion
+from demorec.check.rows import longest_run
 from demorec.core.geometry import Array
 from demorec.episode.sensed import MAY_REST
-from demorec.robots.urdf import Urdf
 
 _LATEST_S = 0.5
 """Lags of torques that are tried, seconds."""
 _FEW_FPS = 20
 """Frames a second below which exploration noise moves a joint to and fro between two frames."""
-FEWEST = 30
-"""Frames below which an episode says nothing of lags and orders."""
 FEWEST_TO_COMPARE = 4
 """Episodes from which on one is told to be unlike the others."""
 _FEWEST_WAYS = 20
 """Ways of `_VELOCITY_S` below which an episode's velocities are not judged by themselves."""
-_OWN = 0.5
-"""Correlation with its own element above which an action is a target of the state: 0.97 and more in demonstrations of
-Panda and iiwa, where increments and poses have 0.3 and less."""
 _VELOCITY_S = 0.3
 """Over which velocities are added up: filters of drivers are 20 to 100 ms late, which cancels over longer times."""
 _SLOW = 0.05
 """Root mean square speed, rad/s or m/s, above which a joint is judged even where others move ten times as far."""
 _LIVELY = 0.25
 """Share of what all episodes move in a frame, squared, from which the velocities of one are judged by themselves."""
-MOVES = 1e-3
-"""Range, rad or m, below which an element stands still."""
 _SETTLE_S = 0.6
 """After a new command fingers need so long to arrive, closing at 0.2 m/s from 0.1 m; some jaws need longer."""
 _STUCK, _INVERTED = 0.01, 0.5
@@ -68,77 +60,11 @@ _LEAST_STROKE = 0.2
 _STILL_FRAMES = 19
 """Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
 
+Recorded = CheckedEpisode | Dataset
+"""What has motions and rotations, whoever recorded it."""
 EVERYWHERE: tuple[Form, ...] = ("simulated", "external", "dataset")
 
 motion_check = partial(check, group="physics", on=EVERYWHERE)
-
-
-class Motions:
-    """All motions of a dataset, or the one of a recording.
-
-    Attributes:
-        all: Of every episode that has a state.
-    """
-
-    def __init__(self, motions: Sequence[Motion]) -> None:
-        self.all = motions
-
-    @cached_property
-    def targets(self) -> list[tuple[Array, Array]]:
-        """(T, K) states and actions of each episode, of the K elements that have an action and move; less their means
-        and in units of the state's deviation. Empty where the action is no target of the state."""
-        pairs = [motion for motion in self.all if motion.action is not None and len(motion.state) >= FEWEST]
-        kept = self.moving
-        if not pairs or not kept.any():
-            return []
-        found = [
-            (_scaled(motion.state, motion.state)[:, kept], _scaled(_action(motion), motion.state)[:, kept])
-            for motion in pairs
-        ]
-        own = np.diag(correlations(found))
-        return found if float(np.median(own)) > _OWN else []
-
-    @cached_property
-    def moving(self) -> Flags:
-        """(D,) elements that have an action, and of which state and action change in some episode."""
-        moves = [
-            (np.ptp(motion.state, axis=0) > MOVES) & (np.ptp(_action(motion), axis=0) > MOVES)
-            for motion in self.all
-            if motion.action is not None
-        ]
-        return np.asarray(np.any(moves, axis=0)) if moves else np.zeros(0, dtype=np.bool_)
-
-
-def _action(motion: Motion) -> Array:
-    assert motion.action is not None
-    return motion.action
-
-
-def _scaled(values: Array, state: Array) -> Array:
-    return np.asarray((values - values.mean(axis=0)) / np.maximum(state.std(axis=0), MOVES))
-
-
-def correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
-    """(K, K) of each element of the state with each of the action, over all episodes; 0 where one does not change."""
-    state, action = (np.concatenate(part) for part in zip(*targets, strict=True))
-    size = np.sqrt(np.outer((state**2).sum(axis=0), (action**2).sum(axis=0)))
-    return np.asarray(state.T @ action / np.maximum(size, 1e-12))
-
-
-class Moving(Protocol):
-    """What the laws are about: it has motions."""
-
-    @property
-    def motions(self) -> Motions:
-        """Of its episodes."""
-        ...
-
-    def dynamics_of(self, motion: Motion) -> Dynamics | NotMeasured | None:
-        """The torques that a motion needs; None where the robot's model is not known."""
-        ...
-
-
-# -------------------------------------------------------------------------------------------------------------- laws
 
 
 @motion_check(
@@ -149,7 +75,7 @@ class Moving(Protocol):
     simulated=(0.005, 0.05),
     needs=URDF,
 )
-def joint_limits(subject: Moving) -> Iterator[Found]:
+def joint_limits(subject: Recorded) -> Iterator[Found]:
     """Joints are within the limits of the robot's URDF: catches degrees for radians, and offsets."""
     for motion in subject.motions.all:
         known = np.isfinite(motion.lower) | np.isfinite(motion.upper)
@@ -169,7 +95,7 @@ def joint_limits(subject: Moving) -> Iterator[Found]:
     simulated=(1.5, 1.7),  # 1.245 where noise shakes an arm most, of 4,000 of seed 92000
     needs=URDF,
 )
-def joint_speed(subject: Moving) -> Iterator[Found]:
+def joint_speed(subject: Recorded) -> Iterator[Found]:
     """No joint is faster than its motor: catches wrong rates, spikes, and episodes glued together.
 
     By the recorded velocities too where these are known to be those of the joints.
@@ -193,7 +119,7 @@ def joint_speed(subject: Moving) -> Iterator[Found]:
     fail=0.16,
     needs=VELOCITIES,
 )
-def velocity_matches_position(subject: Moving) -> Iterator[Found]:
+def velocity_matches_position(subject: Recorded) -> Iterator[Found]:
     """States change by velocity over time, each joint by itself, all episodes together, and all joints in each episode:
     catches a wrong rate, also of one episode, other units, and other joints' velocities."""
     pairs = [motion for motion in subject.motions.all if motion.velocity is not None and len(motion.state) > 1]
@@ -249,7 +175,7 @@ def _of_single_episodes(motions: Sequence[Motion], parts: Array, counts: NDArray
     simulated=(2, 4),
     needs=STATE_ALONE,
 )
-def stuck_sensors(subject: Moving) -> Iterator[Found]:
+def stuck_sensors(subject: Recorded) -> Iterator[Found]:
     """What is measured changes, if ever so little, while the arm moves, and each of its elements in some frame.
 
     Of other robots than simulated ones a sensor is reported that never changes in an episode. One that may rest counts
@@ -278,7 +204,7 @@ def stuck_sensors(subject: Moving) -> Iterator[Found]:
     fail=0.5,
     needs=GRIPPER,
 )
-def gripper_follows(subject: Moving) -> Iterator[Found]:
+def gripper_follows(subject: Recorded) -> Iterator[Found]:
     """The fingers stand where they were told to, or on the way there where something is between or beside them.
 
     Catches openings and commands that are inverted, halved or frozen. Whether something is at the fingers says the
@@ -337,7 +263,7 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     fail=math.inf,
     needs=EFFORTS,
 )
-def effort_matches_dynamics(subject: Moving) -> Iterator[Found]:
+def effort_matches_dynamics(subject: Recorded) -> Iterator[Found]:
     """The motors of the joints that bear the arm give the torques that its weight and motion need.
 
     Catches torques of other joints, of another sign or unit, halved or frozen. Of other robots than simulated ones the
@@ -346,7 +272,7 @@ def effort_matches_dynamics(subject: Moving) -> Iterator[Found]:
     """
     found = list[Measurement]()
     for motion in subject.motions.all:
-        dynamics = subject.dynamics_of(motion)
+        dynamics = _dynamics(subject, motion)
         if motion.effort is None or dynamics is None:
             yield Lacking(need=EFFORTS)
             return
@@ -366,10 +292,10 @@ def effort_matches_dynamics(subject: Moving) -> Iterator[Found]:
     fail=math.inf,
     needs=EFFORTS,
 )
-def effort_lag(subject: Moving) -> Iterator[Found]:
+def effort_lag(subject: Recorded) -> Iterator[Found]:
     """Torques are of the same moment as the joints, where the load of a joint changes much: filters are faster."""
     for motion in subject.motions.all:
-        dynamics = subject.dynamics_of(motion)
+        dynamics = _dynamics(subject, motion)
         if motion.effort is None or dynamics is None:
             yield Lacking(need=EFFORTS)
             return
@@ -381,20 +307,8 @@ def effort_lag(subject: Moving) -> Iterator[Found]:
             yield Measurement(value=abs(lag) / motion.fps, detail=f"{lag:+.1f} frames, {motion.where}".rstrip(", "))
 
 
-def point_masses(motion: Motion) -> Dynamics | NotMeasured | None:
-    """Inverse dynamics of an arm that stands upright and carries nothing; None where its model is not known."""
-    if motion.urdf is None or not motion.model:
-        return None
-    try:
-        masses = masses_of(motion.model)
-    except SceneError as error:
-        return NotMeasured(why=f"the robot's masses are not to be had here: {error}")
-    links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
-    masses = {link: mass for link, mass in masses.items() if link == motion.urdf.root or link in _children(motion.urdf)}
-    tip = [joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]
-    down = np.array([0.0, 0.0, -9.81])
-    return Dynamics([links.__getitem__], motion.urdf, masses, gravity=down, step_s=1 / motion.fps, tip=tip)
-
-
-def _children(urdf: Urdf) -> set[str]:
-    return {joint.child for joint in urdf.joints}
+def _dynamics(subject: Recorded, motion: Motion) -> Dynamics | NotMeasured | None:
+    """The torques that a motion needs; None where the robot's model is not known."""
+    if isinstance(subject, CheckedEpisode) and subject.form == "simulated":
+        return subject.shared(dynamics_by_frames)
+    return point_masses(motion)

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from demorec.check.base import EE_POSES, Found, Lacking, Measurement, NotMeasured, check
-from demorec.check.evidence import Motion
-from demorec.check.motion import FEWEST, Moving
+from demorec.check.evidence import FEWEST, Motion
+from demorec.check.motion import Recorded
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.core.geometry import Array
 
@@ -33,7 +33,7 @@ _FEWEST_EPISODES, _OFF = 3, 0.01
     fail=0.05,
     needs=EE_POSES,
 )
-def pose_follows_joints(subject: Moving) -> Iterator[Found]:
+def pose_follows_joints(subject: Recorded) -> Iterator[Found]:
     """The hand goes where the joints take it, whatever its frame and the base's are: catches exchanged joints,
     other units and orders of a quaternion, and some zeros that are off. 0.1 m are added for each rad of rotation.
 
@@ -66,7 +66,7 @@ def pose_follows_joints(subject: Moving) -> Iterator[Found]:
     fail=math.inf,
     needs=EE_POSES,
 )
-def mounts_alike(subject: Moving) -> Found:
+def mounts_alike(subject: Recorded) -> Found:
     """The arm stands where it stood and has the tool that it had, and its joints have their zeros, in all episodes:
     catches an arm that was homed anew, another tool, a base that was moved. What is usual does not count, unless the
     mounts of an episode alone fit it far better: half of them may be off."""

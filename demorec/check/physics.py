@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,7 @@ from demorec.check.base import (
 )
 from demorec.check.dynamics import MIN_FRAMES
 from demorec.check.episode import CheckedEpisode
-from demorec.check.evidence import Named
-from demorec.check.motion import EVERYWHERE
+from demorec.check.motion import EVERYWHERE, Recorded
 from demorec.check.rows import displacement, matrices
 from demorec.core.geometry import Array
 from demorec.episode.episode import POLICY_PHASE
@@ -103,14 +101,6 @@ _SCATTER = 0.2
 """By which the scatter of velocities counts beside their ratio to those of the servo."""
 
 
-class Handed(Protocol):
-    """What has poses of a hand whose link is known."""
-
-    def hand_poses(self) -> Iterator[tuple[str, Array, Array]]:
-        """(where, poses (T, 7), base_from_tcp (T, 4, 4) by the joints)."""
-        ...
-
-
 @physics_check(
     measures="EE pose against forward kinematics of the joints",
     unit="m",
@@ -120,7 +110,7 @@ class Handed(Protocol):
     on=("simulated", "dataset"),
     needs="EE poses, and the robot and TCP link that demorec recorded",
 )  # fmt: skip
-def forward_kinematics(subject: Handed) -> Iterator[Found]:
+def forward_kinematics(subject: Recorded) -> Iterator[Found]:
     """Observed, wanted and commanded TCP poses are those of their joints (0.1 m per rad of rotation added)."""
     is_known = False
     for where, poses, hand in subject.hand_poses():
@@ -128,14 +118,6 @@ def forward_kinematics(subject: Handed) -> Iterator[Found]:
         yield worst_frame(displacement(matrices(poses), hand), where)
     if not is_known:
         yield Lacking(need="EE poses, and the robot and TCP link that demorec recorded")
-
-
-class Turning(Protocol):
-    """What has rotations."""
-
-    def quaternions(self) -> Iterator[Named]:
-        """(what, (T, 4)) of each."""
-        ...
 
 
 @physics_check(
@@ -146,7 +128,7 @@ class Turning(Protocol):
     fail=1e-2,
     simulated=(1e-6, 1e-3),
 )
-def unit_quaternions(subject: Turning) -> Iterator[Found]:
+def unit_quaternions(subject: Recorded) -> Iterator[Found]:
     """Every rotation is one."""
     for name, table in subject.quaternions():
         yield worst_frame(np.abs(np.linalg.norm(table, axis=1) - 1.0), name)
@@ -159,7 +141,7 @@ def unit_quaternions(subject: Turning) -> Iterator[Found]:
     warn=0,
     fail=math.inf,
 )
-def quaternions_keep_sign(subject: Turning) -> Found:
+def quaternions_keep_sign(subject: Recorded) -> Found:
     """No quaternion changes its sign from one frame to the next: the rotation is the same, but a policy sees a jump.
 
     Where one element is never negative it chooses the sign, and a jump is where it is zero.

@@ -21,8 +21,8 @@ from demorec.check.base import (
     worst_entry,
 )
 from demorec.check.dataset import Dataset
-from demorec.check.evidence import Motion, is_gripper, quaternion_places
-from demorec.check.motion import FEWEST, MOVES, Moving, correlations, motion_check
+from demorec.check.evidence import FEWEST, MOVES, Motion, correlations, is_gripper, quaternion_places
+from demorec.check.motion import Recorded, motion_check
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION
@@ -66,7 +66,7 @@ target_check = partial(check, on=("external", "dataset"), needs=ACTIONS)
     fail=0.95,
     group="alignment",
 )
-def state_follows_action(subject: Moving) -> Found:
+def state_follows_action(subject: Recorded) -> Found:
     """The state follows the action by about a frame or more, and by less than a third of a second: catches actions that
     were recorded late or early, or that are the state itself, from which a policy learns to stand still."""
     if not (targets := subject.motions.targets):
@@ -97,7 +97,7 @@ def state_follows_action(subject: Moving) -> Found:
     measures="elements of the state that follow the action of another one",
     group="alignment",
 )
-def actions_in_order(subject: Moving) -> Found:
+def actions_in_order(subject: Recorded) -> Found:
     """Every element of the state follows its own action: catches joints exchanged in one of the two."""
     if not (targets := subject.motions.targets):
         return NotMeasured(why=NO_TARGETS)
@@ -121,7 +121,7 @@ def actions_in_order(subject: Moving) -> Found:
     warn=0.1,
     fail=0.3,
 )
-def state_reaches_action(subject: Moving) -> Found:
+def state_reaches_action(subject: Recorded) -> Found:
     """A joint that is held comes to where it was sent, at least at some time: catches a zero that is off.
 
     Weight and friction keep an arm off by a few hundredths of a rad, and what a gripper holds keeps its fingers apart;
@@ -153,7 +153,7 @@ def state_reaches_action(subject: Moving) -> Found:
     measures="elements of the state that never change while their action does, or the other way round",
     needs=ACTIONS,
 )
-def elements_alive(subject: Moving) -> Found:
+def elements_alive(subject: Recorded) -> Found:
     """Encoders and commands are alive: of no element one stays at one value in all episodes while the other changes;
     commands, in three episodes or more."""
     pairs = [
@@ -198,7 +198,7 @@ def _opens_and_closes(openings: list[Array]) -> bool:
     fail=0.04,
     needs=VELOCITIES,
 )
-def steps_as_velocities(subject: Moving) -> Iterator[Found]:
+def steps_as_velocities(subject: Recorded) -> Iterator[Found]:
     """No joint jumps: catches an encoder that slips, a single wrong value, and frames that are missing.
 
     Velocities that are coarse, late or of another unit differ from the steps everywhere, and tell nothing.
@@ -225,7 +225,7 @@ def steps_as_velocities(subject: Moving) -> Iterator[Found]:
     warn=0.5,
     fail=float("inf"),
 )
-def action_is_no_observation(subject: Moving) -> Iterator[Found]:
+def action_is_no_observation(subject: Recorded) -> Iterator[Found]:
     """Actions are what was sent, not the states that came of it: what is copied from this observation or the next lacks
     what the robot was told beyond what it did. Of a gripper the two may be the same."""
     if not subject.motions.targets:
@@ -252,7 +252,7 @@ def action_is_no_observation(subject: Moving) -> Iterator[Found]:
     fail=0.015,
     needs=f"{ACTIONS}, and {URDF}",
 )
-def dead_band(subject: Moving) -> Found:
+def dead_band(subject: Recorded) -> Found:
     """A joint's state changes when its action does: catches play between encoder and joint, and coarse encoders.
 
     An encoder has a thousandth of a turn or finer, 0.006 rad; clean data have 0.004. A joint that waits once, or is
@@ -287,7 +287,7 @@ def dead_band(subject: Moving) -> Found:
     on=("external", "dataset"),
     needs=URDF,
 )
-def encoder_steps(subject: Moving) -> Iterator[Found]:
+def encoder_steps(subject: Recorded) -> Iterator[Found]:
     """A joint's readings are as fine as its encoder, a thousandth of a turn: catches angles in whole degrees or a byte.
 
     The step is the least distance of two of its values in all episodes, to which it comes back often: of a continuous
@@ -344,7 +344,7 @@ def action_steps(dataset: Dataset) -> Iterator[Found]:
     fail=3,
     needs=GRIPPER,
 )
-def gripper_waits_for_action(subject: Moving) -> Iterator[Found]:
+def gripper_waits_for_action(subject: Recorded) -> Iterator[Found]:
     """A gripper opens and closes after it was told to: catches actions that are late in one of the two directions."""
     for motion in subject.motions.all:
         place = motion.gripper

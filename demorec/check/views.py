@@ -11,9 +11,10 @@ import numpy as np
 from demorec.check.base import Found, Measurement, NotMeasured, image_check
 from demorec.check.coverage import TWIN_DISTANCE, twins
 from demorec.check.dataset import Dataset
+from demorec.check.evidence import FEWEST
 from demorec.check.films import Film, turned
 from demorec.check.likeness import far_off
-from demorec.check.motion import FEWEST, FEWEST_TO_COMPARE
+from demorec.check.motion import FEWEST_TO_COMPARE
 from demorec.core.geometry import Array
 
 _ALIKE_PARTS = 0.95

@@ -19,7 +19,15 @@ from demorec.check.base import (
     worst,
     worst_frame,
 )
-from demorec.check.dynamics import LIFTED_HEIGHT, MIN_FRAMES, MIN_LOAD, Dynamics, dynamics_by_servo, near_limit
+from demorec.check.dynamics import (
+    LIFTED_HEIGHT,
+    MIN_FRAMES,
+    MIN_LOAD,
+    Dynamics,
+    dynamics_by_frames,
+    dynamics_by_servo,
+    near_limit,
+)
 from demorec.check.episode import CheckedEpisode
 from demorec.check.gripper import CARRIED_HEIGHT
 from demorec.core.geometry import Array
@@ -87,7 +95,7 @@ def _mount(episode: CheckedEpisode) -> str:
 
 
 def _hand(episode: CheckedEpisode) -> _Hand | NotMeasured | Lacking:
-    wrench, dynamics = episode.columns.sensed.get("wrench"), episode.dynamics
+    wrench, dynamics = episode.columns.sensed.get("wrench"), episode.shared(dynamics_by_frames)
     if wrench is None:
         return Lacking(need="a wrench on the hand")
     if isinstance(dynamics, NotMeasured):
@@ -243,8 +251,7 @@ def _servo(episode: CheckedEpisode) -> _Servo | NotMeasured:
     rows = dynamics.is_judged
     if rows.sum() < MIN_FRAMES:
         return NotMeasured(why=f"the servo alone moves the free hand in {int(rows.sum())} frames")
-    known = {joint.name: joint for joint in episode.urdf.joints}
-    torque = np.stack([dynamics.torque(known[name]) for name in episode.info.robot.arm_joints], axis=1)
+    torque = np.stack([dynamics.torque(name) for name in episode.info.robot.arm_joints], axis=1)
     padded = np.pad(torque, ((_STEADY // 2, _STEADY // 2), (0, 0)), mode="edge")
     steady = np.median(np.lib.stride_tricks.sliding_window_view(padded, _STEADY, axis=0)[rows], axis=2)
     shaken = np.sqrt(((torque[rows] - steady) ** 2).mean(axis=0))

@@ -185,15 +185,16 @@ def sensed_of(observation: Observation) -> dict[str, Array]:
 def open_file(path: Path, options: ReplayOptions) -> Demonstration:
     """A recording's file to be replayed; errors as `open_demonstration` or, with a robot, `demonstration_of`."""
     if options.robot is not None:
-        from demorec.check.evidence import motion_of_recording
+        from demorec.check.evidence import motion_of_features
 
         with open_recording(path) as recording:
             if options.motors is not None:
                 raise ConfigError(f"--motor-units belongs to datasets, recordings say their units: {path}")
             if recording.info.simulation is not None:
                 raise ConfigError(f"The recording has an arm and a scene of its own: leave --robot out: {path}")
-            index, motion = recording.info.episode_index, motion_of_recording(recording.info, recording.columns(), "")
-        return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=index)
+            info, c = recording.info, recording.columns()
+            motion = motion_of_features(c.features, info.features, info.fps, info.urdf, c.time_ns)
+        return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=info.episode_index)
     with open_recording(path, simulated=True) as recording:
         return replace(open_demonstration(recording, options), source=path)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from demorec.check.dynamics import Steps
+from demorec.check.dynamics import servo_steps
 from demorec.episode.scene import POSITION_GAIN
 
 
@@ -25,13 +25,13 @@ def test_the_steps_before_a_frame_are_those_of_the_servo() -> None:
         before.append(way[-2])
         first.append(way[-3])
         velocity.append((way[-1] - way[-2]) / step_s)
-    found = Steps.of_servo(
+    found_before, found_first, off = servo_steps(
         np.array(recorded), np.array(velocity), commands, start=start, substeps=substeps, step_s=step_s
     )
-    assert np.allclose(found.before, before, atol=1e-12)
-    assert np.allclose(found.first, first, atol=1e-12)
-    assert found.off.max() < 1e-9
+    assert np.allclose(found_before, before, atol=1e-12)
+    assert np.allclose(found_first, first, atol=1e-12)
+    assert off.max() < 1e-9
     spoilt = np.array(velocity)
     spoilt[7, 1] += 0.05
-    off = Steps.of_servo(np.array(recorded), spoilt, commands, start=start, substeps=substeps, step_s=step_s).off
+    *_, off = servo_steps(np.array(recorded), spoilt, commands, start=start, substeps=substeps, step_s=step_s)
     assert np.flatnonzero(off > 0.01).tolist() == [7]
