@@ -98,9 +98,9 @@ def frame_streams(info: EpisodeInfo, tree: FrameTree | None = None) -> tuple[Fra
     """
     if info.simulation is None:
         features = (_feature(feature) for feature in info.features)
-        return (*features, *_moving_frames(tree, is_simulated=False), _held(info))
+        return (*features, *_moving_frames(tree), _held(info))
     streams = (stream for stream in _simulated_streams(info) if stream.since <= info.format_version)
-    return (*streams, *_moving_frames(tree, is_simulated=True))
+    return (*streams, *_moving_frames(tree))
 
 
 def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
@@ -124,15 +124,14 @@ def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
         yield _pose(topic, WORLD, "world_from_camera", "world_from_camera", camera.name)
 
 
-def _moving_frames(tree: FrameTree | None, *, is_simulated: bool) -> Iterator[FrameStream]:
+def _moving_frames(tree: FrameTree | None) -> Iterator[FrameStream]:
     """The coordinate frames that move; they follow from other streams, so they become no column."""
     if tree is not None and tree.moving:
-        gathered = _gathered(lambda values: tree.parts(values.observation))
         yield FrameStream(
             topic=TF,
             schema=messages.TRANSFORMS,
             layout=transforms_layout(tree.moving),
-            rows=lambda frames: tree.arrange(gathered(frames) if is_simulated else tree.parts_of_samples(frames)),
+            rows=tree.rows,
             columns=lambda values: {},
         )
 

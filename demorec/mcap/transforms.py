@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, quat_multiply
-from demorec.episode.episode import Observation, SampledFrame, Vector
+from demorec.episode.episode import SampledFrame, Vector
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.episode.scene import Body
 from demorec.mcap import messages
@@ -47,21 +48,19 @@ class FrameTree:
 
     Attributes:
         static: Rows that never change.
-        moving: (parent, child) of those that do, in the order of `arrange`.
+        moving: (parent, child) of those that do, in the order of `rows`.
     """
 
     def __init__(self, info: EpisodeInfo) -> None:
-        self._positions = JointPositions(info.features)
-        world_from_base, joints, bodies = Pose(), self._positions.joints, tuple[Body, ...]()
+        world_from_base, bodies = Pose(), tuple[Body, ...]()
         if info.simulation is None:
-            urdf = Urdf.parse(info.urdf)
+            urdf, self._places = Urdf.parse(info.urdf), joint_places(info.features)
+            names: Sequence[str] = [*self._places]
         else:
             urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
-            world_from_base, joints = info.scene.robot.world_from_base, info.robot.joint_names
-            bodies = info.scene.bodies
-        self._num_joints = len(joints)
+            world_from_base, bodies, names = info.scene.robot.world_from_base, info.scene.bodies, info.robot.joint_names
         self._objects = [body.name for body in bodies if body.movable]
-        self._joints = MovingJoints(urdf, joints)
+        self._joints = MovingJoints(urdf, names)
         self.moving = (*self._joints.moving, *((WORLD, name) for name in self._objects))
         self.static: tuple[Row, ...] = (
             (RERUN_ROOT, WORLD, Pose()),
@@ -75,23 +74,17 @@ class FrameTree:
             ),
         )
 
-    def parts(self, observation: Observation) -> list[Array]:
-        """What `arrange` needs of an observation."""
-        result = [observation.joint_position]
-        for name in self._objects:
-            pose = observation.object_poses[name]
-            result += [pose.position, pose.quat_xyzw]
-        return result
-
-    def parts_of_samples(self, frames: Sequence[SampledFrame]) -> Array:
-        """(N, n) what `arrange` needs of frames that hold features."""
-        features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in frames[0].samples}
-        return self._positions.of(features)
-
-    def arrange(self, parts: Array) -> Array:
-        """(N, 7 n) position and quaternion xyzw of every moving row at N frames."""
-        joints = self._joints.values(parts[:, : self._num_joints])
-        return np.concatenate((joints.reshape(len(parts), -1), parts[:, self._num_joints :]), axis=1)
+    def rows(self, frames: Sequence[Any]) -> Array:
+        """(N, 7 n) position and quaternion xyzw of every moving row at N frames (`FrameValues` or `SampledFrame`)."""
+        if isinstance(frames[0], SampledFrame):
+            features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in frames[0].samples}
+            positions = joint_positions(self._places, features)
+            poses = []
+        else:
+            positions = np.array([frame.observation.joint_position for frame in frames])
+            poses = [frame.observation.object_poses[name].vector() for frame in frames for name in self._objects]
+        joints = self._joints.values(positions).reshape(len(frames), -1)
+        return np.concatenate((joints, np.array(poses).reshape(len(frames), 7 * len(self._objects))), axis=1)
 
 
 class MovingJoints:
@@ -145,26 +138,18 @@ class MovingJoints:
         return result
 
 
-class JointPositions:
-    """Which elements of the observations are the positions of which joints.
+def joint_places(features: Sequence[Feature]) -> dict[str, tuple[Feature, int]]:
+    """Joint -> the first feature among the observations, and its element, that is the joint's position."""
+    places: dict[str, tuple[Feature, int]] = {}
+    for feature in features:
+        for index, joint in enumerate(feature.joints if feature.name.partition(".")[0] == "observation" else ()):
+            if joint:
+                places.setdefault(joint, (feature, index))
+    return places
 
-    Attributes:
-        joints: Their names, each once.
-    """
 
-    def __init__(self, features: Sequence[Feature]) -> None:
-        places: dict[str, tuple[Feature, int]] = {}
-        for feature in features:
-            if feature.name.partition(".")[0] != "observation":
-                continue
-            for index, joint in enumerate(feature.joints):
-                if joint:
-                    places.setdefault(joint, (feature, index))
-        self.joints = tuple(places)
-        self._places = tuple(places.values())
-        self._features = tuple({feature.name: feature for feature, _ in self._places}.values())
-
-    def of(self, features: Mapping[str, Vector]) -> Array:
-        """(..., n) rad or m, from features (..., D)."""
-        values = {feature.name: feature.in_si(features[feature.name]) for feature in self._features}
-        return np.stack([values[feature.name][..., index] for feature, index in self._places], axis=-1)
+def joint_positions(places: Mapping[str, tuple[Feature, int]], features: Mapping[str, Vector]) -> Array:
+    """(..., n) rad or m of joints that there are, from features (..., D)."""
+    used = {feature.name: feature for feature, _ in places.values()}
+    values = {name: feature.in_si(features[name]) for name, feature in used.items()}
+    return np.stack([values[feature.name][..., index] for feature, index in places.values()], axis=-1)

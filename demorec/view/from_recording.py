@@ -19,7 +19,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import ObservationRows
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.channels import JOINT_STATES, description_topic
-from demorec.mcap.transforms import JointPositions
+from demorec.mcap.transforms import joint_places, joint_positions
 from demorec.runs.run_file import EPISODES, FAILED
 from demorec.view.episode import Curves, PlayedEpisode, Video, simulated_curves, timed
 
@@ -73,15 +73,15 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
     """What every episode has: features and images; `info` may describe its robot."""
     columns = recording.columns()
     time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
-    positions = JointPositions(info.features)
-    values = positions.of(columns.features) if positions.joints else np.zeros((len(time_ns), 0))
+    places = joint_places(info.features)
+    positions = joint_positions(places, columns.features).T if places else []
     return PlayedEpisode(
         **known,
         info=info,
         robot_description=info.urdf or None,
         outcome=recording.outcome,
         time_ns=time_ns,
-        joint_position=dict(zip(positions.joints, values.T, strict=True)),
+        joint_position=dict(zip(places, positions, strict=True)),
         curves={
             feature.name: Curves(
                 time_ns=time_ns, values=columns.features[feature.name].astype(np.float64), names=feature.names
