@@ -25,11 +25,10 @@ from demorec.mcap.transforms import MovingJoints
 from demorec.view.bodies import log_robot, robot_model
 from demorec.view.episode import PlayedEpisode
 from demorec.view.layout import episode_layout
-from demorec.view.motion import log_curves, log_ee_path, log_events, log_phases
 from demorec.view.paths import Paths
 from demorec.view.programs import free_port, viewer_environment, viewer_program
 from demorec.view.save import save
-from demorec.view.scene import new_recording
+from demorec.view.scene import log_curves, log_ee_path, log_events, log_phases, new_recording
 from demorec.view.sources import find_episodes
 
 

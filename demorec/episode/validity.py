@@ -112,9 +112,7 @@ def _scene(scene: Scene) -> Iterator[str]:
         yield from _within("yaw_symmetry of a goal", goal.yaw_symmetry, 0, 360)
         if goal.area is not None:
             least_x, least_y, most_x, most_y = goal.area
-            if not (
-                -_MAX_METRES <= least_x <= most_x <= _MAX_METRES and -_MAX_METRES <= least_y <= most_y <= _MAX_METRES
-            ):
+            if not (least_x <= most_x and least_y <= most_y and max(map(abs, goal.area)) <= _MAX_METRES):
                 yield f"the area of a goal is from ({least_x}, {least_y}) to ({most_x}, {most_y})"
         if goal.object not in movable:
             yield f"a goal is for {goal.object!r}, which is no movable body of the scene"
@@ -215,10 +213,8 @@ def find_problems(info: EpisodeInfo) -> list[str]:
 
 
 def _external(info: EpisodeInfo) -> Iterator[str]:
-    if not 0 <= info.episode_index < 2**31:
-        yield f"episode_index is {info.episode_index}, allowed are 0 to {2**31 - 1}"
-    if not 1 <= info.fps <= 10_000:
-        yield f"fps is {info.fps}, allowed are 1 to 10000"
+    yield from _within("episode_index", info.episode_index, 0, 2**31 - 1)
+    yield from _within("fps", info.fps, 1, 10_000)
     if not info.instruction.strip():
         yield "the task text is empty"
     for what, text in (("task text", info.instruction), ("name of the robot", info.robot_name)):
@@ -261,7 +257,7 @@ def _feature(feature: Feature, joints: frozenset[str]) -> Iterator[str]:
     for what, words in parts:
         if words and len(words) != count:
             yield f"the feature {name!r} has {count} elements, but {len(words)} {what}"
-    named = [joint for joint in feature.joints if joint]
+    named = list(filter(None, feature.joints))
     if unknown := [joint for joint in named if joints and joint not in joints]:
         yield f"the feature {name!r} has joints that the URDF does not have: {', '.join(unknown)}"
     yield from _unique(f"joints of the feature {name!r}", named, commas=False)

@@ -14,7 +14,7 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
 from demorec.mcap.cdr import decode, encode
 from demorec.mcap.chunks import Block
-from demorec.mcap.ros2 import DEFINITIONS, Types, types_of
+from demorec.mcap.ros2 import DEFINITIONS
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -255,28 +255,23 @@ def message_fields(schema: str, data: bytes) -> dict[str, Value]:
     values, num_left = decode(schema, data, text=_any_text)
     if num_left:
         raise ValueError(f"a message with {num_left} bytes too many")
-    return dict(_leaves(types_of(schema), "", "", values))
+    return dict(_leaves("", values))
 
 
 def _any_text(raw: bytes) -> str:
     return raw.decode(errors="backslashreplace").removesuffix("\0")
 
 
-def _leaves(types: Types, kind: str, prefix: str, values: Any) -> Iterator[tuple[str, Value]]:
-    """Path and value of every field of a struct."""
-    for field in types[kind]:
-        path, value = prefix + field.name, values[field.name]
-        if field.kind == "uint8" and field.is_array:
-            value = value.tobytes()
-        if not field.is_array or isinstance(value, bytes):
-            items = [(path, value)]
-        else:
-            if field.length is None:
-                yield f"{path}.length", len(value)
-            numbers = value.tolist() if isinstance(value, np.ndarray) else value
-            items = [(f"{path}[{index}]", item) for index, item in enumerate(numbers)]
-        for place, item in items:
-            if field.kind in types:
-                yield from _leaves(types, field.kind, f"{place}.", item)
-            else:
-                yield place, item
+def _leaves(path: str, value: Any) -> Iterator[tuple[str, Value]]:
+    """Path and value of every field in a part of a message."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from _leaves(f"{path}.{name}" if path else name, part)
+    elif isinstance(value, np.ndarray) and value.dtype == np.uint8:
+        yield path, value.tobytes()
+    elif isinstance(value, list | np.ndarray):
+        yield f"{path}.length", len(value)
+        for index, item in enumerate(value.tolist() if isinstance(value, np.ndarray) else value):
+            yield from _leaves(f"{path}[{index}]", item)
+    else:
+        yield path, value
