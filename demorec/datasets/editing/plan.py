@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,8 +21,10 @@ from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, DatasetFeature, D
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import OpenDataset
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
+from demorec.datasets.lerobot.stats import NAMES
 from demorec.episode.features import ACTION, STATE
 
+_OLD_STATS = "meta/episodes_stats.jsonl"
 _PLACED = ("stats/", "videos/", "data/", "meta/")
 _FIXED = frozenset(("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"))
 _BESIDE = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
@@ -57,6 +60,25 @@ class Source(OpenDataset):
         if self.info.is_old:
             return [{} for _ in self.places]
         return _columns(self.episode_tables, tuple(self.fact_types))
+
+    def statistics(self, features: Sequence[str]) -> Iterator[tuple[int, str, Mapping[str, Any]]]:
+        """(episode_index, feature, its statistics as LeRobot writes them) where the episodes' tables have all ten."""
+        if self.info.is_old:
+            path = self.root / _OLD_STATS
+            for line in read_json_lines(path) if path.exists() else ():
+                stats, number = line.get("stats"), line.get("episode_index")
+                if isinstance(stats, dict) and isinstance(number, int):
+                    yield from ((number, name, stats[name]) for name in features if isinstance(stats.get(name), dict))
+        for path in self.episode_tables:
+            there = set(open_table(path).schema_arrow.names)
+            columns = {name: [f"stats/{name}/{key}" for key in NAMES] for name in features}
+            complete = {name: wanted for name, wanted in columns.items() if there.issuperset(wanted)}
+            for batch in table_batches(path, ["episode_index", *chain.from_iterable(complete.values())]):
+                for row in batch.to_pylist():
+                    for name, wanted in complete.items():
+                        values = [row[column] for column in wanted]
+                        if None not in values:
+                            yield row["episode_index"], name, dict(zip(NAMES, values, strict=True))
 
     @property
     def sidecar_tables(self) -> list[Path]:

@@ -11,7 +11,7 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.editing.compare import Difference
 from demorec.datasets.editing.content import TASK, Shared
 from demorec.datasets.editing.plan import Source
-from demorec.datasets.lerobot.files import open_table, read_json, table_batches
+from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES
 
@@ -104,17 +104,10 @@ def episode_statistics_differences(
                              details={"of": of, "episodes": [[n, m] for n, m, _ in wrong]})  # fmt: skip
 
 
-def _of_episodes(source: Source, name: str) -> list[dict[str, Any]]:
+def _of_episodes(source: Source, name: str) -> list[Mapping[str, Any]]:
     """The statistics of a feature by episode in order; empty where the table has not all of them."""
-    columns = {f"stats/{name}/{key}": key for key in NAMES}
-    found: list[dict[str, Any]] = []
-    for path in source.episode_tables:
-        if not set(columns) <= set(open_table(path).schema_arrow.names):
-            return []
-        for batch in table_batches(path, list(columns)):
-            rows = batch.to_pylist()
-            found += [{key: row[column] for column, key in columns.items()} for row in rows]
-    return found
+    found = [entry for _, _, entry in source.statistics([name])]
+    return found if len(found) == len(source.places) else []
 
 
 def _stats(source: Source) -> dict[str, Any]:

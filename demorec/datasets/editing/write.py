@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -19,7 +19,7 @@ from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
 from demorec.datasets.editing.packets import OpenVideo, video_files
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json_lines, table_batches
+from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
 
 _RESULT = replace(DATASET, advice="choose --overwrite or another --out")
-_OLD_STATS = "meta/episodes_stats.jsonl"
 _NUMBERS = tuple(name for name in NAMES if name != "count")
 _EPISODES_AT_ONCE = 64
 _OF_THE_END = ("next.done", "next.success", "next.reward")
@@ -271,9 +270,14 @@ class _ImageStatistics:
     def __init__(self, source: Source) -> None:
         keys = [name for name, feature in source.info.features.items() if feature.is_camera]
         self._found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
-        for number, key, count, values in _old_statistics(source, keys) if source.info.is_old else _kept(source, keys):
-            if np.isfinite(values).all():
-                self._found[number, key] = count, values
+        for number, key, entry in source.statistics(keys):
+            try:
+                part = Statistics.from_json(entry)
+                values = None if part is None else np.stack([part.values[name] for name in _NUMBERS])
+            except (ValueError, TypeError):
+                continue
+            if part is not None and values is not None and np.isfinite(values).all():
+                self._found[number, key] = part.count, values
 
     def of(self, place: EpisodePlace, key: str) -> Statistics | None:
         """Those of an episode, weighted by its frames; None where they are not kept."""
@@ -281,42 +285,6 @@ class _ImageStatistics:
             return None
         values = dict(zip(_NUMBERS, found[1], strict=True))
         return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
-
-
-def _kept(source: Source, keys: list[str]) -> Iterator[tuple[int, str, int, NDArray[np.float64]]]:
-    """(episode_index, camera, count, (9, C) numbers) of each; none of a batch in which one is missing."""
-    for path in source.episode_tables:
-        there = open_table(path).schema_arrow.names
-        complete = [key for key in keys if all(f"stats/{key}/{name}" in there for name in NAMES)]
-        names = ["episode_index", *(f"stats/{key}/{name}" for key in complete for name in NAMES)]
-        for batch in table_batches(path, names):
-            episodes = batch.column("episode_index").to_pylist()
-            for key in complete:
-                columns = {name: batch.column(f"stats/{key}/{name}") for name in NAMES}
-                if any(column.null_count for column in columns.values()):
-                    continue
-                try:
-                    counts = column_numbers(columns["count"])[:, 0].astype(np.int64).tolist()
-                    values = np.stack([column_numbers(columns[name]) for name in _NUMBERS], axis=1).astype(np.float64)
-                except (ValueError, TypeError):
-                    continue
-                yield from zip(episodes, [key] * len(episodes), counts, values, strict=True)
-
-
-def _old_statistics(source: Source, keys: list[str]) -> Iterator[tuple[int, str, int, NDArray[np.float64]]]:
-    path = source.root / _OLD_STATS
-    for line in read_json_lines(path) if path.exists() else ():
-        stats, number = line.get("stats"), line.get("episode_index")
-        if not isinstance(stats, dict) or not isinstance(number, int):
-            continue
-        for key in keys:
-            entry = stats.get(key)
-            try:
-                part = Statistics.from_json(entry) if isinstance(entry, dict) else None
-                if part is not None:
-                    yield number, key, part.count, np.stack([part.values[name] for name in _NUMBERS])
-            except (ValueError, TypeError):
-                continue
 
 
 def _video_histogram(video: EpisodeVideo, feature: DatasetFeature, first: int, last: int) -> PixelHistogram:

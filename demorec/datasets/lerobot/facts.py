@@ -126,7 +126,7 @@ def progress_table(episodes: Sequence[EpisodeProgress]) -> pa.Table:
         "frame_index": np.concatenate([np.arange(length) for length in lengths]),
     }
     for head in _HEADS:
-        share = proportions([episode.runs(head) for episode in episodes], _all_stages(episodes, head))
+        share = _proportions(episodes, head)
         parts = [progress(episode.runs(head), episode.stages(head), share) for episode in episodes]
         columns[f"progress_{head}"] = np.concatenate(parts).astype(np.float32)
     return pa.table(columns)
@@ -138,16 +138,15 @@ def write_progress(root: Path, episodes: Sequence[EpisodeProgress]) -> None:
     pq.write_table(progress_table(episodes), path, use_dictionary=["episode_index"])
     sync_path(path)
     for head in _HEADS:
-        stages = _all_stages(episodes, head)
-        share = proportions([episode.runs(head) for episode in episodes], stages)
         file = root / PROPORTIONS_PATH.format(head=head)
-        file.write_text(json.dumps(share, indent=2) + "\n")
+        file.write_text(json.dumps(_proportions(episodes, head), indent=2) + "\n")
         sync_path(file)
 
 
-def _all_stages(episodes: Sequence[EpisodeProgress], head: Head) -> tuple[str, ...]:
-    """The stages of the episode that has most, and of those whose phases nobody knows."""
-    return tuple(dict.fromkeys(stage for episode in episodes for stage in episode.stages(head)))
+def _proportions(episodes: Sequence[EpisodeProgress], head: Head) -> dict[str, float]:
+    """Of the stages of the episode that has most, and of those whose phases nobody knows."""
+    stages = tuple(dict.fromkeys(stage for episode in episodes for stage in episode.stages(head)))
+    return proportions([episode.runs(head) for episode in episodes], stages)
 
 
 _TYPES: dict[str, pa.DataType] = {

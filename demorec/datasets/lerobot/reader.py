@@ -37,6 +37,8 @@ from demorec.datasets.lerobot.layout import (
 _MOST = 1 << 40
 """Above all rows, frames and seconds of any dataset."""
 _INDEX_ROWS = 4096
+_OF_VIDEO = ("chunk_index", "file_index", "from_timestamp")
+"""Columns that say of each camera where an episode's images lie."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,7 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     """Every episode in order; ExportError when a table cannot be read."""
     columns = ["episode_index", "length", "tasks", "data/chunk_index", "data/file_index", "dataset_from_index"]
     for key in info.video_keys:
-        columns += [f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+        columns += [f"videos/{key}/{name}" for name in _OF_VIDEO]
     if info.is_old:
         rows = _old_rows(root, info)
     else:
@@ -106,6 +108,10 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
         data = file(info.data_path, "", row["data/chunk_index"], row["data/file_index"])
         first = ends.get(data, 0)
         ends[data] = first + row["length"]
+        videos = {}
+        for key in info.video_keys:
+            chunk, number, start = (row[f"videos/{key}/{name}"] for name in _OF_VIDEO)
+            videos[key] = file(info.video_path or VIDEO_PATH, key, chunk, number), round(start * info.fps)
         yield EpisodePlace(
             episode_index=row["episode_index"],
             length=row["length"],
@@ -113,18 +119,7 @@ def episode_places(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
             data=data,
             first_row=first,
             from_index=row["dataset_from_index"],
-            videos={
-                key: (
-                    file(
-                        info.video_path or VIDEO_PATH,
-                        key,
-                        row[f"videos/{key}/chunk_index"],
-                        row[f"videos/{key}/file_index"],
-                    ),
-                    round(row[f"videos/{key}/from_timestamp"] * info.fps),
-                )
-                for key in info.video_keys
-            },
+            videos=videos,
         )
 
 

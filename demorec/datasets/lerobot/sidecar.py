@@ -164,7 +164,8 @@ def _simulated_row(episode: ExportEpisode) -> dict[str, Any]:
         "behaviour": sorted(info.behaviour.items()),
         "phases": _phases(columns, episode.rows),
         "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[episode.rows]).tolist(),
-        **_things(info.scene, columns),
+        "objects": _objects(columns),
+        "goals": _goals(info.scene),
         "episode_info": to_json(info),
     }
 
@@ -178,26 +179,21 @@ def _phases(columns: Columns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
     return phases
 
 
-def _things(scene: Scene, columns: Columns) -> dict[str, list[dict[str, Any]]]:
-    """Where the objects and goals are, at the start and at the end."""
-    return {
-        "objects": [
-            {
-                "name": name,
-                "world_from_object_start": poses[0].tolist(),
-                "world_from_object_end": poses[-1].tolist(),
-            }
-            for name, poses in columns.object_poses.items()
-        ],
-        "goals": [
-            {
-                "object": goal.object,
-                "onto": goal.onto,
-                "world_from_goal_start": scene.world_from_goal(goal).vector().tolist(),
-            }
-            for goal in scene.goals
-        ],
-    }
+def _objects(columns: Columns) -> list[dict[str, Any]]:
+    """Where the objects are, at the start and at the end."""
+    return [
+        {"name": name, "world_from_object_start": poses[0].tolist(), "world_from_object_end": poses[-1].tolist()}
+        for name, poses in columns.object_poses.items()
+    ]
+
+
+def _goals(scene: Scene) -> list[dict[str, Any]]:
+    """Where the goals are at the start."""
+    places = [scene.world_from_goal(goal).vector().tolist() for goal in scene.goals]
+    return [
+        {"object": goal.object, "onto": goal.onto, "world_from_goal_start": place}
+        for goal, place in zip(scene.goals, places, strict=True)
+    ]
 
 
 class SidecarWriter:

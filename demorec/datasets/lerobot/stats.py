@@ -117,7 +117,7 @@ def vector_statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, Statisti
     Args:
         columns: Feature -> (T,) or (T, D) numbers or bools.
     """
-    blocks = {name: _two_dimensional(column) for name, column in columns.items()}
+    blocks = {name: column.reshape(len(column), -1) for name, column in columns.items()}
     matrix = np.concatenate([block.T for block in blocks.values()], axis=0, dtype=np.float64)  # (components, T)
     count = matrix.shape[1]
     mean = matrix.mean(axis=1)
@@ -141,10 +141,6 @@ def quantile_ranks(q: float, count: int) -> tuple[int, int, float]:
     position = q * (count - 1)
     low = int(position)
     return low, min(low + 1, count - 1), position - low
-
-
-def _two_dimensional(column: NDArray[Any]) -> NDArray[Any]:
-    return column.reshape(len(column), -1)
 
 
 def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
