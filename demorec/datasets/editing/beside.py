@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import sync_path
+from demorec.core.files import Closing, sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import Cut, Plan, Source
@@ -109,7 +109,7 @@ def _counted(rows: pa.Table, cut: Cut, episode: int, index: int) -> pa.Table:
     return rows
 
 
-class Beside:
+class Beside(Closing):
     """Context manager; `add` takes the episodes as they are written, `finish` completes the files.
 
     Args:
@@ -139,13 +139,11 @@ class Beside:
             for source, takes in zip(plan.sources, plan.takes, strict=True)
         ]
 
-    def __enter__(self) -> Beside:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._boxes.__exit__(*exc)
+    def close(self) -> None:
+        """Let go of the files."""
+        self._boxes.close()
         if self._sidecar is not None:
-            self._sidecar.__exit__(*exc)
+            self._sidecar.close()
 
     def add(self, cut: Cut, episode_index: int, digest: str) -> None:
         """What belongs to an episode that was written, and has this digest."""

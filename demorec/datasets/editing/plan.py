@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.files import open_table, read_json_lines, read_table, table_batches, tables_in
-from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH, DatasetFeature, DatasetInfo
+from demorec.datasets.lerobot.layout import (
+    AUTOMATIC_FEATURES,
+    CODEBASE_VERSION,
+    DATA_PATH,
+    OLD_EPISODES_PATH,
+    VIDEO_PATH,
+    DatasetFeature,
+    DatasetInfo,
+)
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import OpenDataset
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
@@ -265,8 +273,6 @@ class Plan:
     @classmethod
     def whole(cls, source: Source) -> Plan:
         """All of a dataset as it is."""
-        from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, CODEBASE_VERSION, DATA_PATH, VIDEO_PATH
-
         own = {name: feature for name, feature in source.info.features.items() if name not in AUTOMATIC_FEATURES}
         spoken = {name: feature for name, feature in own.items() if feature.dtype == "language"}
         features = {**{k: v for k, v in own.items() if k not in spoken}, **AUTOMATIC_FEATURES, **spoken}

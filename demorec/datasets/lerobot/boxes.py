@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import open_regular, sync_path
+from demorec.core.files import Closing, open_regular, sync_path
 from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 
@@ -139,7 +139,7 @@ class StoredBoxes:
         return width, height, tuple(kept)
 
 
-class BoxWriter:
+class BoxWriter(Closing):
     """Context manager; `finish` completes the files.
 
     Args:
@@ -152,10 +152,8 @@ class BoxWriter:
         self._cameras: dict[str, _CameraFile] = {}
         self._num_frames = 0
 
-    def __enter__(self) -> BoxWriter:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
+    def close(self) -> None:
+        """Let go of the files."""
         for camera in self._cameras.values():
             camera.close()
 

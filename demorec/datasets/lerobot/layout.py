@@ -148,10 +148,7 @@ class DatasetFeature:
 
 AUTOMATIC_FEATURES: dict[str, DatasetFeature] = {
     "timestamp": DatasetFeature(dtype="float32", shape=(1,)),
-    "frame_index": DatasetFeature(dtype="int64", shape=(1,)),
-    "episode_index": DatasetFeature(dtype="int64", shape=(1,)),
-    "index": DatasetFeature(dtype="int64", shape=(1,)),
-    "task_index": DatasetFeature(dtype="int64", shape=(1,)),
+    **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), DatasetFeature(dtype="int64", shape=(1,))),
 }
 """Come last in every dataset, filled in by the writer."""
 LANGUAGE_FEATURE = DatasetFeature(dtype="language", shape=(1,))
@@ -213,13 +210,7 @@ class DatasetInfo:
             "codebase_version": CODEBASE_VERSION,
             "fps": self.fps,
             "features": {name: feature.to_json() for name, feature in self.features.items()},
-            "total_episodes": self.total_episodes,
-            "total_frames": self.total_frames,
-            "total_tasks": self.total_tasks,
-            "chunks_size": self.chunks_size,
-            "data_files_size_in_mb": self.data_files_size_in_mb,
-            "video_files_size_in_mb": self.video_files_size_in_mb,
-            "data_path": self.data_path,
+            **{name: getattr(self, name) for name in _PLAIN_FIELDS},
             "video_path": self.video_path if self.video_keys else None,
             "robot_type": self.robot_type,
             "splits": {"train": f"0:{self.total_episodes}"},
@@ -301,12 +292,11 @@ def _check_template(template: object) -> None:
 
 
 _PLACEHOLDERS = ("chunk_index", "file_index", "video_key")
-_INFO_FIELDS = frozenset(
-    (
-        "fps", "robot_type", "total_episodes", "total_frames", "total_tasks", "chunks_size",
-        "data_files_size_in_mb", "video_files_size_in_mb", "data_path", "video_path",
-    )
+_PLAIN_FIELDS = (
+    "total_episodes", "total_frames", "total_tasks", "chunks_size", "data_files_size_in_mb", "video_files_size_in_mb",
+    "data_path",
 )  # fmt: skip
+_INFO_FIELDS = frozenset(("fps", "robot_type", "video_path", *_PLAIN_FIELDS))
 
 
 _ENCODER_INFO = ("video.g", "video.crf", "video.preset", "video.fast_decode", "video.extra_options")

@@ -23,6 +23,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from demorec.core.files import Closing
 from demorec.core.geometry import Array
 from demorec.core.plain import to_json, to_plain
 from demorec.datasets.lerobot.facts import first_goal
@@ -196,7 +197,7 @@ def _goals(scene: Scene) -> list[dict[str, Any]]:
     ]
 
 
-class SidecarWriter:
+class SidecarWriter(Closing):
     """Writes the sidecar's tables as the episodes come; `finish` completes them.
 
     Args:
@@ -207,21 +208,21 @@ class SidecarWriter:
 
     def __init__(self, root: Path, info: DatasetInfo, configs: Mapping[str, Any]) -> None:
         self._root, self._info = root, info
+        self._tables: list[RollingParquet] = []
         self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA)
         self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA)
         self._camera_poses: RollingParquet | None = None
         self._configs: dict[str, Any] = dict(configs)
 
     def _table(self, template: str, schema: pa.Schema, repeating: Sequence[str] | None = None) -> RollingParquet:
-        return RollingParquet(self._root, template, schema, self._info, compression="zstd", repeating=repeating)
+        table = RollingParquet(self._root, template, schema, self._info, compression="zstd", repeating=repeating)
+        self._tables.append(table)
+        return table
 
-    def __enter__(self) -> SidecarWriter:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        for table in (self._episodes, self._attempts, self._camera_poses):
-            if table is not None:
-                table.abort()
+    def close(self) -> None:
+        """Let go of the tables; those that are not finished are left as they are."""
+        for table in self._tables:
+            table.abort()
 
     def add(self, episode_index: int, digest: str, record: EpisodeRecord, attempt: Mapping[str, Any]) -> None:
         """What belongs to an episode of the dataset with this digest, and the attempt that it was."""
@@ -254,9 +255,8 @@ class SidecarWriter:
 
     def finish(self, export: Mapping[str, Any]) -> Mapping[str, Any]:
         """Close the tables and write the two JSON files; return config digest -> configuration."""
-        for table in (self._episodes, self._attempts, self._camera_poses):
-            if table is not None:
-                table.close()
+        for table in self._tables:
+            table.close()
         write_text(self._root / CONFIGS_PATH, json.dumps(self._configs, indent=2, sort_keys=True) + "\n")
         write_text(self._root / EXPORT_PATH, json.dumps(dict(export), indent=2, sort_keys=True) + "\n")
         return self._configs

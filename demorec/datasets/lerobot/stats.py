@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,11 +74,7 @@ class PixelHistogram:
     num_images: int
 
     def __add__(self, other: PixelHistogram) -> PixelHistogram:
-        return PixelHistogram(
-            counts=self.counts + other.counts,
-            level_values=self.level_values,
-            num_images=self.num_images + other.num_images,
-        )
+        return replace(self, counts=self.counts + other.counts, num_images=self.num_images + other.num_images)
 
     def statistics(self) -> Statistics:
         """Exact, over all counted pixels."""

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.core.files import sync_path
+from demorec.core.files import Closing, sync_path
 from demorec.datasets.lerobot.files import tables_in
 from demorec.datasets.lerobot.language import (
     REPEATING,
@@ -93,7 +93,7 @@ class EpisodeData:
         return len(next(iter(self.columns.values())))
 
 
-class DatasetWriter:
+class DatasetWriter(Closing):
     """Context manager; `finish` completes the metadata.
 
     Args:
@@ -140,10 +140,8 @@ class DatasetWriter:
         self._pixels: dict[str, PixelHistogram] = {}
         self._unseen: dict[str, list[Statistics]] = {}
 
-    def __enter__(self) -> DatasetWriter:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
+    def close(self) -> None:
+        """Let go of the files; those that are not finished are dropped, or left as they are."""
         for video in self._videos.values():
             video.abort()
         self._data.abort()
