@@ -148,14 +148,14 @@ class Dataset:
                 self._tell_result("Would be ", name, plan, "Would not be taken over")
                 continue
             with ProgressBar("writing") as bar:
-                report = write_plan(
+                decoded, around = write_plan(
                     plan, self.out / name, overwrite=self.overwrite, decode=self.decode, progress=bar.set
                 )
             self._tell_result("", name, plan, "Not taken over")
-            if report.around:
-                say(f"{counted(report.around, 'image')} beside cuts stay in the videos, since others need them.")
-            if report.decoded:
-                say(f"Images of {counted(report.decoded, 'episode')} were decoded for their statistics.")
+            if around:
+                say(f"{counted(around, 'image')} beside cuts stay in the videos, since others need them.")
+            if decoded:
+                say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
         return 0
 
     def _plans(self) -> Mapping[str, Plan]:

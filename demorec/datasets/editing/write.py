@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,24 +40,6 @@ _EPISODES_AT_ONCE = 64
 _OF_THE_END = ("next.done", "next.success", "next.reward")
 
 
-@dataclass(frozen=True, kw_only=True)
-class EditReport:
-    """What came out.
-
-    Attributes:
-        path: The dataset.
-        num_episodes, num_frames: In it.
-        decoded: Episodes of which images were decoded for their statistics.
-        around: Images beside cuts that stay in the videos, since others are decoded from them.
-    """
-
-    path: Path
-    num_episodes: int
-    num_frames: int
-    decoded: int
-    around: int
-
-
 def check_target(out: Path, roots: Sequence[Path], *, overwrite: bool) -> None:
     """Raise ConfigError where `write_plan` would: something is in the way at `out`, or it is one of the sources."""
     check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=roots)
@@ -65,7 +47,7 @@ def check_target(out: Path, roots: Sequence[Path], *, overwrite: bool) -> None:
 
 def write_plan(
     plan: Plan, out: Path, *, overwrite: bool = False, decode: bool = False, progress: ProgressCallback | None = None
-) -> EditReport:
+) -> tuple[int, int]:
     """Write the dataset: whole, or not at all; its sources are not touched.
 
     Args:
@@ -74,6 +56,10 @@ def write_plan(
         overwrite: Whether a dataset that is there is replaced.
         decode: Decode all images for their statistics, also of episodes whose own are known.
         progress: Called after every episode.
+
+    Returns:
+        How many episodes' images were decoded for their statistics; how many images beside cuts stay in the videos,
+        since others are decoded from them.
 
     Raises:
         ConfigError: Something is in the way at `out`.
@@ -94,19 +80,13 @@ def write_plan(
                 beside.add(cut, done - 1, writer.add(data))
                 if progress is not None:
                     progress(done, len(plan.cuts))
-            info = writer.finish()
+            writer.finish()
             beside.finish()
         for name in ABOUT_THE_WHOLE:
             if len(roots) == 1 and (roots[0] / name).is_file():
                 (folder / name).parent.mkdir(exist_ok=True)
                 shutil.copyfile(roots[0] / name, folder / name)
-    return EditReport(
-        path=out,
-        num_episodes=info.total_episodes,
-        num_frames=info.total_frames,
-        decoded=sum(reader.num_decoded for reader in readers),
-        around=around,
-    )
+    return sum(reader.num_decoded for reader in readers), around
 
 
 def _fact_types(plan: Plan) -> dict[str, pa.DataType]:

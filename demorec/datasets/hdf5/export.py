@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -157,9 +157,18 @@ class RobomimicWriter:
         for name, (feature, elements) in observations.items():
             _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
         for name, camera in zip(images, episode.cameras, strict=True):
-            settings = episode.recording.video_settings(camera.name)
-            shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
-            _add_images(group, name, shape, episode.images(camera), self.options.compression)
+            settings, level = episode.recording.video_settings(camera.name), self.options.compression
+            shape = (settings.height, settings.width, 1 if camera.is_depth else 3)
+            stored = group.create_dataset(
+                name,
+                (count, *shape),
+                np.float32 if camera.is_depth else np.uint8,
+                chunks=(1, *shape),  # so that one image is read by itself
+                compression="gzip" if level else None,
+                compression_opts=level or None,
+            )
+            for index, image in enumerate(episode.images(camera)):
+                stored[index] = image.reshape(shape)
         if self.num_episodes == 0:
             self._data.attrs.update(_attributes(episode))
         self.num_episodes += 1
@@ -214,31 +223,28 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
 
     Of an external episode there is no environment but its name.
     """
-    arguments = {
-        "robot": episode.recording.info.robot_name,
+    info, options = episode.info, episode.options
+    arguments: dict[str, object] = {
+        "robot": info.robot_name,
         "fps": episode.fps,
         "cameras": [camera.name for camera in episode.cameras if not camera.is_depth],
     }
-    if episode.info.simulation is None:
+    if info.simulation is None:
         arguments["observations"] = [*_observation_names(episode), *_image_names(episode)]
         assert arguments.keys() == EXTERNAL_ARGUMENTS
-        described = {"env_name": EXTERNAL_ENVIRONMENT, "type": _GYM, "env_kwargs": arguments}
-        return {"env_args": json.dumps(described), "fps": episode.fps}
-    return {**_environment(episode.info, episode, arguments), "fps": episode.fps}
-
-
-def _environment(info: EpisodeInfo, episode: ExportEpisode, arguments: dict[str, object]) -> dict[str, str | int]:
-    options = episode.options
-    cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
-    arguments |= {
-        "physics_hz": info.physics_hz,
-        **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
-        "action": options.action,
-        "privileged": options.privileged,
-    }
-    assert arguments.keys() - IMAGE_ARGUMENTS == ENV_ARGUMENTS
-    described = {"env_name": environment_name(info.task), "type": _GYM, "env_kwargs": arguments}
-    return {"env_args": json.dumps(described), "task": info.task}
+        name, task = EXTERNAL_ENVIRONMENT, {}
+    else:
+        cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
+        arguments |= {
+            "physics_hz": info.physics_hz,
+            **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
+            "action": options.action,
+            "privileged": options.privileged,
+        }
+        assert arguments.keys() - IMAGE_ARGUMENTS == ENV_ARGUMENTS
+        name, task = environment_name(info.task), {"task": info.task}
+    described = {"env_name": name, "type": _GYM, "env_kwargs": arguments}
+    return {"env_args": json.dumps(described), **task, "fps": episode.fps}
 
 
 def _states(columns: Columns, rows: NDArray[np.intp], info: EpisodeInfo) -> tuple[NDArray[np.float64], tuple[str, ...]]:
@@ -258,27 +264,3 @@ def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], comp
     """(T, D) numbers as a dataset whose attribute `names` has those of the D components."""
     stored = group.create_dataset(name, data=values)
     stored.attrs["names"] = json.dumps(components)
-
-
-def _add_images(
-    group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
-) -> None:
-    """A stream of images, each a compressed chunk of its own, so that one is read by itself.
-
-    Args:
-        group: Where it goes.
-        name: Of the dataset.
-        shape: Of all images: (T, H, W, 3) of colours, uint8; (T, H, W, 1) of distances, float32.
-        images: One after the other.
-        compression: Level of gzip, 0 for none.
-    """
-    stored = group.create_dataset(
-        name,
-        shape,
-        np.uint8 if shape[-1] == 3 else np.float32,
-        chunks=(1, *shape[1:]),
-        compression="gzip" if compression else None,
-        compression_opts=compression or None,
-    )
-    for index, image in enumerate(images):
-        stored[index] = image.reshape(shape[1:])

@@ -96,9 +96,8 @@ class StoredBoxes:
         self._path, self._starts = path, list(starts)
         self._parts: dict[int, tuple[int, int]] = {}
         self._sizes: dict[int, tuple[int, int]] = {}
-        self._nouns: dict[int, str] | None = None
         with _box_errors(path), open_regular(path) as file:
-            in_images, offset = False, 0
+            in_images, offset, categories = False, 0, None
             for raw in file:
                 line = _line(raw)
                 if line.startswith('{"id"'):
@@ -112,10 +111,11 @@ class StoredBoxes:
                 elif line == "]":
                     in_images = True
                 elif line.startswith('"categories"'):
-                    self._nouns = {item["id"]: str(item["name"]) for item in parse_json("{" + line)["categories"]}
+                    categories = parse_json("{" + line)["categories"]
                 offset += len(raw)
-            if self._nouns is None:
+            if categories is None:
                 raise ValueError("its end is missing")
+            self._nouns = {item["id"]: str(item["name"]) for item in categories}
 
     def _episode(self, index: int) -> int:
         return bisect_right(self._starts, index) - 1
@@ -132,7 +132,7 @@ class StoredBoxes:
             for raw in file.read(end - begin).splitlines():
                 item = parse_json(_line(raw))
                 row = int(item.pop("image_id")) - start
-                noun = (self._nouns or {})[item.pop("category_id")]
+                noun = self._nouns[item.pop("category_id")]
                 if 0 <= row < last - first:
                     del item["id"]
                     kept.append((row, noun, item))
