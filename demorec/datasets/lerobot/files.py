@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +46,16 @@ def leave_pandas_out() -> None:
 
     It would load it, which takes longer than most edits, to ask whether the lists that it is given are pandas' own.
     """
-    if "pandas" not in sys.modules:
-        sys.modules["pandas"] = None  # type: ignore[assignment]  # so that it cannot be imported
-        pa.array([0])  # looks for it once, and remembers
-        del sys.modules["pandas"]
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    pa.array([0])  # looks for it once, and remembers
+    sys.meta_path.remove(finder)
+
+
+class _NoPandas(MetaPathFinder):
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
+        if fullname == "pandas":
+            raise ImportError
 
 
 def read_json(path: Path) -> Any:
