@@ -209,7 +209,7 @@ def dataset_language_truth(dataset: Dataset) -> Found:
     if not dataset.infos:
         return NotMeasured(why="the episodes are external, and what they say is as it came")
     wrong = []
-    boxes = _Boxes(dataset)
+    boxes = _boxes_of(dataset)
     for each in (each for each in dataset.described() if each.number < len(dataset.spoken)):
         number, row, info, episode = each.number, each.kept, each.info, dataset.spoken[each.number]
         start = situation(info.scene)
@@ -217,7 +217,7 @@ def dataset_language_truth(dataset: Dataset) -> Found:
             *_wrong_phases(episode, row, dataset.info.fps),
             *_wrong_words(episode, row, info, start),
             *_wrong_interjections(episode, row, info, start, dataset.info.fps),
-            *_wrong_answers(episode, number, start, boxes),
+            *_wrong_answers(episode, dataset.places[number].from_index, start, boxes),
         ]
         wrong += [f"episode {number}: {text}" for text in faults]
     return counted(wrong, f"{len(dataset.spoken)} episodes")
@@ -307,36 +307,35 @@ def _colored(text: str, start: Surroundings) -> Iterator[tuple[str, str]]:
         yield match[1], match[2]
 
 
-class _Boxes:
-    """What the files of `--boxes` say: (camera, index) -> object -> box; nothing without them."""
-
-    def __init__(self, dataset: Dataset) -> None:
-        self._first = [place.from_index for place in dataset.places]
-        self._found: dict[tuple[str, int], dict[str, list[float]]] = {}
-        files = sorted((dataset.path / BOXES_DIR).glob("*.json"))
-        self.cameras = {path.stem for path in files}
-        for path in files:
-            for item in read_boxes(path):
-                x, y, width, height = item.box
-                self._found.setdefault((path.stem, item.index), {})[item.object] = [x, y, x + width - 1, y + height - 1]
-
-    def at(self, camera: str, episode: int, frame: int) -> dict[str, list[float]]:
-        """Name of the body -> (x_min, y_min, x_max, y_max), of all that an image shows."""
-        return self._found.get((camera, self._first[episode] + frame), {})
+Boxes = dict[str, list[float]]
+"""Name of a body -> (x_min, y_min, x_max, y_max)."""
 
 
-def _wrong_answers(episode: SpokenEpisode, number: int, start: Surroundings, boxes: _Boxes) -> Iterator[str]:
+def _boxes_of(dataset: Dataset) -> dict[str, dict[int, Boxes]]:
+    """What the files of `--boxes` say: camera -> index of a row -> what its image shows; nothing without them."""
+    found: dict[str, dict[int, Boxes]] = {}
+    for path in sorted((dataset.path / BOXES_DIR).glob("*.json")):
+        of_camera = found.setdefault(path.stem, {})
+        for item in read_boxes(path):
+            x, y, width, height = item.box
+            of_camera.setdefault(item.index, {})[item.object] = [x, y, x + width - 1, y + height - 1]
+    return found
+
+
+def _wrong_answers(
+    episode: SpokenEpisode, first: int, start: Surroundings, boxes: dict[str, dict[int, Boxes]]
+) -> Iterator[str]:
+    """Answers that the boxes contradict; `first` is the index of the episode's first row."""
     for frame, rows in episode.events.items():
         for row in rows:
-            answer, camera = _answer(row), str(row.get("camera"))
-            if answer is None or row.get("style") != "vqa" or row.get("role") != "assistant":
+            answer, of_camera = _answer(row), boxes.get(str(row.get("camera")))
+            if answer is None or of_camera is None or (row.get("style"), row.get("role")) != ("vqa", "assistant"):
                 continue
-            if camera in boxes.cameras:
-                seen = boxes.at(camera, number, frame)
-                yield from (f"frame {frame}: {text}" for text in _against(answer, seen, start))
+            seen = of_camera.get(first + frame, {})
+            yield from (f"frame {frame}: {text}" for text in _against(answer, seen, start))
 
 
-def _against(answer: Row, seen: dict[str, list[float]], start: Surroundings) -> Iterator[str]:
+def _against(answer: Row, seen: Boxes, start: Surroundings) -> Iterator[str]:
     """Faults of an answer, given what the image shows."""
     if "count" in answer:
         count = sum(answer["label"] in start.thing(name).nouns for name in seen)

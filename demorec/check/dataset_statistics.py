@@ -49,11 +49,7 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     stats = read_statistics(dataset)
     for name in _numeric(dataset):
         episodes = [_vectors(dataset, name, rows[name]) for rows in dataset.rows]
-        true = {
-            **statistics_of(np.concatenate(episodes)),
-            "count": np.array([float(sum(len(rows[name]) for rows in dataset.rows))]),
-        }
-        weights = [len(values) for values in episodes]
+        count, weights = sum(len(rows[name]) for rows in dataset.rows), [len(values) for values in episodes]
         own = [_quantile_ranges(values) for values in episodes]
         # (2, D) of each quantile: lowest and highest that it may be.
         averaged = {q: np.average([ranges[q] for ranges in own], axis=0, weights=weights) for q in QUANTILES}
@@ -61,8 +57,8 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
             q: np.stack([np.min([r[q][0] for r in own], axis=0), np.max([r[q][1] for r in own], axis=0)])
             for q in QUANTILES
         }
-        ranges = (_quantile_ranges(np.concatenate(episodes)), averaged)
-        yield _off(stats.get(name), true, ranges, {} if dataset.sidecar else between, detail=name)
+        merged = {} if dataset.sidecar else between
+        yield _off(stats.get(name), np.concatenate(episodes), count, name, averaged, merged)
     strays = [name for name in stats if name not in dataset.info.features]
     yield Measurement(value=_STALE if strays else 0.0, detail=f"{', '.join(strays[:3])}: no feature" if strays else "")
 
@@ -79,9 +75,7 @@ def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
     for number, (row, rows) in enumerate(zip(stored, dataset.rows, strict=False)):
         for name in names:
             said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
-            values = _vectors(dataset, name, rows[name])
-            true = {**statistics_of(values), "count": np.array([float(len(rows[name]))])}
-            yield _off(said, true, (_quantile_ranges(values),), detail=f"episode {number}, {name}")
+            yield _off(said, _vectors(dataset, name, rows[name]), len(rows[name]), f"episode {number}, {name}")
 
 
 def episode_column(dataset: Dataset, name: str) -> list[Any]:
@@ -107,18 +101,6 @@ def numbers_of(value: Any) -> Array:
         return np.asarray(value, dtype=np.float64).reshape(-1)
     except (ValueError, TypeError, OverflowError):
         return np.zeros(0)
-
-
-def statistics_of(values: Array) -> dict[str, Array]:
-    """The ten numbers of the rows (T, D), by NumPy alone: each (D,), the count (1,)."""
-    return {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-        "count": np.array([float(len(values))]),
-        **{name: np.quantile(values, share, axis=0) for name, share in QUANTILES.items()},
-    }
 
 
 def _quantile_ranges(values: Array) -> dict[str, Array]:
@@ -148,25 +130,28 @@ def _vectors(dataset: Dataset, name: str, rows: Any) -> Array:
 
 def _off(
     said: Mapping[str, Any] | None,
-    true: Mapping[str, Array],
-    ranges: Sequence[Mapping[str, Array]],
-    between: Mapping[str, Array] = MappingProxyType({}),
-    *,
+    values: Array,
+    count: int,
     detail: str,
+    averaged: Mapping[str, Array] = MappingProxyType({}),
+    between: Mapping[str, Array] = MappingProxyType({}),
 ) -> Found:
-    """How far the worst quantity of a feature is off; a quantile from the nearest of its ranges (2, D), and by no more
-    than `_MERGED` where it lies `between` two others.
+    """How far the worst quantity of a feature is off, by its rows (T, D) of so many frames; a quantile from the nearer
+    one of its ranges, also the `averaged` one, and by no more than `_MERGED` where it lies `between` two others.
     """
     if said is None:
         return Measurement(value=math.inf, detail=f"{detail} has no statistics")
-    found = []
+    true = {name: getattr(values, name)(axis=0) for name in ("min", "max", "mean", "std")}
+    true |= {"count": np.array([float(count)])}
+    true |= {name: np.quantile(values, share, axis=0) for name, share in QUANTILES.items()}
+    found, ranges = [], _quantile_ranges(values)
     scale = np.maximum(true["std"], _SMALLEST_DEVIATION)
     for quantity, value in true.items():
         stored = numbers_of(said.get(quantity, np.inf))
         off, merged = math.inf, ""
         if stored.shape == value.shape:
             distance = np.abs(stored - value)
-            for low, high in (known[quantity] for known in ranges if quantity in known):
+            for low, high in (known[quantity] for known in (ranges, averaged) if quantity in known):
                 distance = np.minimum(distance, np.maximum(np.maximum(low - stored, stored - high), 0.0))
             distance = distance if quantity == "count" else distance / scale
             lowest, highest = between.get(quantity, (np.inf, -np.inf))

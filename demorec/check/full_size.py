@@ -152,16 +152,18 @@ def encoded_again(
         lead = LEAD // recorded.gop * recorded.gop  # so that the first of them is a keyframe as it was
         before = [seen[frame] for frame in range(max(first - lead, 0), first)]
         given = [*before, *(drawn[n] for n in part)]
-        if tries_qualities:
-            true = np.stack([seen[int(frame)] for frame in frames[part]])
-            images += _most_alike(settings, recorded, given, true)
-        else:
-            images += _encoded(settings, recorded, given, len(part))
+        steps = (_STEPS if before else _FAR_STEPS) if tries_qualities else _STEPS[:1]
+        true = np.stack([seen[int(frame)] for frame in frames[part]])
+        images += _most_alike(settings, recorded, given, true, steps)
     return np.stack(images)
 
 
 def _most_alike(
-    settings: VideoSettings, config: VideoConfig, images: Sequence[Rgb], recorded: NDArray[np.uint8]
+    settings: VideoSettings,
+    config: VideoConfig,
+    images: Sequence[Rgb],
+    recorded: NDArray[np.uint8],
+    steps: Sequence[float],
 ) -> Sequence[Rgb]:
     """What an encoder makes of the last of some images, at the quality that was asked for or one near it.
 
@@ -171,9 +173,9 @@ def _most_alike(
         settings, config: Of the encoder.
         images: What it gets.
         recorded: (N, H, W, 3) what it made of the last N of them.
+        steps: By which the quality may be another one.
     """
     best, least = list[Rgb](), np.inf
-    steps = _STEPS if len(images) > len(recorded) else _FAR_STEPS
     for step in steps if config.codec == "h264" and config.crf is not None else steps[:1]:
         # A whole number to the user; x264 knows parts of it.
         other = replace(config, crf=max(config.crf + step, 0)) if step else config  # type: ignore[arg-type, operator]

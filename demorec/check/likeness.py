@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Lacking, Measurement, NotMeasured, check, counted
 from demorec.check.cells import correlation
-from demorec.check.dataset import Dataset, Rows
+from demorec.check.dataset import Dataset
 from demorec.check.evidence import MOVES, Flags, Motion, is_gripper, quaternion_places
 from demorec.check.motion import FEWEST_TO_COMPARE
 from demorec.check.rows import finest_lag
@@ -56,21 +56,7 @@ drawn from 60 of each of three tasks, one in 10,000 has such a view."""
 _OFFSET = 0.1
 """Distance of a joint from its targets that is usual at least, in its deviations."""
 
-likeness_check = partial(check, on=("dataset",), needs="actions of three episodes")
-
-
-def _states(rows: Rows) -> Array:
-    """(T, D) of what is known of the robot's place."""
-    parts = [rows[name].reshape(len(rows[name]), -1) for name in (STATE, EE_POSE) if name in rows]
-    return np.concatenate(parts, axis=1).astype(np.float64)
-
-
-def _evidence(states: Array, fps: float) -> Array:
-    """(T, N) states, and how far they go from each frame on."""
-    ahead = [max(1, round(seconds * fps)) for seconds in _AHEAD_S]
-    last = len(states) - 1
-    steps = [states[np.minimum(np.arange(last + 1) + k, last)] - states for k in ahead]
-    return np.concatenate([states, *steps], axis=1)
+likeness_check = partial(check, group="alignment", on=("dataset",), needs="actions of three episodes")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,30 +66,37 @@ class _Scaled:
 
     Attributes:
         numbers: The episodes.
-        means, deviations: Of actions and evidence, (K,) and (N,); those of what stays the same are inf.
+        width: K elements of the action, before the N of the evidence.
+        mean, deviation: (K + N,); the deviation of what stays the same is inf.
     """
 
     dataset: Dataset
     numbers: list[int]
-    means: list[Array]
-    deviations: list[Array]
+    width: int
+    mean: Array
+    deviation: Array
 
     @property
     def num_states(self) -> int:
         """D: the first elements of the evidence, and as many ways of one frame after them."""
-        return len(self.means[1]) // (1 + len(_AHEAD_S))
+        return (len(self.mean) - self.width) // (1 + len(_AHEAD_S))
 
     def __iter__(self) -> Iterator[tuple[Array, Array]]:
         """(T, K) and (T, N) of each, less the dataset's means and in units of its deviations."""
-        for number in self.numbers:
-            action, evidence = _measured(self.dataset, number)
-            yield (action - self.means[0]) / self.deviations[0], (evidence - self.means[1]) / self.deviations[1]
+        for table in _tables(self.dataset, self.numbers):
+            scaled = (table - self.mean) / self.deviation
+            yield scaled[:, : self.width], scaled[:, self.width :]
 
 
-def _measured(dataset: Dataset, number: int) -> tuple[Array, Array]:
-    rows = dataset.rows[number]
-    action = rows[ACTION].reshape(len(rows[ACTION]), -1).astype(np.float64)
-    return action, _evidence(_states(rows), dataset.info.fps)
+def _tables(dataset: Dataset, numbers: Sequence[int]) -> Iterator[Array]:
+    """(T, K + N) of each episode: actions; what is known of the robot's place, and how far it goes from each frame."""
+    ahead = [max(1, round(seconds * dataset.info.fps)) for seconds in _AHEAD_S]
+    for number in numbers:
+        named = [dataset.rows[number][name] for name in (ACTION, STATE, EE_POSE) if name in dataset.rows[number]]
+        action, *parts = (values.reshape(len(values), -1).astype(np.float64) for values in named)
+        states = np.concatenate(parts, axis=1)
+        later = [np.minimum(np.arange(len(states)) + k, len(states) - 1) for k in ahead]
+        yield np.concatenate([action, states, *(states[rows] - states for rows in later)], axis=1)
 
 
 def _scaled(dataset: Dataset) -> _Scaled | Found:
@@ -113,26 +106,14 @@ def _scaled(dataset: Dataset) -> _Scaled | Found:
     long = [number for number, rows in enumerate(dataset.rows) if len(rows[STATE]) >= _FEWEST_FRAMES]
     if len(long) < _FEWEST_EPISODES:
         return NotMeasured(why=f"fewer than {_FEWEST_EPISODES} episodes have {_FEWEST_FRAMES} frames")
-    means = _average(dataset, long, lambda _, table: table)
-    squares = _average(dataset, long, lambda part, table: (table - means[part]) ** 2)
-    deviations = [np.where(square > 1e-18, np.sqrt(square), np.inf) for square in squares]
-    return _Scaled(dataset=dataset, numbers=long, means=means, deviations=deviations)
-
-
-def _average(dataset: Dataset, numbers: list[int], of: Callable[[int, Array], Array]) -> list[Array]:
-    """Over all frames of actions and of evidence."""
-    sums, count = [np.zeros(()), np.zeros(())], 0
-    for number in numbers:
-        tables = _measured(dataset, number)
-        sums = [
-            total + of(part, table).sum(axis=0) for part, (total, table) in enumerate(zip(sums, tables, strict=True))
-        ]
-        count += len(tables[0])
-    return [total / count for total in sums]
+    count, width = sum(len(dataset.rows[number][STATE]) for number in long), math.prod(features[ACTION].shape)
+    mean = np.asarray(sum(table.sum(axis=0) for table in _tables(dataset, long)) / count)
+    square = np.asarray(sum(((table - mean) ** 2).sum(axis=0) for table in _tables(dataset, long)) / count)
+    deviation = np.where(square > 1e-18, np.sqrt(square), np.inf)
+    return _Scaled(dataset=dataset, numbers=long, width=width, mean=mean, deviation=deviation)
 
 
 @likeness_check(
-    group="alignment",
     measures="by how much less than usual an episode's action goes with its states, as a correlation",
     warn=0.4,
     fail=0.55,
@@ -148,7 +129,7 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
     if not isinstance(found, _Scaled):
         yield found
         return
-    size, width, names = len(found.means[1]), len(found.means[0]), dataset.info.features[ACTION].names or ()
+    size, width, names = len(found.mean) - found.width, found.width, dataset.info.features[ACTION].names or ()
     turns = {place + part for place in quaternion_places(names) for part in range(4)}
     is_linear = np.array([not is_gripper(name) and i not in turns for i, name in enumerate(names)], dtype=np.bool_)
     is_linear = is_linear if len(names) == width else np.ones(width, dtype=np.bool_)
@@ -177,7 +158,6 @@ def actions_go_with_states(dataset: Dataset) -> Iterator[Found]:
 
 
 @likeness_check(
-    group="alignment",
     measures="frames by which the states' motion is too early for actions that are none of their targets, or too late",
     warn=2.5,
     fail=4.5,
@@ -197,7 +177,7 @@ def motion_follows_action(dataset: Dataset) -> Found:
     fps = dataset.info.fps
     reach = max(2, round(_REACH_S * fps))
     lags = range(-reach, reach + 1)
-    size, width = found.num_states, len(found.means[0])
+    size, width = found.num_states, found.width
     square, products, all_of = np.zeros((size, size)), np.zeros((len(lags), size, width)), np.zeros(width)
     for action, evidence in found:
         if len(action) <= 3 * reach + 1:
@@ -241,7 +221,6 @@ def same_joints(dataset: Dataset) -> Iterator[tuple[int, int]]:
 
 
 @likeness_check(
-    group="alignment",
     measures="episodes in which a joint is farther from its targets than in the others",
     fail=math.inf,
 )
@@ -265,7 +244,6 @@ def offsets_alike(dataset: Dataset) -> Found:
 
 
 @likeness_check(
-    group="alignment",
     measures="joints whose action is called a position, as their state is, where no action is a target of the state",
     fail=math.inf,
 )
@@ -278,9 +256,7 @@ def targets_as_named(dataset: Dataset) -> Found:
     return Measurement(value=len(wrong), detail=", ".join(wrong[:3]))
 
 
-@check(
-    group="alignment",
-    on=("dataset",),
+@likeness_check(
     needs="an element that two observations have",
     measures="elements of one name that go their own ways in two observations",
     fail=math.inf,
@@ -306,7 +282,7 @@ def same_by_name(dataset: Dataset) -> Found:
 
 def _told_by_states(found: _Scaled) -> Array:
     """(K,) share of each action's variance that is a linear function of the states in the same frame."""
-    size, width, count = found.num_states, len(found.means[0]), 0
+    size, width, count = found.num_states, found.width, 0
     square, product, total = np.zeros((size, size)), np.zeros((size, width)), np.zeros(width)
     for action, evidence in found:
         states = evidence[:, :size]
@@ -318,9 +294,7 @@ def _told_by_states(found: _Scaled) -> Array:
     return np.asarray(told / np.maximum(total, 1e-9))
 
 
-@check(
-    group="alignment",
-    on=("dataset",),
+@likeness_check(
     needs=STATE_ALONE,
     measures="episodes that alone begin or end in the middle of a motion, with another opening, or standing still",
     fail=math.inf,

@@ -50,11 +50,8 @@ def pose_follows_joints(subject: Recorded) -> Iterator[Found]:
         if len(motion.state) < FEWEST:
             yield NotMeasured(why=f"an episode has fewer than {FEWEST} frames")
             continue
-        links, poses = _links(motion), _poses(motion)
-        rows = np.unique(np.linspace(0, len(links) - 1, _FITTED_FRAMES).astype(int))
-        off = displacement(_placed(_fitted(links[rows], poses[rows]), links), poses)
-        frame = int(np.argmax(off))
-        yield Measurement(value=float(np.quantile(off, 0.9)), frame=frame, detail=motion.where)
+        off = _off(_fitted(*_links_and_poses(motion, _FITTED_FRAMES)), motion)
+        yield Measurement(value=float(np.quantile(off, 0.9)), frame=int(np.argmax(off)), detail=motion.where)
 
 
 @check(
@@ -78,35 +75,28 @@ def mounts_alike(subject: Recorded) -> Found:
         return NotMeasured(why=f"of fewer than {_FEWEST_EPISODES} episodes the mounts are unknown")
     chosen = motions[:: max(1, len(motions) // _FITTED_EPISODES)]
     few = max(_FITTED_FRAMES // len(chosen), 5)
-    rows = [np.unique(np.linspace(0, len(motion.state) - 1, few).astype(int)) for motion in chosen]
-    links = np.concatenate([_links(motion)[some] for motion, some in zip(chosen, rows, strict=True)])
-    poses = np.concatenate([_poses(motion)[some] for motion, some in zip(chosen, rows, strict=True)])
-    fit = _fitted(links, poses, loss="soft_l1")
-    off = [_off_by(fit, motion) for motion in motions]
-    worst = int(np.argmax(off))
-    chosen_links, chosen_poses = _links(motions[worst]), _poses(motions[worst])
-    some = np.unique(np.linspace(0, len(chosen_links) - 1, _FITTED_FRAMES).astype(int))
-    alone = _off_by(_fitted(chosen_links[some], chosen_poses[some]), motions[worst])
-    usual = min(float(np.median(off)), _FAR_BETTER * alone)
-    return Measurement(value=off[worst] - usual, detail=motions[worst].where)
+    links, poses = zip(*(_links_and_poses(motion, few) for motion in chosen), strict=True)
+    fit = _fitted(np.concatenate(links), np.concatenate(poses), loss="soft_l1")
+    off = [float(np.quantile(_off(fit, motion), 0.9)) for motion in motions]
+    odd = motions[int(np.argmax(off))]
+    alone = float(np.quantile(_off(_fitted(*_links_and_poses(odd, _FITTED_FRAMES)), odd), 0.9))
+    return Measurement(value=max(off) - min(float(np.median(off)), _FAR_BETTER * alone), detail=odd.where)
 
 
-def _off_by(fit: Array, motion: Motion) -> float:
-    """Metres that nine of ten poses are off at most."""
-    return float(np.quantile(displacement(_placed(fit, _links(motion)), _poses(motion)), 0.9))
+def _off(fit: Array, motion: Motion) -> Array:
+    """(T,) metres that the poses are off."""
+    links, poses = _links_and_poses(motion, len(motion.state))
+    return displacement(_placed(fit, links), poses)
 
 
-def _links(motion: Motion) -> Array:
-    """(T, 4, 4) of the last link that moves."""
+def _links_and_poses(motion: Motion, count: int) -> tuple[Array, Array]:
+    """(N, 4, 4) of the last link that moves, and of the hand, in N frames of an episode: so many at most, evenly."""
     assert motion.urdf is not None
-    links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
-    return links[[joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]]
-
-
-def _poses(motion: Motion) -> Array:
-    """(T, 4, 4) of the hand."""
     assert motion.ee_pose is not None
-    return matrices(motion.ee_pose)
+    links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
+    last = [joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]
+    rows = np.unique(np.linspace(0, len(motion.state) - 1, min(count, len(motion.state))).astype(int))
+    return links[last][rows], matrices(motion.ee_pose)[rows]
 
 
 def _fixed(numbers: Array) -> Array:
