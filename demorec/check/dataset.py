@@ -72,12 +72,14 @@ class DescribedEpisode:
     Attributes:
         number: Its `episode_index`.
         rows: Feature -> (T, D).
+        tasks: Instructions.
         kept: Its row of the sidecar.
         info: What was known before its first frame.
     """
 
     number: int
     rows: Rows
+    tasks: tuple[str, ...]
     kept: dict[str, Any]
     info: EpisodeInfo
 
@@ -299,9 +301,11 @@ class Dataset:
         """The simulated episodes that the sidecar describes, if not all: LeRobot's `resume` adds some without."""
         simulated = [row for row in self.sidecar if row["episode_info"] is not None]
         return [
-            DescribedEpisode(number=row["episode_index"], rows=self.rows[row["episode_index"]], kept=row, info=info)
+            DescribedEpisode(
+                number=number, rows=self.rows[number], tasks=self.places[number].tasks, kept=row, info=info
+            )
             for row, info in zip(simulated, self.infos, strict=True)
-            if row["episode_index"] in range(len(self.rows))
+            if (number := row["episode_index"]) in range(len(self.rows))
         ]
 
     def action_kind(self, info: EpisodeInfo) -> ActionKind | None:

@@ -5,46 +5,25 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from demorec.check.base import Measurement, counted, run_check
-from demorec.check.dataset import Dataset, Rows, read_rows
+from demorec.check.dataset import Dataset, DescribedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.paths import SIDECAR_DIR, is_dataset
+from demorec.datasets.lerobot.paths import is_dataset
 from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transcode
-from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
+from demorec.datasets.lerobot.sidecar import EXPORT_PATH, EpisodeRecord
 from demorec.datasets.lerobot.videos import PacketReader
 from demorec.mcap import open_recording
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """What the sidecar keeps that is not of the recording."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DatasetEpisode:
-    """One episode of a dataset that has a sidecar.
-
-    Attributes:
-        number: In the dataset.
-        rows: Feature -> (T, D).
-        videos: Camera feature -> SHA-256 (hex) of its coded images.
-        tasks: Instructions.
-        details: The sidecar's row.
-    """
-
-    number: int
-    rows: Rows
-    videos: Mapping[str, str]
-    tasks: tuple[str, ...]
-    details: Mapping[str, Any]
 
 
 @run_check(measures="episodes of the run's dataset that are not what was recorded")
@@ -56,30 +35,25 @@ def run_dataset_content(run: CheckedRun) -> Measurement | None:
     dataset = Dataset(path)
     if not dataset.sidecar:
         return Measurement(value=1, detail="the dataset does not say which recordings it comes from")
+    dataset.check_simulated()
     options = export_options(path)
     wrong: list[str] = []
-    for episode in dataset_episodes(dataset):
-        file = (
-            run.path
-            / ("episodes" if episode.details["success"] else "failed")
-            / Path(str(episode.details["source"])).name
-        )
-        if words := [what for what, _ in episode_differences(file, options, episode)]:
+    for episode, videos in with_videos(dataset):
+        folder = run.path / ("episodes" if episode.kept["success"] else "failed")
+        file = folder / Path(str(episode.kept["source"])).name
+        if words := [what for what, _ in episode_differences(file, options, episode, videos)]:
             wrong.append(f"episode {episode.number}: {', '.join(words)}")
     return counted(wrong, f"{len(dataset.sidecar)} episodes")
 
 
-def dataset_episodes(dataset: Dataset) -> Iterator[DatasetEpisode]:
-    """Every episode that the sidecar knows, in order; ExportError when a file cannot be read."""
-    details = read_rows(dataset.path / SIDECAR_DIR, EPISODE_SCHEMA.names)
+def with_videos(dataset: Dataset) -> Iterator[tuple[DescribedEpisode, Mapping[str, str]]]:
+    """Every simulated episode that the sidecar knows, in order, and of each camera feature SHA-256 (hex) of its coded
+    images; ExportError when a file cannot be read."""
     with ExitStack() as stack:
         readers = {key: stack.enter_context(closing(PacketReader(key))) for key in dataset.info.video_keys}
-        for row in sorted(details, key=lambda row: int(row["episode_index"])):
-            if (number := int(row["episode_index"])) in range(len(dataset.rows)):
-                place = dataset.places[number]
-                videos = {key: _digest(reader.read(place)) for key, reader in readers.items()}
-                rows = dataset.rows[number]
-                yield DatasetEpisode(number=number, rows=rows, videos=videos, tasks=place.tasks, details=row)
+        for each in sorted(dataset.described(), key=lambda each: each.number):
+            place = dataset.places[each.number]
+            yield each, {key: _digest(reader.read(place)) for key, reader in readers.items()}
 
 
 def _digest(samples: Iterable[bytes]) -> str:
@@ -116,7 +90,7 @@ def export_options(dataset: Path) -> ExportOptions:
 
 
 def episode_differences(
-    recording_file: Path, options: ExportOptions, episode: DatasetEpisode
+    recording_file: Path, options: ExportOptions, episode: DescribedEpisode, videos: Mapping[str, str]
 ) -> Iterator[tuple[str, tuple[int, ...]]]:
     """(what, in which frames) of an episode is not what a recording gives with the same options.
 
@@ -147,8 +121,8 @@ def episode_differences(
         elif len(frames := np.flatnonzero((found != true).any(axis=1))):
             yield name, tuple(frames.tolist())
     for key, video in expected.videos.items():
-        if key not in transcoded and episode.videos.get(key) != video.digest:
+        if key not in transcoded and videos.get(key) != video.digest:
             yield key, ()
     for name, value in record.row.items():
-        if name not in _OF_THE_PLACE and episode.details.get(name) != value:
+        if name not in _OF_THE_PLACE and episode.kept.get(name) != value:
             yield f"sidecar's {name}", ()

@@ -439,14 +439,14 @@ def test_a_recording_with_nan_is_not_exported(tmp_path: Path) -> None:
 def test_episodes_are_told_of_by_their_numbers(run: Path, tmp_path: Path) -> None:
     """Where the sidecar lacks one, as after LeRobot's resume, the others are not taken for their neighbours."""
     from demorec.check.dataset import Dataset
-    from demorec.check.run_dataset import dataset_episodes
+    from demorec.check.run_dataset import with_videos
 
     spoilt = tmp_path / "run"
     shutil.copytree(run, spoilt)
     (path,) = (spoilt / "dataset" / "demorec" / "episodes").glob("*/*.parquet")
     pq.write_table(pq.read_table(path).slice(1), path)
-    for episode in dataset_episodes(Dataset(spoilt / "dataset")):
-        assert episode.details["episode_index"] == episode.number == int(episode.rows["episode_index"][0, 0])
+    for episode, _ in with_videos(Dataset(spoilt / "dataset")):
+        assert episode.kept["episode_index"] == episode.number == int(episode.rows["episode_index"][0, 0])
     assert level_of(spoilt, "run_dataset_content", "run") == "pass"
     for name in ("dataset_description", "dataset_facts"):
         assert level_of(spoilt / "dataset", name, "dataset") == "pass"

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.dataset import Dataset
-from demorec.check.run_dataset import DatasetEpisode, dataset_episodes, episode_differences, export_options
+from demorec.check.dataset import Dataset, DescribedEpisode
+from demorec.check.run_dataset import episode_differences, export_options, with_videos
 from demorec.core.config import deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, resource_error
 from demorec.core.own_versions import version_differences
@@ -161,16 +161,15 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
                 raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
             dataset.check_simulated()
             options = export_options(path)
-            infos = {each.number: each.info for each in dataset.described()}
-            for episode in dataset_episodes(dataset):
-                info = infos[episode.number]
+            for episode, videos in with_videos(dataset):
+                info = episode.info
                 report = DeepReport(
                     path=path / f"episode {episode.number}",
                     versions=version_differences(info.versions, versions_here(info, allowed)),
                     num_frames=len(episode.rows["index"]),
                 )
                 try:
-                    found = tuple(_episode_differences(episode, info, options, simulators, allowed))
+                    found = tuple(_episode_differences(episode, videos, options, simulators, allowed))
                     yield replace(report, differences=found)
                 except DemorecError as error:
                     yield _impossible(report, error)
@@ -179,16 +178,17 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
 
 
 def _episode_differences(
-    episode: DatasetEpisode,
-    info: EpisodeInfo,
+    episode: DescribedEpisode,
+    videos: Mapping[str, str],
     options: ExportOptions,
     simulators: SimulatorCache,
     allowed: Sequence[str],
 ) -> Iterator[Difference]:
+    info = episode.info
     if info.origin:
         raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
     with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
         again = Path(folder) / "again.mcap"
         generate_again(info, again, simulators, allowed)
-        for what, frames in episode_differences(again, options, episode):
+        for what, frames in episode_differences(again, options, episode, videos):
             yield Difference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")
