@@ -20,7 +20,7 @@ from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import Cut, Plan, Source
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, read_progress, write_progress
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
 from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, THUMBNAILS_PATH, is_dataset_file
 from demorec.datasets.lerobot.reader import EpisodeRows
@@ -81,7 +81,7 @@ def _progress_is_kept(plan: Plan) -> bool:
 def _write_kept_progress(plan: Plan, folder: Path) -> None:
     """Write the progress of the new dataset's rows: from stages, else as the sources have it of each frame."""
     if _has_stages(plan):
-        write_progress(folder, read_progress(folder))
+        write_progress(folder)
         return
     path, total = folder / PROGRESS_PATH, 0
     sources = [EpisodeRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]

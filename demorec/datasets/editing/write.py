@@ -105,7 +105,6 @@ class _Reader:
         self.num_decoded = 0
         self._features, self._fps = plan.info.features, plan.info.fps
         self._takes: Mapping[str, Take] = plan.takes[number]
-        self._decode = decode
         info = self.source.info
         names = {take.feature for take in self._takes.values() if take.feature}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]

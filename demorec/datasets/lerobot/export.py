@@ -21,7 +21,7 @@ from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.boxes import BoxWriter, SeenByCamera
 from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
-from demorec.datasets.lerobot.facts import STAGE_COLUMNS, EpisodeProgress, fact_types, read_progress, write_progress
+from demorec.datasets.lerobot.facts import STAGE_COLUMNS, fact_types, write_progress
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, DatasetInfo, combined_digest
 from demorec.datasets.lerobot.motor_units import NO_PLACE, recording_of
@@ -90,7 +90,6 @@ class _Export:
         self._before = episode_digests(existing.root, existing.info) if existing is not None else []
         self._left_out: tuple[str, ...] = ()
         self._transcoded: dict[str, None] = {}
-        self._progress: list[EpisodeProgress] = []
         self._digests: list[str] = []
         self._recordings: list[Path] = []
         self._silent: list[str] = []
@@ -127,8 +126,7 @@ class _Export:
             boxes.finish()
             configs = sidecar.finish(self._about_this_export())
         if self._options.progress:
-            before = [] if there is None else read_progress(there.root)
-            write_progress(self._folder, [*before, *self._progress])
+            write_progress(self._folder)
         write_card(self._folder, finished, self._options, configs, is_transcoded=bool(self._transcoded))
         return ExportReport(
             path=self._folder,
@@ -193,9 +191,6 @@ class _Export:
         sidecar.add(writer.num_episodes - 1, digest, reading.record, reading.attempt)
         if self._options.language is not None and not reading.is_simulated and not reading.data.language.persistent:
             self._silent.append(reading.path.name)
-        if self._options.progress:
-            facts = reading.data.facts
-            self._progress.append(EpisodeProgress.from_row(facts, facts["num_goals"]))
         self._digests.append(digest)
         self._recordings.append(reading.path)
         self._transcoded.update(dict.fromkeys(reading.transcoded))

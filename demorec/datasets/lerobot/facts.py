@@ -132,9 +132,9 @@ def progress_table(episodes: Sequence[EpisodeProgress]) -> pa.Table:
     return pa.table(columns)
 
 
-def write_progress(root: Path, episodes: Sequence[EpisodeProgress]) -> None:
-    """Write the files of the whole dataset, durably."""
-    path = root / PROGRESS_PATH
+def write_progress(root: Path) -> None:
+    """Write the files of a whole dataset, durably, from the stages in its table of episodes."""
+    episodes, path = read_progress(root), root / PROGRESS_PATH
     pq.write_table(progress_table(episodes), path, use_dictionary=["episode_index"])
     sync_path(path)
     for head in _HEADS:
