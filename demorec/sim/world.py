@@ -7,7 +7,7 @@ every engine parameter set (PyBullet leaks some of them into later clients of th
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -97,8 +97,7 @@ class World:
         for body in scene.movable:
             self._bodies[body.name] = add_body(self.client, body)
         self._inertial = {name: base_from_inertial(self.client, index) for name, index in self._bodies.items()}
-        movable = [self._bodies[body.name] for body in scene.movable]
-        self._hold = ConstraintHold(self.client, self.arm, movable) if scene.hold == "constraint" else None
+        self._constraint: int | None = None
         self.arm.command(self.hold())
         for _ in range(round(SETTLE_SECONDS * scene.physics.hz)):
             self.arm.drive(self.arm.target)
@@ -111,11 +110,8 @@ class World:
     def apply(self, command: Action) -> None:
         """Advance by one control step; the joint targets move linearly from the last command to this one."""
         start, end = self.arm.target, np.asarray(command.joint_target, dtype=np.float64)
-        if self._hold is not None:
-            self._hold.update(
-                opens=command.gripper_target > self.arm.gripper_target + 1e-6,
-                closes=command.gripper_target < self.arm.gripper_width(),
-            )
+        if self.scene.hold == "constraint":
+            self._hold_by_constraint(command)
         self.arm.command(command)
         samples = []
         for substep in range(1, self._substeps + 1):
@@ -135,6 +131,33 @@ class World:
         self._steps += 1
         self.joint_samples = tuple(samples)
         self.arm.target = end.copy()
+
+    def _hold_by_constraint(self, command: Action) -> None:
+        """Fix a body to the hand once both closing fingers press on it, until the gripper is told to open.
+
+        The shortcut of many PyBullet tutorials, instead of friction. What happens depends on the world's state and the
+        commands alone, so that a recording replays without being told when the constraint was made.
+        """
+        arm, client = self.arm, self.client
+        if command.gripper_target > arm.gripper_target + 1e-6:
+            if self._constraint is not None:
+                client.removeConstraint(self._constraint)
+                self._constraint = None
+            return
+        # Fingers that have not yet left an object do not close.
+        if self._constraint is not None or command.gripper_target >= arm.gripper_width():
+            return
+        for index in (self._bodies[body.name] for body in self.scene.movable):
+            if all(client.getContactPoints(arm.body, index, link, -1) for link in arm.finger_links):
+                tcp = arm.links[self.robot.tcp_link]
+                hand = client.getLinkState(arm.body, tcp, computeForwardKinematics=True)
+                place = client.getBasePositionAndOrientation(index)
+                # The constraint's frames are those of the centres of mass: [0:2] of a link state.
+                position, quat = client.multiplyTransforms(*client.invertTransform(*hand[0:2]), *place)
+                self._constraint = client.createConstraint(
+                    arm.body, tcp, index, -1, client.JOINT_FIXED, [0, 0, 0], position, [0, 0, 0], quat
+                )
+                return
 
     def _set_iterations(self) -> None:
         """More of them for what the fingers hold: as few as suffice for all else would leave them deep in light things.
@@ -316,61 +339,3 @@ def set_engine(client: Any, physics: Physics) -> None:
         # About the joint that has the sensor, along the axes of the link that it carries.
         jointFeedbackMode=client.JOINT_FEEDBACK_IN_JOINT_FRAME,
     )
-
-
-class ConstraintHold:
-    """Fixes a body to the hand once both closing fingers press on it, until the gripper is told to open.
-
-    The shortcut of many PyBullet tutorials, instead of friction. What happens depends on the world's state and the
-    commands alone, so that a recording replays without being told when the constraint was made.
-
-    Args:
-        client: The PyBullet client.
-        arm: The robot.
-        bodies: PyBullet indices of what may be held.
-    """
-
-    def __init__(self, client: Any, arm: Arm, bodies: Sequence[int]) -> None:
-        self._client = client
-        self._arm = arm
-        self._bodies = tuple(bodies)
-        self._constraint: int | None = None
-
-    def update(self, *, opens: bool, closes: bool) -> None:
-        """Make or release the constraint; called before each command.
-
-        Args:
-            opens: Whether the command opens the gripper further than the last one.
-            closes: Whether it asks for less than the present opening; fingers that have not yet left an object do not.
-        """
-        if opens:
-            if self._constraint is not None:
-                self._client.removeConstraint(self._constraint)
-                self._constraint = None
-        elif closes and self._constraint is None:
-            body = next((body for body in self._bodies if self._is_pressed(body)), None)
-            if body is not None:
-                self._constraint = self._fix(body)
-
-    def _is_pressed(self, body: int) -> bool:
-        return all(self._client.getContactPoints(self._arm.body, body, link, -1) for link in self._arm.finger_links)
-
-    def _fix(self, body: int) -> int:
-        link = self._arm.links[self._arm.spec.tcp_link]
-        hand = self._client.getLinkState(self._arm.body, link, computeForwardKinematics=True)
-        place = self._client.getBasePositionAndOrientation(body)
-        # The constraint's frames are those of the centres of mass: [0:2] of a link state.
-        position, quat = self._client.multiplyTransforms(*self._client.invertTransform(*hand[0:2]), *place)
-        return int(
-            self._client.createConstraint(
-                self._arm.body,
-                link,
-                body,
-                -1,
-                self._client.JOINT_FIXED,
-                [0, 0, 0],
-                position,
-                [0, 0, 0],
-                quat,
-            )
-        )
