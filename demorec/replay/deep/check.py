@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,19 +12,24 @@ from typing import Literal
 
 from demorec.check.dataset import Dataset, DescribedEpisode
 from demorec.check.run_dataset import episode_differences, export_options, with_videos
-from demorec.core.config import deciding_versions
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, resource_error
 from demorec.core.own_versions import version_differences
+from demorec.core.plain import digest
 from demorec.core.processes import in_turn
+from demorec.core.tables import RENDERERS
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.info import EpisodeInfo
-from demorec.loop import SimulatorCache
-from demorec.mcap import Recording, open_recording
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
+from demorec.mcap import EpisodeWriter, Recording, open_recording
+from demorec.render import Renderer
+from demorec.render.painter import Painter
 from demorec.replay.deep.contents import Contents, Difference, coded_topics, content_differences
 from demorec.replay.deep.images import image_differences
-from demorec.replay.deep.remake import generate_again, recorded_config, recorded_painter, remake
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
 from demorec.replay.drive import replay
+from demorec.replay.rerender import config_as, recorded_view, view_painter
+from demorec.robots.assets import allow_models
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +84,7 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
             open_recording(path, simulated=True) as recording,
         ):
             info = recording.info
-            versions = version_differences(info.versions, versions_here(info, allowed))
+            versions = version_differences(info.versions, _versions_here(info, allowed))
             report = replace(report, versions=versions, num_frames=recording.num_frames, is_derived=bool(info.origin))
             again = Path(folder) / "again.mcap"
             remake(recording, again, simulators, allowed)
@@ -98,11 +103,82 @@ def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
     return replace(report, error=str(error))
 
 
-def versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
+def _versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
     """package -> version of what would make such an episode here."""
     with suppress(DemorecError):
-        return deciding_versions(recorded_config(info, allowed))
+        return deciding_versions(_recorded_config(info, allowed))
     return deciding_versions()
+
+
+def _recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:
+    """The config that an episode says it was made with.
+
+    Raises:
+        ConfigError: It is none.
+        NotAllowedError: It names something of a module that is not among those `allowed`.
+    """
+    config = config_as(info.config, GenerateConfig)
+    config.check_names(allowed)
+    config.validate()
+    return config
+
+
+def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    """Make the episode of a recording again, as a recording of the same format version, into a file.
+
+    A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
+    its commands are sent again in its recorded scene, and labels, phases and events are taken over.
+
+    Raises:
+        ConfigError: Its config cannot be used.
+        DemorecError: It cannot be simulated, drawn or written here.
+    """
+    if recording.info.origin:
+        _send_again(recording, path, simulators, allowed)
+    else:
+        _generate_again(recording.info, path, simulators, allowed)
+
+
+def _generate_again(recorded: EpisodeInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
+    config = _recorded_config(recorded, allowed)
+    episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
+    info = replace(episode.info, format_version=recorded.format_version)
+    world, renderer = simulators.acquire(info)
+    session = Session.of_episode(world, episode, renderer)
+    with EpisodeWriter(path, info, video=config.video) as writer:
+        for frame in session.run(ScriptAgent(episode)):
+            writer.write(frame)
+        writer.finish(session.outcome)
+
+
+def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    allow_models(allowed)
+    options = ReplayOptions(allowed=tuple(allowed))
+    demonstration = open_demonstration(recording, options)
+    info = recording.info.with_simulation(config_digest=digest(recording.info.config))
+    RENDERERS.check_name(str(info.config.get("renderer", "raster")))
+    world, renderer = simulators.acquire(info)
+    painter = _recorded_painter(info, renderer, allowed)
+    with EpisodeWriter(path, info, video=config_as(info.config.get("video", {}), VideoConfig)) as writer:
+        _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
+        if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
+            recorded = recording.outcome
+            outcome = replace(
+                outcome,
+                failure_phase=recorded.failure_phase,
+                failure_reason=recorded.failure_reason,
+                num_retries=recorded.num_retries,
+                success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
+            )
+        writer.finish(outcome)
+
+
+def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
+    """Draws what the recording shows, from where its cameras really were; None without cameras."""
+    if renderer is None:
+        return None
+    return view_painter(renderer, recorded_view(info, allowed), info.config)
 
 
 def _differences(
@@ -115,7 +191,7 @@ def _differences(
             made.cut_off(found)
         differences, images = content_differences(found, made, remade.info, recording.info.fps)
         if images:
-            painter = recorded_painter(remade.info, simulators.acquire(remade.info)[1], allowed)
+            painter = _recorded_painter(remade.info, simulators.acquire(remade.info)[1], allowed)
             assert painter is not None, "images were drawn"
             cameras = coded_topics(remade.info)
             differences += image_differences(found, made, remade, painter, cameras, images)
@@ -165,7 +241,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
                 info = episode.info
                 report = DeepReport(
                     path=path / f"episode {episode.number}",
-                    versions=version_differences(info.versions, versions_here(info, allowed)),
+                    versions=version_differences(info.versions, _versions_here(info, allowed)),
                     num_frames=len(episode.rows["index"]),
                 )
                 try:
@@ -189,6 +265,6 @@ def _episode_differences(
         raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
     with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
         again = Path(folder) / "again.mcap"
-        generate_again(info, again, simulators, allowed)
+        _generate_again(info, again, simulators, allowed)
         for what, frames in episode_differences(again, options, episode, videos):
             yield Difference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")
