@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from demorec.episode.mesh import SolidMesh
-from demorec.objects.shelf import Kind, Shelf, by_seed
+from demorec.objects.shelf import Shelf, drawn
 from demorec.objects.solids import arc, board
 
 Rng = np.random.Generator
+SHAPES = 25
 
 
 def _sizes(rng: Rng) -> tuple[float, float, float]:
@@ -18,32 +19,32 @@ def _sizes(rng: Rng) -> tuple[float, float, float]:
     return rng.uniform(0.02, 0.026), rng.uniform(0.055, 0.075), rng.uniform(0.022, 0.04)
 
 
-@by_seed
+@drawn("wood", count=SHAPES, yaw_symmetry=4)
 def _cube(rng: Rng) -> SolidMesh:
     h = rng.uniform(0.03, 0.05) / 2
     return board([(-h, -h), (h, -h), (h, h), (-h, h)], [(0, 1, 2, 3)], 2 * h)
 
 
-@by_seed
+@drawn("wood", count=SHAPES, yaw_symmetry=2)
 def _brick(rng: Rng) -> SolidMesh:
     x, y = rng.uniform(0.05, 0.08) / 2, rng.uniform(0.022, 0.04) / 2
     return board([(-x, -y), (x, -y), (x, y), (-x, y)], [(0, 1, 2, 3)], rng.uniform(0.022, 0.04))
 
 
-@by_seed
+@drawn("wood", count=SHAPES)
 def _wedge(rng: Rng) -> SolidMesh:
     _, side, depth = _sizes(rng)
     return board([(0.0, 0.0), (side, 0.0), (0.0, rng.uniform(0.5, 0.7) * side)], [(0, 1, 2)], depth, upright=True)
 
 
-@by_seed
+@drawn("wood", count=SHAPES)
 def _corner(rng: Rng) -> SolidMesh:
     bar, side, depth = _sizes(rng)
     outline = [(0.0, 0.0), (side, 0.0), (side, bar), (bar, bar), (bar, side), (0.0, side)]
     return board(outline, [(0, 1, 2, 3), (0, 3, 4, 5)], depth)
 
 
-@by_seed
+@drawn("wood", count=SHAPES)
 def _tee(rng: Rng) -> SolidMesh:
     bar, side, depth = _sizes(rng)
     h, s = bar / 2, side / 2
@@ -51,7 +52,7 @@ def _tee(rng: Rng) -> SolidMesh:
     return board(outline, [(0, 1, 2, 7), (2, 3, 4, 5, 6, 7)], depth)
 
 
-@by_seed
+@drawn("wood", count=SHAPES, yaw_symmetry=4)
 def _cross(rng: Rng) -> SolidMesh:
     bar, side, depth = _sizes(rng)
     h, s = bar / 2, side / 2
@@ -72,7 +73,7 @@ def _cross(rng: Rng) -> SolidMesh:
     return board(outline, [(2, 3, 4, 5, 8, 9, 10, 11), (0, 1, 2, 11), (5, 6, 7, 8)], depth)
 
 
-@by_seed
+@drawn("wood", count=SHAPES, yaw_symmetry=2)
 def _arch(rng: Rng) -> SolidMesh:
     bar, side, depth = _sizes(rng)
     s, z = side / 2, rng.uniform(0.015, 0.022)
@@ -92,23 +93,11 @@ def _arch(rng: Rng) -> SolidMesh:
     return board(outline, [(9, 2, 3, 6, 7, 8), (0, 1, 2, 9), (4, 5, 6, 3)], depth, upright=True)
 
 
-@by_seed
+@drawn("wood", count=SHAPES, yaw_symmetry=6)
 def _hexagon(rng: Rng) -> SolidMesh:
     outline = arc((0.0, 0.0), rng.uniform(0.02, 0.032), 0.0, 2 * math.pi, 7)[:-1]
     return board(outline, [tuple(range(6))], rng.uniform(0.025, 0.045))
 
 
-_SHAPES = 25
-CUBES = Shelf(kinds=(Kind(noun="cube", material="wood", shape=_cube, count=_SHAPES, yaw_symmetry=4),))
-BLOCKS = Shelf(
-    kinds=(
-        *CUBES.kinds,
-        Kind(noun="brick", material="wood", shape=_brick, count=_SHAPES, yaw_symmetry=2),
-        Kind(noun="wedge", material="wood", shape=_wedge, count=_SHAPES),
-        Kind(noun="corner", material="wood", shape=_corner, count=_SHAPES),
-        Kind(noun="tee", material="wood", shape=_tee, count=_SHAPES),
-        Kind(noun="cross", material="wood", shape=_cross, count=_SHAPES, yaw_symmetry=4),
-        Kind(noun="arch", material="wood", shape=_arch, count=_SHAPES, yaw_symmetry=2),
-        Kind(noun="hexagon", material="wood", shape=_hexagon, count=_SHAPES, yaw_symmetry=6),
-    )
-)
+CUBES = Shelf(kinds=(_cube,))
+BLOCKS = Shelf(kinds=(_cube, _brick, _wedge, _corner, _tee, _cross, _arch, _hexagon))

@@ -68,12 +68,6 @@ MATERIALS: Mapping[str, Material] = {
 }
 
 
-def by_seed(make: Callable[[np.random.Generator], SolidMesh]) -> Callable[[int], SolidMesh]:
-    """Shapes by number from a function that draws one; its name seeds them."""
-    name = zlib.crc32(make.__name__.strip("_").encode())
-    return lambda number: make(np.random.default_rng((name, number)))
-
-
 @dataclass(frozen=True, kw_only=True)
 class Kind:
     """Things of one name.
@@ -100,6 +94,26 @@ class Kind:
         return {"all": range(self.count), "eval": held_out}.get(
             split, [n for n in range(self.count) if n not in held_out]
         )
+
+
+def drawn(
+    material: str, *, count: int, colors: tuple[str, ...] = (), yaw_symmetry: int = 1
+) -> Callable[[Callable[[np.random.Generator], SolidMesh]], Kind]:
+    """Makes a kind of a function that draws one shape, and whose name is the noun and seeds the shapes."""
+
+    def kind(draw: Callable[[np.random.Generator], SolidMesh]) -> Kind:
+        noun = draw.__name__.strip("_")
+        name = zlib.crc32(noun.encode())
+        return Kind(
+            noun=noun,
+            material=material,
+            shape=lambda number: draw(np.random.default_rng((name, number))),
+            count=count,
+            colors=colors,
+            yaw_symmetry=yaw_symmetry,
+        )
+
+    return kind
 
 
 @dataclass(frozen=True, kw_only=True)
