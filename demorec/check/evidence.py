@@ -113,9 +113,8 @@ class Motion:
         return {joint: column for joint, column in zip(self.joints, self.state.T, strict=False) if joint}
 
     def labels(self, known: Flags) -> list[str]:
-        """Names of some elements, with the episode."""
-        where = f", {self.where}" if self.where else ""
-        return [f"{name}{where}" for name, is_known in zip(self.names, known, strict=True) if is_known]
+        """Names of some elements."""
+        return [name for name, is_known in zip(self.names, known, strict=True) if is_known]
 
 
 class Motions:

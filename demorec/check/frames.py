@@ -12,7 +12,7 @@ import numpy as np
 
 from demorec.check.base import STATE_ALONE, Found, Measurement
 from demorec.check.evidence import FEWEST, MOVES, Flags, Motion
-from demorec.check.motion import Recorded, motion_check
+from demorec.check.motion import motion_check, of_each_motion
 
 _MIDWAY = 1e-6
 """Share of the state's range within which a state is midway between two others; float32 rounds to a tenth of it."""
@@ -34,20 +34,20 @@ _STIRS = 1e-3
     simulated=(0.0, 0.0),
     needs=STATE_ALONE,
 )
-def repeated_frames(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def repeated_frames(motion: Motion) -> Iterator[Found]:
     """Each frame is one of its own: catches gaps that were filled with what came before. Of simulated recordings, of
     which all numbers are measured anew, in any frame; else where the frames around it differ or a velocity says so."""
-    for motion in subject.motions.all:
-        tables = [motion.state, *motion.sensors.values(), *([] if motion.action is None else [motion.action])]
-        rows = np.column_stack([table.reshape(len(table), -1) for table in tables])
-        same = ((rows[1:] == rows[:-1]) | np.isnan(rows[1:])).all(axis=1)
-        steps = np.abs(np.diff(motion.state, axis=0))
-        changes = (steps > _STIRS * np.sqrt((steps**2).sum(axis=0) / max(len(steps), 1))).any(axis=1)
-        moves = _is_quick(motion)[1:]
-        moves[1:-1] |= changes[:-2] & changes[2:]
-        wrong = same if motion.contact is not None else same & moves
-        frame = int(np.argmax(wrong)) + 1 if wrong.any() else None
-        yield Measurement(value=float(wrong.mean()) if len(wrong) else 0.0, frame=frame, detail=motion.where)
+    tables = [motion.state, *motion.sensors.values(), *([] if motion.action is None else [motion.action])]
+    rows = np.column_stack([table.reshape(len(table), -1) for table in tables])
+    same = ((rows[1:] == rows[:-1]) | np.isnan(rows[1:])).all(axis=1)
+    steps = np.abs(np.diff(motion.state, axis=0))
+    changes = (steps > _STIRS * np.sqrt((steps**2).sum(axis=0) / max(len(steps), 1))).any(axis=1)
+    moves = _is_quick(motion)[1:]
+    moves[1:-1] |= changes[:-2] & changes[2:]
+    wrong = same if motion.contact is not None else same & moves
+    frame = int(np.argmax(wrong)) + 1 if wrong.any() else None
+    yield Measurement(value=float(wrong.mean()) if len(wrong) else 0.0, frame=frame)
 
 
 def _is_quick(motion: Motion) -> Flags:
@@ -64,22 +64,22 @@ def _is_quick(motion: Motion) -> Flags:
     fail=0.2,
     needs=STATE_ALONE,
 )
-def interpolated_frames(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def interpolated_frames(motion: Motion) -> Iterator[Found]:
     """States were measured, not made by interpolation between others, which halves velocities where they turn.
 
     A gripper may move at one speed while the arm stands still.
     """
-    for motion in subject.motions.all:
-        state = motion.state[:, ~motion.grippers]
-        if len(state) < FEWEST or not state.size:
-            continue
-        near, way = _MIDWAY * max(float(np.ptp(state, axis=0).max()), 1e-9), np.abs(state[2:] - state[:-2])
-        # Encoders of coarse steps may go as far twice; not several of them at once, over many steps.
-        least = np.where(state[1:] == state[:-1], np.inf, np.abs(np.diff(state, axis=0))).min(axis=0)
-        moves = (way > np.maximum(1e3 * near, 10 * least)).sum(axis=1) >= min(3, state.shape[1])
-        midway = np.abs(state[1:-1] - (state[2:] + state[:-2]) / 2).max(axis=1) < near
-        if moves.sum() >= FEWEST:
-            yield Measurement(value=float(midway[moves].mean()), detail=motion.where)
+    state = motion.state[:, ~motion.grippers]
+    if len(state) < FEWEST or not state.size:
+        return
+    near, way = _MIDWAY * max(float(np.ptp(state, axis=0).max()), 1e-9), np.abs(state[2:] - state[:-2])
+    # Encoders of coarse steps may go as far twice; not several of them at once, over many steps.
+    least = np.where(state[1:] == state[:-1], np.inf, np.abs(np.diff(state, axis=0))).min(axis=0)
+    moves = (way > np.maximum(1e3 * near, 10 * least)).sum(axis=1) >= min(3, state.shape[1])
+    midway = np.abs(state[1:-1] - (state[2:] + state[:-2]) / 2).max(axis=1) < near
+    if moves.sum() >= FEWEST:
+        yield Measurement(value=float(midway[moves].mean()))
 
 
 @motion_check(
@@ -89,18 +89,15 @@ def interpolated_frames(subject: Recorded) -> Iterator[Found]:
     on=("external", "dataset"),
     needs=STATE_ALONE,
 )
-def missing_frames(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def missing_frames(motion: Motion) -> Found:
     """An arm is as fast in a frame as in the two before and after, within a few times: catches frames that were lost,
     as the next one then is as far away as several, and angles that wrap.
 
     Grippers may be that quick, and are left out.
     """
-    for motion in subject.motions.all:
-        if len(motion.state) >= FEWEST:
-            yield _farthest(motion)
-
-
-def _farthest(motion: Motion) -> Measurement | None:
+    if len(motion.state) < FEWEST:
+        return None
     state = motion.state[:, ~motion.grippers]
     way = np.abs(np.diff(state, axis=0))
     finest = np.where(way > 0, way, np.inf).min(axis=0)  # of an encoder of coarse steps one is no jump
@@ -113,4 +110,4 @@ def _farthest(motion: Motion) -> Measurement | None:
     around = np.max([beside[:-4], beside[1:-3], beside[3:-1], beside[4:]], axis=0)
     times = speed / np.maximum(around, max(_SLOWEST * math.sqrt(float((speed**2).mean())), 1e-12))
     frame = int(times.argmax())
-    return Measurement(value=float(times[frame]), frame=frame + 1, detail=motion.where)
+    return Measurement(value=float(times[frame]), frame=frame + 1)

@@ -9,7 +9,8 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.objects import held_for, top_of
+from demorec.check.objects import top_of
+from demorec.check.rows import held_for
 
 CARRIED_HEIGHT = 0.03
 """Metres above its start from which on an object counts as carried."""

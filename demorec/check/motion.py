@@ -6,9 +6,9 @@ An action is compared with the state where its elements are targets of the same 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import partial, wraps
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from demorec.check.dataset import Dataset
 from demorec.check.dynamics import Dynamics, dynamics_by_frames, point_masses
 from demorec.check.episode import CheckedEpisode
 from demorec.check.evidence import Motion
-from demorec.check.rows import longest_run
+from demorec.check.rows import held_for, longest_run
 from demorec.core.geometry import Array
 from demorec.episode.sensed import MAY_REST
 
@@ -67,6 +67,23 @@ EVERYWHERE: tuple[Form, ...] = ("simulated", "external", "dataset")
 motion_check = partial(check, group="physics", on=EVERYWHERE)
 
 
+def of_each_motion(law: Callable[[Motion], Found | Iterator[Found]]) -> Callable[[Recorded], Iterator[Found]]:
+    """A law of each motion by itself: what is found names its episode, and one that lacks something ends the search."""
+
+    @wraps(law)
+    def of_all(subject: Recorded) -> Iterator[Found]:
+        for motion in subject.motions.all:
+            of_one = law(motion)
+            for found in of_one if isinstance(of_one, Iterator) else (of_one,):
+                if isinstance(found, Measurement):
+                    found = replace(found, detail=", ".join(filter(None, (found.detail, motion.where))))
+                yield found
+                if isinstance(found, Lacking):
+                    return
+
+    return of_all
+
+
 @motion_check(
     measures="how far the state, and what is sent to it, is beyond the limits of its joints",
     unit="rad, m",
@@ -75,17 +92,17 @@ motion_check = partial(check, group="physics", on=EVERYWHERE)
     simulated=(0.005, 0.05),
     needs=URDF,
 )
-def joint_limits(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def joint_limits(motion: Motion) -> Iterator[Found]:
     """Joints are within the limits of the robot's URDF: catches degrees for radians, and offsets."""
-    for motion in subject.motions.all:
-        known = np.isfinite(motion.lower) | np.isfinite(motion.upper)
-        if not known.any():
-            yield Lacking(need=URDF)
-            return
-        for name, table in (("", motion.state), *motion.commands.items()):
-            beyond = np.maximum(np.maximum(motion.lower - table, table - motion.upper), 0.0)
-            labels = [f"{label} of the {name}" if name else label for label in motion.labels(known)]
-            yield worst_entry(beyond[:, known], labels)
+    known = np.isfinite(motion.lower) | np.isfinite(motion.upper)
+    if not known.any():
+        yield Lacking(need=URDF)
+        return
+    for name, table in (("", motion.state), *motion.commands.items()):
+        beyond = np.maximum(np.maximum(motion.lower - table, table - motion.upper), 0.0)
+        labels = [f"{label} of the {name}" if name else label for label in motion.labels(known)]
+        yield worst_entry(beyond[:, known], labels)
 
 
 @motion_check(
@@ -95,22 +112,22 @@ def joint_limits(subject: Recorded) -> Iterator[Found]:
     simulated=(1.5, 1.7),  # 1.245 where noise shakes an arm most, of 4,000 of seed 92000
     needs=URDF,
 )
-def joint_speed(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def joint_speed(motion: Motion) -> Iterator[Found]:
     """No joint is faster than its motor: catches wrong rates, spikes, and episodes glued together.
 
     By the recorded velocities too where these are known to be those of the joints.
     """
-    for motion in subject.motions.all:
-        known = np.isfinite(motion.speed) & (motion.speed > 0)
-        if not known.any():
-            yield Lacking(need=URDF)
-            return
-        labels, limit = motion.labels(known), motion.speed[known]
-        if motion.commands and motion.velocity is not None:
-            yield worst_entry(np.abs(motion.velocity[:, known]) / limit, labels)
-        for table in (motion.state, *motion.commands.values()):
-            speed = np.abs(np.diff(table[:, known], axis=0)) / motion.steps_s[:, None] / limit
-            yield worst_entry(speed, labels, first=1)
+    known = np.isfinite(motion.speed) & (motion.speed > 0)
+    if not known.any():
+        yield Lacking(need=URDF)
+        return
+    labels, limit = motion.labels(known), motion.speed[known]
+    if motion.commands and motion.velocity is not None:
+        yield worst_entry(np.abs(motion.velocity[:, known]) / limit, labels)
+    for table in (motion.state, *motion.commands.values()):
+        speed = np.abs(np.diff(table[:, known], axis=0)) / motion.steps_s[:, None] / limit
+        yield worst_entry(speed, labels, first=1)
 
 
 @motion_check(
@@ -175,27 +192,26 @@ def _of_single_episodes(motions: Sequence[Motion], parts: Array, counts: NDArray
     simulated=(2, 4),
     needs=STATE_ALONE,
 )
-def stuck_sensors(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def stuck_sensors(motion: Motion) -> Iterator[Found]:
     """What is measured changes, if ever so little, while the arm moves, and each of its elements in some frame.
 
     Of other robots than simulated ones a sensor is reported that never changes in an episode. One that may rest counts
     only where it is not zero.
     """
-    for motion in subject.motions.all:
-        moves = np.abs(np.diff(motion.state, axis=0)).max(axis=1, initial=0.0) > 1e-5
-        if motion.contact is not None:
-            moves = np.abs(np.diff(motion.state[:, :-1], axis=0)).max(axis=1, initial=0.0) > 1e-5
-        for name, table in motion.sensors.items():
-            same, stands = (table[1:] == table[:-1]).all(axis=1) & moves, np.ptp(table, axis=0) == 0
-            if name in MAY_REST:
-                same, stands = same & table[1:].any(axis=1), stands & table.any(axis=0)
-            length, start = longest_run(same)
-            if motion.contact is None:  # sensors slower than the frames hold a value, and contacts come and go
-                length, start = int(same.sum() * stands.all()), 0
-            elif stands.any():
-                length, start = int(moves.sum()), 0
-            label = f"{name}, {motion.where}" if motion.where else name
-            yield Measurement(value=length, frame=start + 1 if length else None, detail=label)
+    moves = np.abs(np.diff(motion.state, axis=0)).max(axis=1, initial=0.0) > 1e-5
+    if motion.contact is not None:
+        moves = np.abs(np.diff(motion.state[:, :-1], axis=0)).max(axis=1, initial=0.0) > 1e-5
+    for name, table in motion.sensors.items():
+        same, stands = (table[1:] == table[:-1]).all(axis=1) & moves, np.ptp(table, axis=0) == 0
+        if name in MAY_REST:
+            same, stands = same & table[1:].any(axis=1), stands & table.any(axis=0)
+        length, start = longest_run(same)
+        if motion.contact is None:  # sensors slower than the frames hold a value, and contacts come and go
+            length, start = int(same.sum() * stands.all()), 0
+        elif stands.any():
+            length, start = int(moves.sum()), 0
+        yield Measurement(value=length, frame=start + 1 if length else None, detail=name)
 
 
 @motion_check(
@@ -204,22 +220,18 @@ def stuck_sensors(subject: Recorded) -> Iterator[Found]:
     fail=0.5,
     needs=GRIPPER,
 )
-def gripper_follows(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def gripper_follows(motion: Motion) -> Found:
     """The fingers stand where they were told to, or on the way there where something is between or beside them.
 
     Catches openings and commands that are inverted, halved or frozen. Whether something is at the fingers says the
     force on them; where nobody measures it, they may be kept open by it whenever they were told to close, and from
     opening in fewer than half of the frames in which they were told to open.
     """
-    for motion in subject.motions.all:
-        place = motion.gripper
-        if place is None or motion.action is None or not np.isfinite(motion.action[:, place]).all():
-            yield Lacking(need=GRIPPER)
-            return
-        yield _followed(motion, place, motion.commands.get("command", motion.action)[:, place])
-
-
-def _followed(motion: Motion, place: int, command: Array) -> Found:
+    if (told := told_gripper(motion)) is None:
+        return Lacking(need=GRIPPER)
+    place, command = told
+    command = motion.commands["command"][:, place] if "command" in motion.commands else command
     settle_s = max(_SETTLE_S, motion.stroke_s + 0.1)
     opening, wait = motion.state[:, place], math.ceil(settle_s * motion.fps)
     span = float(motion.upper[place] - motion.lower[place])
@@ -240,21 +252,25 @@ def _followed(motion: Motion, place: int, command: Array) -> Found:
     is_open = command > command.min() + 0.5 * max(float(np.ptp(command)), _LEAST_STROKE * reach)
     holds = ~is_open
     if motion.contact is not None:
-        holds = motion.contact > 0
-        for back in range(1, wait + 1):  # what was let go of has as much time, from then on
-            holds[back:] |= motion.contact[:-back] > 0
+        holds = held_for(motion.contact > 0, wait)  # what was let go of has as much time, from then on
     beyond = np.where(is_open, gap, -gap)  # things keep fingers from closing between them, and from opening beside them
     off = np.where(holds, np.maximum(beyond, 0.0), np.abs(gap)) / reach
-    where = f", {motion.where}" if motion.where else ""
-    detail = f"{int(steady.sum())} frames after the motion{where}"
     if motion.contact is None and float(np.ptp(command[steady])) > _LEAST_STROKE * reach:
         if float(np.ptp(opening[steady])) < _STUCK * reach:
-            return Measurement(value=1.0, detail=f"it never moves{where}")
+            return Measurement(value=1.0, detail="it never moves")
         if float(np.corrcoef(opening[steady], command[steady])[0, 1]) < -_INVERTED:
-            return Measurement(value=1.0, detail=f"it opens when told to close, and closes when told to open{where}")
+            return Measurement(value=1.0, detail="it opens when told to close, and closes when told to open")
     if motion.contact is None and (rows := steady & is_open).any():  # what is beside them shows in some frames
         off = np.where(is_open, np.median(off[rows]), off)
-    return worst_frame(np.where(steady, off, 0.0), detail)
+    return worst_frame(np.where(steady, off, 0.0), f"{int(steady.sum())} frames after the motion")
+
+
+def told_gripper(motion: Motion) -> tuple[int, Array] | None:
+    """The element that is the opening of a gripper, and (T,) its action; None where either is not known."""
+    place = motion.gripper
+    if place is None or motion.action is None or not np.isfinite(motion.action[:, place]).all():
+        return None
+    return place, motion.action[:, place]
 
 
 @motion_check(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.check.fingers import NEAR, SOLID, depth_of_link
-from demorec.check.rows import angle_between, displacement, inverse, longest_run, matrices
+from demorec.check.rows import angle_between, displacement, held_for, inverse, longest_run, matrices
 from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Shape
 
@@ -84,14 +84,6 @@ def _touched(episode: CheckedEpisode) -> dict[str, NDArray[np.bool_]]:
                 close = (gap < reach)[:-1] & active[other.name]
                 active[body.name] = active[body.name] | held_for(close, coast)
     return active
-
-
-def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
-    """Each True lasts for `count` more entries."""
-    if not len(flags):
-        return flags
-    last = np.where(flags, np.arange(len(flags)), -(10**9))
-    return np.asarray(np.arange(len(flags)) - np.maximum.accumulate(last) <= count)
 
 
 @physics_check(

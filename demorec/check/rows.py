@@ -104,6 +104,14 @@ def finest_lag(lags: Sequence[int], errors: Sequence[float]) -> float:
     return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0)
 
 
+def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    """Each True lasts for `count` more entries."""
+    if not len(flags):
+        return flags
+    last = np.where(flags, np.arange(len(flags)), -(10**9))
+    return np.asarray(np.arange(len(flags)) - np.maximum.accumulate(last) <= count)
+
+
 def longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
     """(length, start) of the longest run of True; (0, 0) when there is none."""
     padded = np.concatenate([[False], np.asarray(flags, dtype=bool), [False]])

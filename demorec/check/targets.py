@@ -18,11 +18,12 @@ from demorec.check.base import (
     Measurement,
     NotMeasured,
     check,
+    worst,
     worst_entry,
 )
 from demorec.check.dataset import Dataset
 from demorec.check.evidence import FEWEST, MOVES, Motion, correlations, is_gripper, quaternion_places
-from demorec.check.motion import Recorded, motion_check
+from demorec.check.motion import Recorded, motion_check, of_each_motion, told_gripper
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION
@@ -198,25 +199,25 @@ def _opens_and_closes(openings: list[Array]) -> bool:
     fail=0.04,
     needs=VELOCITIES,
 )
-def steps_as_velocities(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def steps_as_velocities(motion: Motion) -> Iterator[Found]:
     """No joint jumps: catches an encoder that slips, a single wrong value, and frames that are missing.
 
     Velocities that are coarse, late or of another unit differ from the steps everywhere, and tell nothing.
     """
-    for motion in subject.motions.all:
-        if motion.velocity is None:
-            yield Lacking(need=VELOCITIES)
-            return
-        if len(motion.state) < FEWEST:
-            continue
-        expected = (motion.velocity[1:] + motion.velocity[:-1]) / 2 * motion.steps_s[:, None]
-        # Within a step a joint may start and stop: only what is more than its fastest could do is a jump.
-        fastest = np.abs(motion.velocity).max(axis=0) * motion.steps_s[:, None]
-        off = np.sort(np.maximum(np.abs(np.diff(motion.state, axis=0) - expected) - fastest, 0.0), axis=0)[-2:]
-        beyond = np.maximum(off[1] - _ANY_OTHER * off[0], 0.0) / np.maximum(np.ptp(motion.state, axis=0), _GOES)
-        known = np.isfinite(beyond) & (np.arange(len(beyond)) != motion.gripper)
-        if known.any():
-            yield worst_entry(beyond[None, known], motion.labels(known))
+    if motion.velocity is None:
+        yield Lacking(need=VELOCITIES)
+        return
+    if len(motion.state) < FEWEST:
+        return
+    expected = (motion.velocity[1:] + motion.velocity[:-1]) / 2 * motion.steps_s[:, None]
+    # Within a step a joint may start and stop: only what is more than its fastest could do is a jump.
+    fastest = np.abs(motion.velocity).max(axis=0) * motion.steps_s[:, None]
+    off = np.sort(np.maximum(np.abs(np.diff(motion.state, axis=0) - expected) - fastest, 0.0), axis=0)[-2:]
+    beyond = np.maximum(off[1] - _ANY_OTHER * off[0], 0.0) / np.maximum(np.ptp(motion.state, axis=0), _GOES)
+    known = np.isfinite(beyond) & (np.arange(len(beyond)) != motion.gripper)
+    if known.any():
+        yield worst_entry(beyond[None, known], motion.labels(known))
 
 
 @target_check(
@@ -344,21 +345,12 @@ def action_steps(dataset: Dataset) -> Iterator[Found]:
     fail=3,
     needs=GRIPPER,
 )
-def gripper_waits_for_action(subject: Recorded) -> Iterator[Found]:
+@of_each_motion
+def gripper_waits_for_action(motion: Motion) -> Found:
     """A gripper opens and closes after it was told to: catches actions that are late in one of the two directions."""
-    for motion in subject.motions.all:
-        place = motion.gripper
-        if place is None or motion.action is None or not np.isfinite(motion.action[:, place]).all():
-            yield Lacking(need=GRIPPER)
-            return
-        early = _early(motion, place)
-        yield NotMeasured(why="the gripper's command never jumps after a pause") if early is None else early
-
-
-def _early(motion: Motion, place: int) -> Measurement | None:
-    """By how much the opening is ahead of the worst jump of its command."""
-    assert motion.action is not None
-    command, opening = motion.action[:, place], motion.state[:, place]
+    if (told := told_gripper(motion)) is None:
+        return Lacking(need=GRIPPER)
+    command, opening = told[1], motion.state[:, told[0]]
     reach, before = float(np.ptp(command)), round(_HELD_S * 2 * motion.fps)
     found = []
     for frame in np.flatnonzero(np.abs(np.diff(command)) > _JUMP * max(reach, 1e-9)) + 1:
@@ -367,5 +359,5 @@ def _early(motion: Motion, place: int) -> Measurement | None:
         direction = np.sign(command[frame] - command[frame - 1])
         moved = direction * (opening[frame - before : frame + 1] - opening[frame - before]) > _BEGUN * np.ptp(opening)
         ahead = int(moved[::-1].argmin()) if moved[-1] else 0  # frames in a row up to the command
-        found.append(Measurement(value=ahead, frame=int(frame), detail=motion.where))
-    return max(found, key=lambda one: one.value, default=None)
+        found.append(Measurement(value=ahead, frame=int(frame)))
+    return worst(*found) or NotMeasured(why="the gripper's command never jumps after a pause")
