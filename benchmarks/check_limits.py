@@ -24,8 +24,9 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from demorec.check.limits import TABLE, LimitCalibration, LimitTable, read_table
+from demorec.check.base import LIMITS, limit_table
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.core.errors import SceneError
@@ -187,40 +188,36 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
 
 def write_limits(rows: Sequence[Row], options: argparse.Namespace) -> None:
     """Merge the largest values into the table and list limits that are too near."""
-    before = read_table()
+    before = limit_table()
+    margin = before["calibration"]["margin"]
     good = [row for row in rows if row.success]
     checks = {}
-    for name, limit in before.checks.items():
+    for name, limit in before["checks"].items():
         values = [row.values[name] for row in good if name in row.values]
-        largest = max([0.0 if options.anew else limit.largest, *values])
-        checks[name] = replace(limit, largest=round(largest, 6))
-        if largest * before.calibration.margin > limit.warn:
-            print(f"too near: {name} warns above {limit.warn:g}, the largest value is {largest:g}")
-    calibration = LimitCalibration(
-        seed=options.seed,
-        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
-        episodes=len(good) + (0 if options.anew else before.calibration.episodes),
-        settings="all tasks, robots and variations; sizes, rates, codecs and qualities are drawn for each episode",
-        margin=before.calibration.margin,
-    )
-    TABLE.write_text(written(LimitTable(calibration=calibration, checks=checks)))
+        largest = max([0.0 if options.anew else limit["largest"], *values])
+        checks[name] = {**limit, "largest": round(largest, 6)}
+        if largest * margin > limit["warn"]:
+            print(f"too near: {name} warns above {limit['warn']:g}, the largest value is {largest:g}")
+    calibration = {
+        "seed": options.seed,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "episodes": len(good) + (0 if options.anew else before["calibration"]["episodes"]),
+        "settings": "all tasks, robots and variations; sizes, rates, codecs and qualities are drawn for each episode",
+        "margin": margin,
+    }
+    LIMITS.write_text(written(calibration, checks))
 
 
-def written(limits: LimitTable) -> str:
+def written(calibration: Mapping[str, Any], checks: Mapping[str, Mapping[str, float]]) -> str:
     """The table as TOML."""
-    c = limits.calibration
     lines = [
-        "# Written by benchmarks/check_limits.py but for the limits, which are set by hand (demorec/check/limits.py).",
+        "# Written by benchmarks/check_limits.py but for the limits, set by hand (demorec/check/base.py).",
         "",
         "[calibration]",
-        f"seed = {c.seed}",
-        f'date = "{c.date}"',
-        f"episodes = {c.episodes}",
-        f'settings = "{c.settings}"',
-        f"margin = {c.margin}",
+        *(f"{key} = {json.dumps(value)}" for key, value in calibration.items()),
     ]
-    for name, limit in limits.checks.items():
-        lines += ["", f"[checks.{name}]", f"warn = {limit.warn}", f"fail = {limit.fail}", f"largest = {limit.largest}"]
+    for name, limit in checks.items():
+        lines += ["", f"[checks.{name}]", *(f"{key} = {value}" for key, value in limit.items())]
     return "\n".join(lines) + "\n"
 
 

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import logging
 import math
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial, wraps
+from functools import cache, partial, wraps
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.limits import limit_table
 from demorec.core.errors import DemorecError, MissingDependencyError, NotAllowedError, resource_error
 from demorec.core.geometry import Array
 
@@ -26,6 +27,7 @@ Form = Literal["simulated", "external", "run", "external run", "dataset"]
 """What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
 Group = Literal["file", "time", "physics", "alignment", "calibration", "images", "outcome", "run", "dataset"]
 
+LIMITS = Path(__file__).with_name("limits.toml")
 _BLOCKED = "it needs what is damaged"
 _NOT_APPLICABLE = "not applicable: it needs "
 _NEEDS_ALLOW = "not measured without --allow: "
@@ -41,6 +43,16 @@ STATE_ALONE = "observation.state"
 IMAGES = "colour images"
 SIDECAR = "what demorec keeps beside its datasets"
 """What checks need, as `Check.needs` has it."""
+
+
+@cache
+def limit_table() -> dict[str, Any]:
+    """The limits of checks whose values vary from one good recording to the next, with what they were calibrated on.
+
+    "checks" has by the name of a check "warn", "fail" and "largest", the largest value of good recordings, which
+    `benchmarks/check_limits.py` writes; the limits are set by hand, and a test holds them to the margin.
+    """
+    return tomllib.loads(LIMITS.read_text())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +257,7 @@ def check(
 ) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
     """Make a `Check` of a function; its name is the function's. Of a generator the `worst` that it yields is judged.
 
-    Recordings that demorec simulated have the limits of `demorec.check.limits`, where the check stands in there, or
+    Recordings that demorec simulated have the limits of `limits.toml`, where the check stands in there, or
     those of `simulated`. Without `fail` there are no warnings, and without any limit nothing above zero passes.
     """
 
@@ -256,8 +268,8 @@ def check(
             return worst(*found) if isinstance(found, Iterator) else found
 
         name = function.__name__
-        table, general = limit_table().checks.get(name), (warn, warn if fail is None else fail)
-        exact = (table.warn, table.fail) if table else simulated or general
+        table, general = limit_table()["checks"].get(name), (warn, warn if fail is None else fail)
+        exact = (table["warn"], table["fail"]) if table else simulated or general
         limits = exact if on == ("simulated",) else general
         return Check(
             name=name,

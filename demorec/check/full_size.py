@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import limit_table
 from demorec.check.cells import CellGrid
-from demorec.check.limits import limit_table
 from demorec.core.config import VideoConfig
 from demorec.core.geometry import Array
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe, make_encoder
@@ -81,14 +81,14 @@ class FullSize:
     @property
     def is_clear(self) -> bool:
         """Whether all of them are well below what is warned of."""
-        limits = limit_table().checks
+        limits = limit_table()["checks"]
         found = {
             "image_placement": self.displacement,
             "image_sharpness": abs(self.sharpness),
             "image_colors": self.color,
             "image_errors": float(self.errors.max()),
         }
-        return all(value < _CLEAR * limits[check].warn for check, value in found.items())
+        return all(value < _CLEAR * limits[check]["warn"] for check, value in found.items())
 
 
 def frames_to_compare(
