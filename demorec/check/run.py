@@ -1,15 +1,19 @@
-"""Does a run's folder hold what its run.json says, each episode once, and do they cover what was randomised."""
+"""Does a run's folder hold what its run.json says, each episode once, and do they cover what was randomised.
+
+Of an imported run also what the import found in its bags, which need not be there any more: the report that
+`demorec import` keeps in import.json, judged again.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+import math
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from demorec.check.base import SCENE, Form, Found, Lacking, Measurement, NotMeasured, run_check, worst
+from demorec.check.base import SCENE, Form, Found, Lacking, Measurement, NotMeasured, check, run_check, worst
 from demorec.check.coverage import MIN_EPISODES, motion_vector, pieces, start_vector, twins, worst_gap
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ConfigError, RecordingError, describe_error, resource_error
@@ -18,33 +22,22 @@ from demorec.core.geometry import Array
 from demorec.core.plain import digest
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.episode.episode import Outcome
 from demorec.episode.features import STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_recording
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME, is_external_run, load_any_run_file
 
+if TYPE_CHECKING:
+    from demorec.sources.import_file import ImportFile
+
 _MAX_JSON_BYTES = 2 << 30
+_TIMES = frozenset(
+    ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
+) | {"duplicates", "late_start", "early_end", "cut_off", "repeats", "skips"}
+_IMAGES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
+_MOST_LISTED = 5
 _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}
 """What the line of an attempt says, as far as it is checked."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RecordedAttempt:
-    """What a recording states about itself.
-
-    Attributes:
-        info, outcome: As recorded.
-        digest: Of its content.
-        num_bytes: Size of the file.
-        motion: `motion_vector` of its joints.
-    """
-
-    info: EpisodeInfo
-    outcome: Outcome | None
-    digest: str
-    num_bytes: int
-    motion: Array
 
 
 class CheckedRun:
@@ -92,19 +85,25 @@ class CheckedRun:
         return [path for folder in (EPISODES, FAILED) for path in sorted((self.path / folder).glob("*.mcap"))]
 
     @cached_property
-    def attempts(self) -> dict[str, RecordedAttempt]:
-        """File (relative) -> what it states about itself, of the recordings that can be read."""
+    def attempts(self) -> dict[str, tuple[EpisodeInfo, dict[str, Any], Array]]:
+        """File (relative) -> what it states about itself, of the recordings that can be read: before its first frame,
+        after its last one (as run.json has it; nothing of one that was cut off), and `motion_vector` of its joints."""
         found = {}
         for path in self.recordings:
             try:
                 with open_recording(path, simulated=True) as recording:
-                    found[str(path.relative_to(self.path))] = RecordedAttempt(
-                        info=recording.info,
-                        outcome=recording.outcome,
-                        digest=recording.digest(),
-                        num_bytes=path.stat().st_size,
-                        motion=motion_vector(recording.columns().joint_position),
-                    )
+                    content, motion = recording.digest(), motion_vector(recording.columns().joint_position)
+                    said: dict[str, Any] = {}
+                    if (outcome := recording.outcome) is not None:
+                        said = {
+                            "success": outcome.success,
+                            "phase": outcome.failure_phase,
+                            "reason": outcome.failure_reason,
+                            "num_frames": outcome.num_frames,
+                            "num_bytes": path.stat().st_size,
+                            "digest": content,
+                        }
+                    found[str(path.relative_to(self.path))] = recording.info, said, motion
             except (RecordingError, OSError):
                 continue  # check `opens` or `readable` of that recording says so
         return found
@@ -115,6 +114,13 @@ class CheckedRun:
         if self.form == "external run":
             return {line.file: line.sha256 for line in load_any_run_file(self.path).attempts}
         return {line["file"]: line["sha256"] for line in self.lines}
+
+    @property
+    def import_file(self) -> ImportFile | None:
+        """What its import found; None where nothing says so."""
+        from demorec.sources.import_file import load_import_file
+
+        return load_import_file(self.path)
 
     @property
     def hint(self) -> str:
@@ -133,7 +139,8 @@ class CheckedRun:
             motions = dict(self._external_motions())
             return list(motions), list(motions.values()), []
         kept = {file: attempt for file, attempt in self.attempts.items() if file.startswith("episodes/")}
-        return list(kept), [a.motion for a in kept.values()], [start_vector(a.info.scene) for a in kept.values()]
+        starts = [start_vector(info.scene) for info, _, _ in kept.values()]
+        return list(kept), [motion for _, _, motion in kept.values()], starts
 
     def _external_motions(self) -> Iterator[tuple[str, Array]]:
         """Of the recordings that can be read and have a state."""
@@ -149,7 +156,7 @@ class CheckedRun:
     def successes(self) -> list[EpisodeInfo]:
         """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
         asked = self.run["num_episodes"]
-        infos = [attempt.info for file, attempt in self.attempts.items() if file.startswith("episodes/")]
+        infos = [info for file, (info, _, _) in self.attempts.items() if file.startswith("episodes/")]
         return [info for info in infos if info.episode_index < asked]
 
 
@@ -188,10 +195,9 @@ def run_agrees(run: CheckedRun) -> Measurement:
 def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
     """What a line of run.json says otherwise than its recording."""
     file = line["file"]
-    attempt = run.attempts.get(file)
-    if attempt is None:
+    if file not in run.attempts:
         return
-    info = attempt.info
+    info, found, _ = run.attempts[file]
     said = (line["episode_index"], line["attempt"], line["seed"])
     if (info.episode_index, info.attempt, info.root_seed) != said:
         yield f"{file} is episode {info.episode_index}, attempt {info.attempt}"
@@ -206,17 +212,6 @@ def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
     stem = Path(file).name.partition(".")[0]
     if stem != f"episode_{info.episode_index:06d}":
         yield f"{file} is episode {info.episode_index}"
-    outcome = attempt.outcome
-    if outcome is None:
-        return
-    found = {
-        "success": outcome.success,
-        "phase": outcome.failure_phase,
-        "reason": outcome.failure_reason,
-        "num_frames": outcome.num_frames,
-        "num_bytes": attempt.num_bytes,
-        "digest": attempt.digest,
-    }
     for name, value in found.items():
         if line.get(name, value) != value:
             yield f"{name} of {file} is {str(value)[:40]!r}, run.json says {str(line[name])[:40]!r}"
@@ -279,3 +274,58 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
         raise ConfigError(f"info.json of the dataset cannot be used ({describe_error(error)}): {path}") from error
     successes = sum(1 for line in run.lines if line["success"] and line["episode_index"] < run.run["num_episodes"])
     return Measurement(value=abs(episodes - successes), detail=f"{episodes} in the dataset, {successes} successes")
+
+
+import_check = partial(check, on=("external run",), needs="a run that was imported", fail=math.inf)
+
+
+@import_check(
+    group="time",
+    measures="findings about times in the bags that were imported: clocks, losses, gaps, repeats, jitter, order",
+)
+def import_times(run: CheckedRun) -> Found:
+    """The streams of the bags were whole, in order and on one clock."""
+    return _found(run, lambda kind: kind in _TIMES)
+
+
+@import_check(
+    group="images",
+    measures="findings about cameras in the bags that were imported: frozen, swapped, of several sizes",
+)
+def import_images(run: CheckedRun) -> Found:
+    """Each camera showed its own images, of one size and kind."""
+    return _found(run, lambda kind: kind in _IMAGES)
+
+
+@import_check(
+    group="physics",
+    measures="findings about numbers in the bags that were imported: NaN, stuck sensors, spikes, units",
+)
+def import_numbers(run: CheckedRun) -> Found:
+    """The numbers of the bags were such as robots have."""
+    return _found(run, lambda kind: kind not in _TIMES | _IMAGES)
+
+
+@import_check(
+    group="run",
+    measures="episodes that an import dropped, since something was missing or too old, and bags that it skipped",
+)
+def import_dropped(run: CheckedRun) -> Found:
+    """Every episode that the bags hold is in the run, but those that a marker discards."""
+    if (found := run.import_file) is None:
+        return None
+    rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
+    dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
+    return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_LISTED]))
+
+
+def _found(run: CheckedRun, is_mine: Callable[[str], bool]) -> Found:
+    if (found := run.import_file) is None:
+        return None
+    words = [
+        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
+        for bag in found.bags
+        for finding in bag.odd
+        if is_mine(finding.kind)
+    ]
+    return Measurement(value=len(words), detail="; ".join(words[:_MOST_LISTED]))

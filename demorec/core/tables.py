@@ -124,7 +124,7 @@ CHECKS: Registry[Check] = Registry(
         ("images", "image_errors", "odd_images", "frozen"),
         ("images", "repeated_images", "distinct_cameras", "pixel_statistics"),
         ("external", "drops", "rate", "gaps", "sample_age", "image_age", "missing_images", "images_show_something"),
-        ("imported", "import_times", "import_numbers", "import_images", "import_dropped"),
+        ("run", "import_times", "import_numbers", "import_images", "import_dropped"),
         ("run", "run_files", "run_agrees", "run_dataset"),
         ("run_dataset", "run_dataset_content"),
         ("dataset_files", "dataset_readable", "dataset_counts", "dataset_videos", "dataset_strays"),
