@@ -11,11 +11,11 @@ import queue
 import subprocess
 import sys
 import threading
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.files import Closing
 from demorec.core.text import printable
 from demorec.view.programs import free_port, has_display, viewer_environment, viewer_program
 
@@ -23,7 +23,7 @@ _NICENESS = 15
 _END_SECONDS = 60.0
 
 
-class LiveViewer(AbstractContextManager["LiveViewer"]):
+class LiveViewer(Closing):
     """Context manager over a window to which finished episodes can be added; the window stays open afterwards.
 
     Args:
@@ -59,9 +59,6 @@ class LiveViewer(AbstractContextManager["LiveViewer"]):
         self._paths: queue.SimpleQueue[Path | None] = queue.SimpleQueue()
         self._feeder = threading.Thread(target=self._feed, daemon=True)
         self._feeder.start()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def add(self, recording: Path) -> None:
         """Show a finished recording as soon as there is time; returns at once."""

@@ -21,7 +21,7 @@ def save(source: PlaybackSource, target: Path) -> None:
     Raises:
         DemorecError: The episode cannot be read, or the file cannot be written.
     """
-    with _partial(target) as part:
+    with _refusals_reported(target), written_whole(target, RERUN_FILE) as part:
         _save_episode(source, part, is_alone=True)
 
 
@@ -54,7 +54,12 @@ def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
     Raises:
         DemorecError: As `save`; ConfigError when they cannot be compared.
     """
-    with _partial(target) as part, a.open() as first, b.open() as second:
+    with (
+        _refusals_reported(target),
+        written_whole(target, RERUN_FILE) as part,
+        a.open() as first,
+        b.open() as second,
+    ):
         recording = new_comparison(first, second)
         with _saving(recording, part, comparison_layout(first, second)):
             log_comparison(recording, first, second)
@@ -83,13 +88,6 @@ def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Bl
         recording.disconnect()
     assert data is not None  # there is a layout, at least
     target.write_bytes(data)
-
-
-@contextmanager
-def _partial(target: Path) -> Iterator[Path]:
-    """A name beside the target, renamed when the block ends well and removed when not."""
-    with _refusals_reported(target), written_whole(target, RERUN_FILE) as part:
-        yield part
 
 
 @contextmanager

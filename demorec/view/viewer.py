@@ -114,7 +114,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
 
     def close(self) -> None:
         """End the viewer; harmless when called twice."""
-        end_process(self._process)
+        _end_process(self._process)
         self._said.close()
 
     def _reason(self) -> DemorecError:
@@ -123,28 +123,21 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         return why_it_ended(self._said.read())
 
     def _connect(self) -> ViewerClient:
-        deadline = time.monotonic() + _START_SECONDS
-        while time.monotonic() < deadline:
+        for _ in _tries(0.2):
             if self._process.poll() is not None:
                 raise self._reason()
-            try:
+            with suppress(OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
                 client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
                 if _loaded(client, 1):
                     return client
-            except (OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
-                pass
-            time.sleep(0.2)
         raise _not_loaded(self._recordings[0])
 
     def _add(self, recordings: Sequence[Path]) -> None:
         """Load more files; the viewer lists them as they come, but names and reads only what it has shown."""
         for count, recording in enumerate(recordings, start=2):
             self.client.open(str(recording), navigate=False)
-            deadline = time.monotonic() + _START_SECONDS
-            while not _loaded(self.client, count):
-                if time.monotonic() > deadline:
-                    raise _not_loaded(recording)
-                time.sleep(0.1)
+            if not any(_loaded(self.client, count) for _ in _tries(0.1)):
+                raise _not_loaded(recording)
         listed = self.client.get_state().recordings
         if len(listed) > 1:
             for shown in (*listed[1:], listed[0]):
@@ -161,11 +154,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         """Pause at a time of the episode, and wait until the image has settled (videos are decoded)."""
         for recording in self.client.get_state().recordings:
             self.client.set_time(timeline=SECONDS, duration=seconds, play_state="paused", recording=recording.store_id)
-        self._settle()
-
-    def _settle(self) -> None:
-        before, same = b"", 0
-        deadline = time.monotonic() + _SETTLE_SECONDS
+        before, same, deadline = b"", 0, time.monotonic() + _SETTLE_SECONDS
         while same < 3 and time.monotonic() < deadline:
             time.sleep(0.4)
             now = self._image()
@@ -201,6 +190,14 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     def reports(self) -> list[tuple[str, Any]]:
         """Every warning and error of a view: (its name, what Rerun tells)."""
         return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
+
+
+def _tries(pause: float) -> Iterator[None]:
+    """Again and again, with a pause in seconds in between, until the viewer should long have come up."""
+    deadline = time.monotonic() + _START_SECONDS
+    while time.monotonic() < deadline:
+        yield
+        time.sleep(pause)
 
 
 def _loaded(client: ViewerClient, count: int) -> bool:
@@ -264,28 +261,26 @@ def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tupl
         _wait_for_page(page, process)
         yield f"{page}/?url={quote(f'rerun+http://127.0.0.1:{data_port}/proxy', safe='')}", process.wait
     finally:
-        end_process(process)
+        _end_process(process)
 
 
 def _wait_for_page(page: str, process: subprocess.Popen[Any]) -> None:
-    deadline = time.monotonic() + _START_SECONDS
-    while time.monotonic() < deadline and process.poll() is None:
-        try:
-            with urlopen(page, timeout=5):
-                return
-        except OSError:
-            time.sleep(0.1)
+    for _ in _tries(0.1):
+        if process.poll() is not None:
+            break
+        with suppress(OSError), urlopen(page, timeout=5):
+            return
     raise RecordingError(f"Rerun's web server did not come up at {page}: is the port taken?")
 
 
-def end_process(process: subprocess.Popen[Any]) -> None:
+def _end_process(process: subprocess.Popen[Any]) -> None:
     """Ask a process to end, and make it when it does not within some seconds."""
     if process.stdin is not None:
         process.stdin.close()
     if process.poll() is None:
         process.terminate()
         try:
-            process.wait(timeout=5)
+            process.wait(_END_SECONDS)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
