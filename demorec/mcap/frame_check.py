@@ -121,12 +121,19 @@ MAX_SUBTASK = 1000
 
 
 class SampledFrameCheck:
-    """Looks at images and frames in the order in which they come, and notes those that were taken."""
+    """Looks at images and frames in the order in which they come, and notes those that were taken.
+
+    Attributes:
+        features: By name, of the episode.
+        image_stamps: Camera -> stamp of the last image that was taken.
+    """
 
     def __init__(self, info: EpisodeInfo) -> None:
-        self._features = {feature.name: feature for feature in info.features}
+        self.features = {feature.name: feature for feature in info.features}
         self._cameras = {camera.name: camera for camera in info.cameras}
-        self._last: dict[str, int] = {}
+        self.image_stamps: dict[str, int] = {}
+        self._sample_stamps: dict[str, int] = {}
+        self._frame_stamp = -1
         self._num_images = dict.fromkeys(self._cameras, 0)
         self._num_frames = 0
 
@@ -139,26 +146,26 @@ class SampledFrameCheck:
                 f"{', '.join(self._cameras) or 'none'}."
             )
         _check_image(known, data)
-        self._check_stamp(f"The image of the camera {camera!r}", "camera " + camera, stamp_ns, may_repeat=False)
+        _check_stamp(f"The image of the camera {camera!r}", self.image_stamps.get(camera, -1), stamp_ns)
 
     def note_image(self, camera: str, stamp_ns: int) -> None:
         """The camera's next image was taken."""
-        self._last["camera " + camera] = int(stamp_ns)
+        self.image_stamps[camera] = int(stamp_ns)
         self._num_images[camera] += 1
 
     def check_frame(self, frame: SampledFrame) -> None:
         """Raise RecordingError unless it can be the next frame."""
         what = f"frame {self._num_frames}"
-        if unknown := [name for name in frame.samples if name not in self._features]:
+        if unknown := [name for name in frame.samples if name not in self.features]:
             raise RecordingError(
                 f"{what.capitalize()} has an unknown feature {unknown[0]!r}."
-                f"{nearest_match(unknown[0], self._features)} The features are: {', '.join(self._features)}."
+                f"{nearest_match(unknown[0], self.features)} The features are: {', '.join(self.features)}."
             )
-        if missing := [name for name in self._features if name not in frame.samples]:
+        if missing := [name for name in self.features if name not in frame.samples]:
             raise RecordingError(
                 f"{what.capitalize()} lacks the feature {', '.join(missing)}: every frame has every feature."
             )
-        for name, feature in self._features.items():
+        for name, feature in self.features.items():
             vector, count = frame.samples[name].vector, len(feature.names)
             if not isinstance(vector, np.ndarray) or vector.dtype != feature.dtype or vector.shape != (count,):
                 found = f"{getattr(vector, 'dtype', type(vector).__name__)} of shape {np.shape(vector)}"
@@ -177,29 +184,30 @@ class SampledFrameCheck:
                 raise RecordingError(f"The camera {camera!r} has no image {number} for {what}, it has {count} so far.")
         if len(frame.subtask) > MAX_SUBTASK or not frame.subtask.isprintable():
             raise RecordingError(f"The subtask of {what} is no single line of at most {MAX_SUBTASK} characters.")
-        for name in self._features:
+        for name in self.features:
             stamp = frame.samples[name].stamp_ns
-            self._check_stamp(f"The feature {name!r} of {what}", "feature " + name, stamp, may_repeat=True)
-        self._check_stamp(what.capitalize(), "frames", frame.time_ns, may_repeat=False)
+            last = self._sample_stamps.get(name, -1)
+            _check_stamp(f"The feature {name!r} of {what}", last, stamp, may_repeat=True)
+        _check_stamp(what.capitalize(), self._frame_stamp, frame.time_ns)
 
     def note_frame(self, frame: SampledFrame) -> None:
         """The next frame was taken."""
-        for name in self._features:
-            self._last["feature " + name] = int(frame.samples[name].stamp_ns)
-        self._last["frames"] = int(frame.time_ns)
+        for name in self.features:
+            self._sample_stamps[name] = int(frame.samples[name].stamp_ns)
+        self._frame_stamp = int(frame.time_ns)
         self._num_frames += 1
 
-    def _check_stamp(self, what: str, key: str, stamp_ns: int, *, may_repeat: bool) -> None:
-        if not isinstance(stamp_ns, int | np.integer) or isinstance(stamp_ns, bool):
-            raise RecordingError(f"{what} has the stamp {stamp_ns!r}, it must be a whole number of nanoseconds.")
-        if not 0 <= stamp_ns <= MAX_STAMP_NS:
-            raise RecordingError(f"{what} has the stamp {stamp_ns} ns, allowed are 0 to {MAX_STAMP_NS} ns.")
-        last = self._last.get(key, -1)
-        if stamp_ns < last or (stamp_ns == last and not may_repeat):
-            raise RecordingError(
-                f"{what} has the stamp {stamp_ns} ns, the one before it {last} ns: stamps must not "
-                f"{'go backwards' if stamp_ns < last else 'stand still'}."
-            )
+
+def _check_stamp(what: str, last: int, stamp_ns: int, *, may_repeat: bool = False) -> None:
+    if not isinstance(stamp_ns, int | np.integer) or isinstance(stamp_ns, bool):
+        raise RecordingError(f"{what} has the stamp {stamp_ns!r}, it must be a whole number of nanoseconds.")
+    if not 0 <= stamp_ns <= MAX_STAMP_NS:
+        raise RecordingError(f"{what} has the stamp {stamp_ns} ns, allowed are 0 to {MAX_STAMP_NS} ns.")
+    if stamp_ns < last or (stamp_ns == last and not may_repeat):
+        raise RecordingError(
+            f"{what} has the stamp {stamp_ns} ns, the one before it {last} ns: stamps must not "
+            f"{'go backwards' if stamp_ns < last else 'stand still'}."
+        )
 
 
 def _check_image(camera: Camera, data: NDArray[Any] | bytes) -> None:

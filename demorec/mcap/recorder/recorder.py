@@ -64,8 +64,7 @@ class RecordedEpisode:
         self._run = run
         self._info = info
         self._encoder: Encoder | None = encoder
-        self._features: dict[str, Feature] = {}
-        self._image_stamps: dict[str, int] = {}
+        self._check: SampledFrameCheck | None = None
 
     @property
     def is_open(self) -> bool:
@@ -118,57 +117,19 @@ class RecordedEpisode:
             raise RecordingError("The episode has ended: begin another with recorder.episode().")
         if self._encoder.error is not None:
             raise _as_recording_error(self._encoder.error)
-        if time_ns is None:
-            time_ns = self._run.clock()
+        time_ns = self._run.clock() if time_ns is None else time_ns
         vectors = named_vectors(observation, action)
-        if not self._features:
-            info = self._encoder.info = self._run.described(self._info, vectors)
-            self._check = SampledFrameCheck(info)
-            self._features = {feature.name: feature for feature in info.features}
-        samples = self._samples(vectors, time_ns, stamps or {})
-        waiting = self._images(images or {}, time_ns)
-        return self._queue(SampledFrame(time_ns=time_ns, samples=samples), waiting)
-
-    def _samples(
-        self,
-        vectors: NamedVectors,
-        time_ns: int,
-        stamps: Mapping[str, int],
-    ) -> dict[str, Sample]:
-        if unknown := [name for name in stamps if name not in self._features]:
-            raise RecordingError(
-                f"The stamps name an unknown feature {unknown[0]!r}.{nearest_match(unknown[0], self._features)} The "
-                f"features are: {', '.join(self._features)}."
-            )
-        samples = {}
-        for name, (vector, names) in vectors.items():
-            if name in self._features:
-                vector = as_declared(self._features[name], vector, names)
-            samples[name] = Sample(stamp_ns=stamps.get(name, time_ns), vector=vector)
-        return samples
-
-    def _images(self, images: Mapping[str, Image | None], time_ns: int) -> WaitingImages:
-        """The images that came, checked and not yet copied; one that came before is None."""
-        waiting: dict[str, tuple[int, NDArray[np.uint8] | None]] = {}
-        for camera, image in images.items():
-            if isinstance(image, tuple) and len(image) != 2:
-                raise RecordingError(
-                    f"The image of the camera {camera!r} is a tuple, it must be (pixels, stamp in ns)."
-                )
-            pixels, stamp_ns = image if isinstance(image, tuple) else (image, time_ns)
-            if pixels is None:
-                continue
-            is_same = camera in self._image_stamps and stamp_ns == self._image_stamps[camera]
-            waiting[camera] = stamp_ns, None if is_same else pixels
-        return waiting
-
-    def _queue(self, frame: SampledFrame, images: WaitingImages) -> bool:
-        assert self._encoder is not None
-        self._check.check_frame(frame)
-        new = {camera: (stamp, pixels) for camera, (stamp, pixels) in images.items() if pixels is not None}
+        if self._check is None:
+            self._encoder.info = self._run.described(self._info, vectors)
+            self._check = SampledFrameCheck(self._encoder.info)
+        check = self._check
+        frame = SampledFrame(time_ns=time_ns, samples=_samples(check, vectors, time_ns, stamps or {}))
+        waiting = _waiting(check, images or {}, time_ns)
+        new = {camera: (stamp, pixels) for camera, (stamp, pixels) in waiting.items() if pixels is not None}
+        check.check_frame(frame)
         for camera, (stamp_ns, pixels) in new.items():
-            self._check.check_image(camera, stamp_ns, pixels)
-        if not self._encoder.put(frame, images):
+            check.check_image(camera, stamp_ns, pixels)
+        if not self._encoder.put(frame, waiting):
             if self._run.when_full == "drop":
                 self.drops[FRAMES] = self.drops.get(FRAMES, 0) + 1
                 return False
@@ -177,9 +138,8 @@ class RecordedEpisode:
                 '(video=VideoConfig(codec="jpeg")), smaller or fewer images, or when_full="drop" or "wait".'
             )
         for camera, (stamp_ns, _) in new.items():
-            self._check.note_image(camera, stamp_ns)
-            self._image_stamps[camera] = stamp_ns
-        self._check.note_frame(frame)
+            check.note_image(camera, stamp_ns)
+        check.note_frame(frame)
         self.num_frames += 1
         return True
 
@@ -225,6 +185,36 @@ class RecordedEpisode:
         if encoder is not None:
             encoder.end()
         return encoder
+
+
+def _samples(
+    check: SampledFrameCheck, vectors: NamedVectors, time_ns: int, stamps: Mapping[str, int]
+) -> dict[str, Sample]:
+    features = check.features
+    if unknown := [name for name in stamps if name not in features]:
+        raise RecordingError(
+            f"The stamps name an unknown feature {unknown[0]!r}.{nearest_match(unknown[0], features)} The features "
+            f"are: {', '.join(features)}."
+        )
+    samples = {}
+    for name, (vector, names) in vectors.items():
+        if name in features:
+            vector = as_declared(features[name], vector, names)
+        samples[name] = Sample(stamp_ns=stamps.get(name, time_ns), vector=vector)
+    return samples
+
+
+def _waiting(check: SampledFrameCheck, images: Mapping[str, Image | None], time_ns: int) -> WaitingImages:
+    """The images that came, not yet copied; one that came before is None."""
+    waiting: dict[str, tuple[int, NDArray[np.uint8] | None]] = {}
+    for camera, image in images.items():
+        if isinstance(image, tuple) and len(image) != 2:
+            raise RecordingError(f"The image of the camera {camera!r} is a tuple, it must be (pixels, stamp in ns).")
+        pixels, stamp_ns = image if isinstance(image, tuple) else (image, time_ns)
+        if pixels is not None:
+            is_same = camera in check.image_stamps and check.image_stamps[camera] == stamp_ns
+            waiting[camera] = stamp_ns, None if is_same else pixels
+    return waiting
 
 
 class Recorder(Closing):
