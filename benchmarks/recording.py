@@ -23,7 +23,7 @@ from demorec.core.geometry import Array
 from demorec.episode.episode import CameraImages, Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
-from demorec.mcap import EpisodeWriter, video
+from demorec.mcap import EpisodeWriter, Recording, video
 from demorec.render import Renderer, RenderSetup
 
 WAYS = [VideoConfig(codec=codec, gop=gop) for codec in ("h264", "av1") for gop in (2, 10, 30)]
@@ -168,20 +168,21 @@ def main() -> None:
             with EpisodeWriter(folder / f"{way.codec}-{way.gop}.mcap", info, video=way) as writer:
                 for frame in frames:
                     writer.write(frame)
-                stats = writer.finish(outcome)
+                path = writer.finish(outcome)
+            num_bytes = path.stat().st_size
+            with Recording(path) as recording:
+                video_bytes = sum(len(packet.data) for name in recording.cameras for packet in recording.packets(name))
             count = max(1, len(frames) * len(frames[0].images))
             label = "jpeg q90" if way.codec == "jpeg" else f"{way.codec} GOP {way.gop}"
             encoding = clock.seconds.get("encoding", 0.0) / count * 1e3
             print(
-                f"{label:<14}{stats.num_bytes / 1e3:>9.0f}{sum(stats.video_bytes.values()) / 1e3:>10.0f}"
-                f"{raw / stats.num_bytes:>11.0f}x{encoding:>21.2f}{psnr(stats.path, frames):>9.1f}"
+                f"{label:<14}{num_bytes / 1e3:>9.0f}{video_bytes / 1e3:>10.0f}"
+                f"{raw / num_bytes:>11.0f}x{encoding:>21.2f}{psnr(path, frames):>9.1f}"
             )
 
 
 def psnr(path: Path, frames: list[Frame]) -> float:
     """Of the decoded images, all cameras together."""
-    from demorec.mcap import Recording
-
     errors = []
     with Recording(path) as recording:
         for camera in recording.cameras:

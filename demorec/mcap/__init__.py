@@ -9,7 +9,7 @@ from demorec.mcap.images import PixelStatistics
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.recover import Recovered, is_whole, recover
 from demorec.mcap.video import VideoPacket, VideoSettings
-from demorec.mcap.writer import EpisodeWriter, WriteStats
+from demorec.mcap.writer import EpisodeWriter
 
 __all__ = [
     "EpisodeWriter",
@@ -18,7 +18,6 @@ __all__ = [
     "Recovered",
     "VideoPacket",
     "VideoSettings",
-    "WriteStats",
     "is_whole",
     "open_recording",
     "recover",

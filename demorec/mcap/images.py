@@ -103,7 +103,6 @@ class CameraWriter:
         camera: As given.
         streams: What is recorded, and how the images are encoded.
         num_ready: Images that have left the encoder, so far.
-        num_video_bytes: Of them.
         last_ns: Stamp of the last image.
     """
 
@@ -119,7 +118,7 @@ class CameraWriter:
         self._frame_id = camera_frame(camera.name)
         self._waiting: list[tuple[int, list[Message]]] = []
         self._packets: list[bytes] = []
-        self._num_images = self.num_ready = self.num_video_bytes = self.last_ns = 0
+        self._num_images = self.num_ready = self.last_ns = 0
 
     def add(self, stamp_ns: int, data: NDArray[Any] | bytes, **beside: NDArray[Any] | None) -> int:
         """Take the next image: pixels, distances, or the packet of one that came encoded; return its number."""
@@ -143,7 +142,6 @@ class CameraWriter:
     def _keep(self, packets: list[bytes]) -> None:
         self._packets += packets
         self.num_ready += len(packets)
-        self.num_video_bytes += sum(map(len, packets))
 
     def end(self) -> None:
         """Take what the encoder held back."""

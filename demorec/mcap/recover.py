@@ -37,14 +37,12 @@ class Recovered:
     Attributes:
         path: The indexed recording.
         num_frames: Kept.
-        num_messages: Kept, of all streams.
         is_complete: Whether nothing was missing, only the name.
         reason: Why reading stopped, "" when the file was complete.
     """
 
     path: Path
     num_frames: int
-    num_messages: int
     is_complete: bool
     reason: str
 
@@ -63,7 +61,6 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     except RecordingError as error:
         raise RecordingError(f"{without_path(error, source)}: {source}") from error
     make_folder(target.parent)
-    num_messages = 0
     seen: Counter[str] = Counter()
     # The usual place for an unfinished file is where the source may lie.
     part = target.with_name(f"{target.name}.recovering")
@@ -78,7 +75,6 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
                 seen[channel.topic] += 1
                 if survey.keeps(item, seen[channel.topic]) and channel.type in _KNOWN_TYPES:
                     file.log(channel.topic, channel.type, item.data, item.log_ns, latched=channel.has_qos)
-                    num_messages += 1
             elif item is None:
                 file.flush()
         if survey.outcome is not None:
@@ -95,7 +91,6 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     return Recovered(
         path=target,
         num_frames=survey.num_frames,
-        num_messages=num_messages,
         is_complete=survey.outcome is not None,
         reason="" if survey.outcome is not None else survey.reason,
     )

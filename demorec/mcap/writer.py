@@ -12,7 +12,6 @@ hold them, so that whatever a crash leaves of the frames has its images.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from heapq import merge
 from pathlib import Path
@@ -38,23 +37,6 @@ from demorec.mcap.streams import SUBTASK, FrameValues, frame_streams
 from demorec.mcap.transforms import FrameTree
 
 _SECOND_NS = 1_000_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class WriteStats:
-    """What was written.
-
-    Attributes:
-        path: The finished file.
-        num_frames: Frames in it.
-        num_bytes: Its size.
-        video_bytes: camera -> bytes of its encoded images.
-    """
-
-    path: Path
-    num_frames: int
-    num_bytes: int
-    video_bytes: Mapping[str, int]
 
 
 class _Pending(NamedTuple):
@@ -296,8 +278,8 @@ class EpisodeWriter(Closing):
         times = np.array([sample.time_ns for sample in samples], dtype=np.int64)
         return self._streams[0].layout.encode(times, values.reshape(len(samples), -1))
 
-    def finish(self, outcome: Outcome) -> WriteStats:
-        """Write the rest, make the file durable and give it its name.
+    def finish(self, outcome: Outcome) -> Path:
+        """Write the rest, make the file durable and give it its name, which is returned.
 
         Raises:
             ConfigError: A file of that name has appeared meanwhile.
@@ -319,12 +301,7 @@ class EpisodeWriter(Closing):
         record = metadata.record_of(self._info)
         self._file.metadata(metadata.OUTCOME, metadata.outcome_metadata(record, outcome))
         self._file.publish()
-        return WriteStats(
-            path=self._file.path,
-            num_frames=self.num_frames,
-            num_bytes=self._file.path.stat().st_size,
-            video_bytes={name: camera.num_video_bytes for name, camera in self._cameras.items()},
-        )
+        return self._file.path
 
     def close(self) -> None:
         """End it, and leave NAME.mcap.part as it is or nothing; harmless when called twice, and after `finish`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.geometry import Array
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.info import EpisodeInfo
@@ -74,7 +75,7 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
     columns = recording.columns()
     time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
     places = joint_places(info.features)
-    positions = joint_positions(places, columns.features).T if places else []
+    positions: Sequence[Array] = joint_positions(places, columns.features).T if places else ()
     return PlayedEpisode(
         **known,
         info=info,

@@ -66,12 +66,8 @@ def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
     with EpisodeWriter(path, info) as writer:
         write_all(writer, frames)
         assert names(tmp_path) == ["a.mcap.part"]
-        stats = writer.finish(outcome)
+        assert writer.finish(outcome) == path
     assert names(tmp_path) == ["a.mcap"]
-    assert (stats.path, stats.num_frames, stats.num_bytes) == (path, 3, path.stat().st_size)
-    with Recording(path) as recording:
-        for camera in ("front", "wrist"):
-            assert stats.video_bytes[camera] == sum(len(packet.data) for packet in recording.packets(camera))
 
 
 def test_frames_come_in_order(tmp_path: Path) -> None:

@@ -258,7 +258,7 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
             num_retries=turns.num_retries,
             final_state_digest=env.world.state_digest(),
         )
-        stats = recording.finish(outcome)
+        num_bytes = recording.finish(outcome).stat().st_size
     file = f"{EPISODES if turns.success else FAILED}/{name}"
     path.replace(folder / file)
     return Attempt(
@@ -269,8 +269,8 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
         file=file,
         sha256="",
         digest=outcome.final_state_digest[:16],
-        num_frames=stats.num_frames,
-        num_bytes=stats.num_bytes,
+        num_frames=outcome.num_frames,
+        num_bytes=num_bytes,
         phase=phase,
         reason=reason,
     )

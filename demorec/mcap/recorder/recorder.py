@@ -169,7 +169,7 @@ class RecordedEpisode:
             encoder.writer.close()
             raise _as_recording_error(encoder.error)
         outcome = Outcome(success=self.success, num_frames=self.num_frames, drops=self.drops, failure_reason=reason)
-        path = encoder.writer.finish(outcome).path
+        path = encoder.writer.finish(outcome)
         self._run.add(path)
         return path
 
