@@ -18,6 +18,7 @@ from demorec.datasets.lerobot.boxes import BOXES_DIR, ReadBox, read_boxes
 from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.language import PERSISTENT, SpokenEpisode, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
+from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.episode.episode import Columns, Outcome, frame_time_ns
 from demorec.episode.features import DEPTH_SUFFIX, STATE
 from demorec.episode.info import Camera, EpisodeInfo, Origin
@@ -156,9 +157,13 @@ class DatasetRecording:
 
     def _lead(self, camera: str) -> int:
         """How many images of a camera come before the first frame: what that is decoded from."""
+        video = None if camera in self.depth_cameras else self._video(camera)
+        return 0 if video is None else video.lead
+
+    def _video(self, camera: str) -> EpisodeVideo | None:
+        """The video of a camera; None where its images are in rows of tables."""
         key = self.dataset.keys[camera]
-        feature = self.dataset.info.features[key]
-        return self.dataset.video(key, self.place).lead if feature.is_video and not feature.is_depth else 0
+        return self.dataset.video(key, self.place) if self.dataset.info.features[key].is_video else None
 
     def video_settings(self, camera: str) -> VideoSettings:
         """How the images of a camera are encoded; those in rows of tables are given as JPEG."""
@@ -167,9 +172,9 @@ class DatasetRecording:
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera in order; `frame_index` is their number, by which frames hold them."""
-        key, lead, times = self.dataset.keys[camera], self._lead(camera), self.columns().image_stamps[camera]
-        if self.dataset.info.features[key].is_video:
-            for frame, data, is_key in self.dataset.video(key, self.place).packets():
+        lead, times = self._lead(camera), self.columns().image_stamps[camera]
+        if (video := self._video(camera)) is not None:
+            for frame, data, is_key in video.packets():
                 number = min(frame + lead, len(times) - 1)
                 yield VideoPacket(frame_index=number, time_ns=int(times[number]), data=data, is_keyframe=is_key)
             return
@@ -183,17 +188,15 @@ class DatasetRecording:
 
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
-        key = self.dataset.keys[camera]
-        if self.dataset.info.features[key].is_video:
-            return self.dataset.video(key, self.place).images(-self._lead(camera))
-        return self.dataset.stored_images(key, self.place)
+        if (video := self._video(camera)) is not None:
+            return video.images(-self._lead(camera))
+        return self.dataset.stored_images(self.dataset.keys[camera], self.place)
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
         """What some frames, in rising order, show of a camera, (H, W, 3) uint8 RGB."""
-        key = self.dataset.keys[camera]
-        if self.dataset.info.features[key].is_video:
-            return self.dataset.video(key, self.place).images_at(frames)
-        return self.dataset.stored_images(key, self.place, frames)
+        if (video := self._video(camera)) is not None:
+            return video.images_at(frames)
+        return self.dataset.stored_images(self.dataset.keys[camera], self.place, frames)
 
     def distances(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """The images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""
