@@ -110,12 +110,7 @@ def _counted(rows: pa.Table, cut: Cut, episode: int, index: int) -> pa.Table:
 
 
 class Beside(Closing):
-    """Context manager; `add` takes the episodes as they are written, `finish` completes the files.
-
-    Args:
-        plan: What is written.
-        folder: Of the new dataset.
-    """
+    """Context manager; `add` takes the episodes as they are written, `finish` completes the files."""
 
     def __init__(self, plan: Plan, folder: Path) -> None:
         self._plan, self._folder = plan, folder

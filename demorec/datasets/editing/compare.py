@@ -55,13 +55,7 @@ class Difference:
 
 
 class EpisodeComparer:
-    """Compares pairs of episodes of two datasets.
-
-    Args:
-        sources: A and B.
-        readers: Of their rows.
-        shared: What both have.
-    """
+    """Compares pairs of episodes of two datasets, A and B."""
 
     def __init__(
         self, sources: tuple[Source, Source], readers: tuple[ContentReader, ContentReader], shared: Shared
@@ -73,14 +67,9 @@ class EpisodeComparer:
         ]  # fmt: skip
 
     def differences(self, a: int, b: int, images_equal: Mapping[str, bool]) -> Iterator[Difference]:
-        """Between episode `a` of A and `b` of B.
+        """Between episode `a` of A and `b` of B; ExportError when something cannot be read.
 
-        Args:
-            a, b: Their numbers.
-            images_equal: Camera feature -> whether its encoded images are known to be the same.
-
-        Raises:
-            ExportError: Something cannot be read.
+        `images_equal` says of each camera feature whether its encoded images are known to be the same.
         """
         one, other = self._readers[0].columns(a), self._readers[1].columns(b)
         stored = [name for name in self._shared.cameras if name in one and name in other]

@@ -82,14 +82,10 @@ def _box_errors(path: Path) -> Iterator[None]:
 
 
 class StoredBoxes:
-    """A file of ours by episode, read in one pass for where its lines are.
+    """A file of ours by episode, read in one pass for where its lines are; ExportError when it is missing, or none.
 
     Args:
-        path: The file.
         starts: First row over the dataset of each episode.
-
-    Raises:
-        ExportError: It is missing, or no such file.
     """
 
     def __init__(self, path: Path, starts: Sequence[int]) -> None:
@@ -140,12 +136,7 @@ class StoredBoxes:
 
 
 class BoxWriter(Closing):
-    """Context manager; `finish` completes the files.
-
-    Args:
-        root: Folder of the dataset.
-        fps: Of the dataset.
-    """
+    """Context manager; `finish` completes the files in a dataset's folder."""
 
     def __init__(self, root: Path, *, fps: int) -> None:
         self._root, self._fps = root, fps

@@ -98,9 +98,6 @@ def write_card(
     """Write the card and the thumbnails of a finished dataset folder.
 
     Args:
-        root: The folder.
-        info: Of it.
-        options: Of the export.
         configs: Config digest -> configuration of the runs; none where demorec simulated no episode.
         is_transcoded: Whether any images were encoded anew.
     """
@@ -315,10 +312,7 @@ def making_commands(root: Path, configs: Mapping[str, Any], options: ExportOptio
     That is so when it was made from several runs or by several exports, from replayed or rendered episodes, or by
     another version of demorec whose configuration this one does not understand.
 
-    Args:
-        root: The finished dataset.
-        configs: Config digest -> configuration of the runs.
-        options: Of the export.
+    `configs` has config digests -> configurations of the runs.
     """
     rows = list(rows_in(root, f"{SIDECAR_DIR}/episodes", ["run_episode_index", "origin"]))
     if options.append or len(configs) != 1 or any(row["origin"] for row in rows):

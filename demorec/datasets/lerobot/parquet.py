@@ -44,9 +44,7 @@ class RollingParquet:
         num_bytes: Size of the finished files.
 
     Args:
-        root: The dataset's folder.
-        template: Of the files' paths in it.
-        schema: Of the tables.
+        template: Of the files' paths in the dataset's folder.
         info: Of the dataset: how large files and folders grow.
         repeating: Columns that are worth a dictionary; all by default.
     """

@@ -68,8 +68,6 @@ def prepare_episode(
     """Read an episode into memory, as the dataset wants it.
 
     Args:
-        episode: Of an open recording.
-        options: How.
         encode_depth: Whether depth videos, which must be encoded, are made.
         about: The rows whose images are spoken of, if language is asked for; None for all.
 

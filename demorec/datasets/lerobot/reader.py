@@ -185,11 +185,7 @@ class RowStream:
     """Some columns of the data files, episode after episode, in any order; one batch is in memory.
 
     Attributes:
-        names: Of the columns.
-
-    Args:
-        info: Of the dataset.
-        names: All that are in the data files by default.
+        names: Of the columns, by default all that are in the data files.
     """
 
     def __init__(self, info: DatasetInfo, names: Sequence[str] | None = None) -> None:

@@ -202,7 +202,6 @@ class SidecarWriter(Closing):
 
     Args:
         root: Folder of the dataset; what it holds of a sidecar already is gone on with.
-        info: Of it.
         configs: Config digest -> configuration, of the episodes that are there.
     """
 

@@ -128,11 +128,6 @@ class EpisodeVideo:
         path: The mp4 file.
         first: Number of the episode's first image in it.
         length: T.
-
-    Args:
-        info: Of the dataset.
-        key: Name of the feature.
-        place: Of the episode.
     """
 
     def __init__(self, info: DatasetInfo, key: str, place: EpisodePlace) -> None:
