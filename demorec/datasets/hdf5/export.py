@@ -61,7 +61,7 @@ def export_hdf5(
         target.parent.mkdir(parents=True, exist_ok=True)
         with written_whole(target, UNFINISHED) as part:
             with NewFile(part) as file:
-                report = _write(RobomimicWriter(file, options), found, out, progress)
+                report = _write(file, found, out, options, progress)
             check()  # something may have been put there meanwhile
     except OSError as error:
         raise ExportError(f"The file cannot be written ({error.strerror or error}): {out}") from error
@@ -69,10 +69,10 @@ def export_hdf5(
 
 
 def _write(
-    writer: RobomimicWriter, found: Sequence[Path], out: Path, progress: ProgressCallback | None
+    file: NewFile, found: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None
 ) -> ExportReport:
-    options = writer.options
-    intake = Intake(found, options)
+    intake, data = Intake(found, options), file.root.create_group("data")
+    num_frames = 0
     depth_left_out: tuple[str, ...] = ()
     for done, path in enumerate(found, start=1):
         with open_recording(path) as recording:
@@ -80,20 +80,25 @@ def _write(
                 if goes_in(recording, options):
                     episode = ExportEpisode(recording, options)
                     intake.take(path, dict(episode.traits()))
+                    _add(data.create_group(f"demo_{intake.num_taken - 1}"), episode, options.compression)
+                    if intake.num_taken == 1:
+                        data.attrs.update(_attributes(episode))
                     depth_left_out = depth_left_out or episode.depth_left_out
-                    writer.add(episode)
+                    num_frames += len(episode.rows)
+                    file.flush()
                 else:
                     intake.leave_out(recording.outcome)
         if progress is not None:
             progress(done, len(found))
     intake.check()
-    writer.finish()
+    data.attrs["total"] = num_frames
+    _add_masks(file.root, intake.num_taken, options.valid_share)
     return ExportReport(
         path=out,
-        num_episodes=writer.num_episodes,
-        num_frames=writer.num_frames,
-        new_episodes=writer.num_episodes,
-        new_frames=writer.num_frames,
+        num_episodes=intake.num_taken,
+        num_frames=num_frames,
+        new_episodes=intake.num_taken,
+        new_frames=num_frames,
         skipped_failures=intake.skipped_failures,
         skipped_unknown=intake.skipped_unknown,
         skipped_unwanted=intake.skipped_unwanted,
@@ -112,78 +117,57 @@ _ROBOSUITE = {
 """Of simulated arms: feature -> robosuite's observations, and which elements each of them has."""
 
 
-class RobomimicWriter:
-    """Adds episodes to an empty file; `finish` completes it.
+def _add(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
+    """Fill in the group of an episode: numbers at once, images one by one, compressed by that level of gzip.
 
-    Attributes:
-        options: Of the export.
-        num_episodes, num_frames: Written so far.
+    Raises:
+        ConfigError: It has no actions, two of its streams would get one name, or images are missing.
+        ExportError: It has no frames, a number that is not finite, or frames without an image.
+        RecordingError: It is damaged.
     """
+    observations, images = _observation_names(episode), _image_names(episode)
+    info, count = episode.recording.info, len(episode.rows)
+    demo.attrs["num_samples"] = count
+    demo.attrs["instruction"] = info.instruction
+    demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
+    if episode.origin:
+        demo.attrs["origin"] = episode.origin
+    if urdf := episode.urdf:
+        demo.attrs["model_file"] = urdf
+    dones = episode.scalar_columns[DONE].astype(np.int64)
+    if (success := episode.recording.success) is not None:
+        demo.attrs["success"] = success
+        demo["rewards"] = (dones * success).astype(np.float32)
+    demo["dones"] = dones
+    _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
+    if episode.info.simulation is not None:
+        _add_vectors(demo, "states", *_states(episode.columns, episode.rows, episode.info))
+    group = demo.create_group("obs")
+    for name, (feature, elements) in observations.items():
+        _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
+    for name, camera in zip(images, episode.cameras, strict=True):
+        settings = episode.recording.video_settings(camera.name)
+        shape = (settings.height, settings.width, 1 if camera.is_depth else 3)
+        stored = group.create_dataset(
+            name,
+            (count, *shape),
+            np.float32 if camera.is_depth else np.uint8,
+            chunks=(1, *shape),  # so that one image is read by itself
+            compression="gzip" if compression else None,
+            compression_opts=compression or None,
+        )
+        for index, image in enumerate(episode.images(camera)):
+            stored[index] = image.reshape(shape)
 
-    def __init__(self, file: NewFile, options: Hdf5Options) -> None:
-        self.options = options
-        self.num_episodes = 0
-        self.num_frames = 0
-        self._file = file
-        self._data = file.root.create_group("data")
 
-    def add(self, episode: ExportEpisode) -> None:
-        """Append an episode: numbers at once, images one by one.
-
-        Raises:
-            ConfigError: It has no actions, two of its streams would get one name, or images are missing.
-            ExportError: It has no frames, a number that is not finite, or frames without an image.
-            RecordingError: It is damaged.
-        """
-        demo = self._data.create_group(f"demo_{self.num_episodes}")
-        observations, images = _observation_names(episode), _image_names(episode)
-        info, count = episode.recording.info, len(episode.rows)
-        demo.attrs["num_samples"] = count
-        demo.attrs["instruction"] = info.instruction
-        demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
-        if episode.origin:
-            demo.attrs["origin"] = episode.origin
-        if urdf := episode.urdf:
-            demo.attrs["model_file"] = urdf
-        dones = episode.scalar_columns[DONE].astype(np.int64)
-        if (success := episode.recording.success) is not None:
-            demo.attrs["success"] = success
-            demo["rewards"] = (dones * success).astype(np.float32)
-        demo["dones"] = dones
-        _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
-        if episode.info.simulation is not None:
-            _add_vectors(demo, "states", *_states(episode.columns, episode.rows, episode.info))
-        group = demo.create_group("obs")
-        for name, (feature, elements) in observations.items():
-            _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
-        for name, camera in zip(images, episode.cameras, strict=True):
-            settings, level = episode.recording.video_settings(camera.name), self.options.compression
-            shape = (settings.height, settings.width, 1 if camera.is_depth else 3)
-            stored = group.create_dataset(
-                name,
-                (count, *shape),
-                np.float32 if camera.is_depth else np.uint8,
-                chunks=(1, *shape),  # so that one image is read by itself
-                compression="gzip" if level else None,
-                compression_opts=level or None,
-            )
-            for index, image in enumerate(episode.images(camera)):
-                stored[index] = image.reshape(shape)
-        if self.num_episodes == 0:
-            self._data.attrs.update(_attributes(episode))
-        self.num_episodes += 1
-        self.num_frames += count
-        self._file.flush()
-
-    def finish(self) -> None:
-        """Write what is known of all episodes together: their number of samples, and who is for validation."""
-        self._data.attrs["total"] = self.num_frames
-        share = Fraction(self.options.valid_share).limit_denominator(1_000_000)
-        numbers = range(self.num_episodes)
-        valid = [number for number in numbers if int((number + 1) * share) > int(number * share)]
-        train = [number for number in numbers if number not in set(valid)]
-        for name, chosen in (("train", train), ("valid", valid)):
-            self._file.root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
+def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
+    """Say which episodes are for training, and which for validation."""
+    share = Fraction(valid_share).limit_denominator(1_000_000)
+    numbers = range(num_episodes)
+    valid = [number for number in numbers if int((number + 1) * share) > int(number * share)]
+    train = [number for number in numbers if number not in set(valid)]
+    for name, chosen in (("train", train), ("valid", valid)):
+        root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
 
 
 def _observation_names(episode: ExportEpisode) -> dict[str, tuple[str, slice]]:
