@@ -115,7 +115,7 @@ class _Reader:
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
         tables = self.source.episode_tables if self.source.fact_types else ()
         self._facts_beside = EpisodeRows(tables, schema, rows=_EPISODES_AT_ONCE)
-        self._known = _ImageStatistics(self.source) if not decode else None
+        self._known = {} if decode else _kept_statistics(self.source)
         self._has_digests = any(source.sidecar_tables for source in plan.sources)
 
     def episode(self, cut: Cut) -> EpisodeData:
@@ -145,7 +145,7 @@ class _Reader:
                 if take.feature in _OF_THE_END and cut.last != place.length:
                     columns[name] = _with_end(columns[name], self._column(all_rows, take, feature))
             if feature.is_camera:
-                known = self._known.of(place, take.feature) if whole and self._known is not None else None
+                known = self._kept(place, take.feature) if whole else None
                 pixels[name] = known or self._counted(take.feature, cut, rows)
                 num_decoded += known is None
         self.num_decoded += num_decoded > 0
@@ -160,6 +160,13 @@ class _Reader:
             facts=self._facts(cut, place),
             row_tasks=tasks if len(set(tasks)) > 1 else (),
         )
+
+    def _kept(self, place: EpisodePlace, key: str) -> Statistics | None:
+        """The statistics that the source keeps of an episode, weighted by its frames; None where it has none."""
+        if (found := self._known.get((place.episode_index, key))) is None:
+            return None
+        values = dict(zip(_NUMBERS, found[1], strict=True))
+        return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
 
     def _counted(self, key: str, cut: Cut, rows: pa.Table) -> PixelHistogram:
         """Every pixel of a camera in a cut, whose rows have been read."""
@@ -243,27 +250,19 @@ def _clipped_stages(facts: Mapping[str, Any], head: str, cut: Cut) -> dict[str, 
                     strict=True))  # fmt: skip
 
 
-class _ImageStatistics:
-    """The statistics of images that a dataset keeps of each episode."""
-
-    def __init__(self, source: Source) -> None:
-        keys = [name for name, feature in source.info.features.items() if feature.is_camera]
-        self._found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
-        for number, key, entry in source.statistics(keys):
-            try:
-                part = Statistics.from_json(entry)
-                values = None if part is None else np.stack([part.values[name] for name in _NUMBERS])
-            except (ValueError, TypeError):
-                continue
-            if part is not None and values is not None and np.isfinite(values).all():
-                self._found[number, key] = part.count, values
-
-    def of(self, place: EpisodePlace, key: str) -> Statistics | None:
-        """Those of an episode, weighted by its frames; None where they are not kept."""
-        if (found := self._found.get((place.episode_index, key))) is None:
-            return None
-        values = dict(zip(_NUMBERS, found[1], strict=True))
-        return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
+def _kept_statistics(source: Source) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:
+    """(episode_index, camera) -> count and (9, C) numbers of the statistics that a dataset keeps of each episode."""
+    keys = [name for name, feature in source.info.features.items() if feature.is_camera]
+    found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
+    for number, key, entry in source.statistics(keys):
+        try:
+            part = Statistics.from_json(entry)
+            values = None if part is None else np.stack([part.values[name] for name in _NUMBERS])
+        except (ValueError, TypeError):
+            continue
+        if part is not None and values is not None and np.isfinite(values).all():
+            found[number, key] = part.count, values
+    return found
 
 
 def _video_histogram(video: EpisodeVideo, feature: DatasetFeature, first: int, last: int) -> PixelHistogram:

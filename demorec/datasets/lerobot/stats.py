@@ -187,21 +187,21 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature
 
 def _group_statistics(paths: Sequence[Path], widths: Mapping[str, int], times: int) -> dict[str, Statistics]:
     """Of features whose frames have that many vectors each; name -> D."""
-    moments = _Moments()
-    for arrays in _batches(paths, list(widths)):
-        if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of several lengths
-            raise ExportError("A column of the dataset holds values that are no numbers, so it has no statistics.")
-        vectors = [array.reshape(times * len(array), -1) for array in arrays]
-        moments.add(np.concatenate(vectors, axis=1, dtype=np.float64))
-    if not moments.count:
-        raise ExportError("The dataset has no rows, so it has no statistics.")
-    values = moments.values()
+
+    def vectors() -> Iterator[Array]:
+        for arrays in _batches(paths, list(widths)):
+            if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of several lengths
+                raise ExportError("A column of the dataset holds values that are no numbers, so it has no statistics.")
+            blocks = [array.reshape(times * len(array), -1) for array in arrays]
+            yield np.concatenate(blocks, axis=1, dtype=np.float64)
+
+    count, values = _moments(vectors())
     result = {}
     start = 0
     for name, width in widths.items():
         part = {key: value[start : start + width] for key, value in values.items()}
-        part |= _quantiles(paths, name, (width, moments.count))
-        result[name] = Statistics(values=part, count=moments.count // times)
+        part |= _quantiles(paths, name, (width, count))
+        result[name] = Statistics(values=part, count=count // times)
         start += width
     return result
 
@@ -233,36 +233,23 @@ def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[A
             yield [column_numbers(batch.column(name)) for name in names]
 
 
-class _Moments:
-    """Minimum, maximum, mean and standard deviation, batch by batch (Chan, Golub and LeVeque 1979)."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._mean: Array = np.zeros(0)
-        self._squares: Array = np.zeros(0)
-        self._min: Array = np.zeros(0)
-        self._max: Array = np.zeros(0)
-
-    def add(self, values: Array) -> None:
-        rows = len(values)
-        mean = values.mean(axis=0)
-        squares = ((values - mean) ** 2).sum(axis=0)
-        if self.count == 0:
-            self._mean, self._squares = mean, squares
-            self._min, self._max = values.min(axis=0), values.max(axis=0)
-        else:
-            delta = mean - self._mean
-            total = self.count + rows
-            self._squares = self._squares + squares + delta * delta * (self.count * rows / total)
-            self._mean = self._mean + delta * (rows / total)
-            self._min = np.minimum(self._min, values.min(axis=0))
-            self._max = np.maximum(self._max, values.max(axis=0))
-        self.count += rows
-
-    def values(self) -> dict[str, Array]:
-        return {
-            "min": self._min,
-            "max": self._max,
-            "mean": self._mean,
-            "std": np.sqrt(self._squares / self.count),
-        }
+def _moments(parts: Iterable[Array]) -> tuple[int, dict[str, Array]]:
+    """Rows of (T, D) numbers that come in parts; minimum, maximum, mean and standard deviation (Chan, Golub and LeVeque
+    1979).
+    """
+    count = 0
+    found: dict[str, Array] = {}
+    for values in parts:
+        rows, mean = len(values), values.mean(axis=0)
+        low, high, squares = values.min(axis=0), values.max(axis=0), ((values - mean) ** 2).sum(axis=0)
+        if count:
+            delta, total = mean - found["mean"], count + rows
+            squares = found["squares"] + squares + delta * delta * (count * rows / total)
+            mean = found["mean"] + delta * (rows / total)
+            low, high = np.minimum(found["min"], low), np.maximum(found["max"], high)
+        count += rows
+        found = {"min": low, "max": high, "mean": mean, "squares": squares}
+    if not count:
+        raise ExportError("The dataset has no rows, so it has no statistics.")
+    deviation = np.sqrt(found.pop("squares") / count)
+    return count, {**found, "std": deviation}
