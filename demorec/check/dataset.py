@@ -23,7 +23,7 @@ from demorec.check.rows import LinkMatrices
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import open_table, read_table
-from demorec.datasets.lerobot.language import COLUMNS, SpokenEpisode, spoken_of
+from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places, read_tasks
@@ -237,7 +237,7 @@ class Dataset:
         return LinkMatrices(urdf, dict(zip(info.robot.arm_joints, state.T, strict=False)), len(state))
 
     @cached_property
-    def spoken(self) -> list[SpokenEpisode]:
+    def spoken(self) -> list[EpisodeLanguage]:
         """What the language columns of each episode hold; empty for a dataset without them."""
         if not set(COLUMNS) <= set(self.info.features):
             return []

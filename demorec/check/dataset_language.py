@@ -22,7 +22,7 @@ from demorec.annotate.situation import COLOR_WORDS, Surroundings, place_of, situ
 from demorec.check.base import Found, Measurement, NotMeasured, counted, dataset_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.datasets.lerobot.boxes import BOXES_DIR, read_boxes
-from demorec.datasets.lerobot.language import SpokenEpisode
+from demorec.datasets.lerobot.language import EpisodeLanguage
 from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
 from demorec.episode.info import EpisodeInfo
 
@@ -119,12 +119,12 @@ def _wrong_colors(dataset: Dataset) -> Iterator[str]:
         yield f"colours that the thing has nowhere else ({wrong[0][:60]!r})"
 
 
-def _said(episode: SpokenEpisode, style: str) -> list[str]:
+def _said(episode: EpisodeLanguage, style: str) -> list[str]:
     """Texts of a style."""
     return [str(row.get("content")) for row in episode.persistent if row.get("style") == style]
 
 
-def _malformed(dataset: Dataset, episode: SpokenEpisode) -> Iterator[str]:
+def _malformed(dataset: Dataset, episode: EpisodeLanguage) -> Iterator[str]:
     if episode.differing:
         yield f"language_persistent is another in row {episode.differing[0]}"
     times = (np.arange(episode.num_rows) / dataset.info.fps).astype(np.float32).tolist()
@@ -223,7 +223,7 @@ def dataset_language_truth(dataset: Dataset) -> Found:
     return counted(wrong, f"{len(dataset.spoken)} episodes")
 
 
-def _wrong_phases(episode: SpokenEpisode, row: Row, fps: int) -> Iterator[str]:
+def _wrong_phases(episode: EpisodeLanguage, row: Row, fps: int) -> Iterator[str]:
     """Subtasks begin where phases do, and those that speak of a deliberate miss are those of one."""
     subtasks = [entry for entry in episode.persistent if entry.get("style") == "subtask"]
     if not subtasks:
@@ -240,7 +240,7 @@ def _wrong_phases(episode: SpokenEpisode, row: Row, fps: int) -> Iterator[str]:
             yield f"frame {first}: {entry['content'][:60]!r} {'hides' if is_miss else 'invents'} a deliberate miss"
 
 
-def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings) -> Iterator[str]:
+def _wrong_words(episode: EpisodeLanguage, row: Row, info: EpisodeInfo, start: Surroundings) -> Iterator[str]:
     """Wordings mean the things of the task; subtasks name things of a goal, by kind and colour."""
     scene = info.scene
     objects = {goal.object for goal in scene.goals}
@@ -262,7 +262,7 @@ def _wrong_words(episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Sur
 
 
 def _wrong_interjections(
-    episode: SpokenEpisode, row: Row, info: EpisodeInfo, start: Surroundings, fps: int
+    episode: EpisodeLanguage, row: Row, info: EpisodeInfo, start: Surroundings, fps: int
 ) -> Iterator[str]:
     """Interjections come where the expert listens, say what is meant and what was mistaken, and renew the plan."""
     said = {
@@ -323,7 +323,7 @@ def _boxes_of(dataset: Dataset) -> dict[str, dict[int, Boxes]]:
 
 
 def _wrong_answers(
-    episode: SpokenEpisode, first: int, start: Surroundings, boxes: dict[str, dict[int, Boxes]]
+    episode: EpisodeLanguage, first: int, start: Surroundings, boxes: dict[str, dict[int, Boxes]]
 ) -> Iterator[str]:
     """Answers that the boxes contradict; `first` is the index of the episode's first row."""
     for frame, rows in episode.events.items():

@@ -53,12 +53,15 @@ class EpisodeLanguage:
     """The language columns of one episode; entries as the columns have them, calls of tools as JSON.
 
     Attributes:
-        persistent: What stands in every row.
-        events: Row -> what stands in it alone.
+        persistent: What stands in every row; of one that was read, in the first.
+        events: Row -> what stands in it alone, of rows in which anything does.
+        num_rows, differing: Of one that was read: its rows, and in which of them `persistent` is another.
     """
 
     persistent: Sequence[dict[str, Any]] = ()
     events: Mapping[int, Sequence[dict[str, Any]]] = field(default_factory=dict)
+    num_rows: int = 0
+    differing: Sequence[int] = ()
 
 
 def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLanguage:
@@ -172,44 +175,30 @@ def _parsed(call: Any) -> Any:
         return call
 
 
-@dataclass(kw_only=True)
-class SpokenEpisode:
-    """What the language columns of one episode hold, whoever wrote them.
-
-    Attributes:
-        persistent: What stands in its first row.
-        events: Row -> what stands in it, of rows in which anything does.
-        num_rows: Of the episode.
-        differing: Rows in which `language_persistent` holds something else than in the first.
-    """
-
-    persistent: list[dict[str, Any]]
-    events: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
-    num_rows: int = 0
-    differing: list[int] = field(default_factory=list)
-
-
-def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> SpokenEpisode:
-    """The language of one episode, from its rows of both columns, in a dataset in the folder `path`.
+def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> EpisodeLanguage:
+    """The language of one episode, whoever wrote it, from its rows of both columns, in a dataset in the folder `path`.
 
     Raises:
         ExportError: They cannot be read.
     """
-    episode, first = SpokenEpisode(persistent=[]), None
+    said: list[dict[str, Any]] = []
+    events: dict[int, list[dict[str, Any]]] = {}
+    differing: list[int] = []
+    number, first = 0, None
     try:
         for batch in batches:
-            persistent, events = (batch.column(name) for name in COLUMNS)
-            if not is_language(persistent.type) or not is_language(events.type):
+            persistent, of_rows = (batch.column(name) for name in COLUMNS)
+            if not is_language(persistent.type) or not is_language(of_rows.type):
                 raise ValueError("language columns of another type")
             for row in range(len(batch)):
                 state = persistent[row].values
-                if not episode.num_rows:
-                    episode.persistent, first = persistent[row].as_py() or [], state
+                if not number:
+                    said, first = persistent[row].as_py() or [], state
                 elif (state is None) != (first is None) or (state is not None and not state.equals(first)):
-                    episode.differing.append(episode.num_rows)
-                if found := events[row].as_py():
-                    episode.events[episode.num_rows] = found
-                episode.num_rows += 1
+                    differing.append(number)
+                if found := of_rows[row].as_py():
+                    events[number] = found
+                number += 1
     except (ValueError, pa.ArrowException) as error:
         raise ExportError(f"The language of the dataset cannot be read ({describe_error(error)}): {path}") from error
-    return episode
+    return EpisodeLanguage(persistent=said, events=events, num_rows=number, differing=differing)

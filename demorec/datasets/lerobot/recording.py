@@ -16,7 +16,7 @@ from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot.boxes import BOXES_DIR, ReadBox, read_boxes
 from demorec.datasets.lerobot.episodes import LeRobotDataset
-from demorec.datasets.lerobot.language import PERSISTENT, SpokenEpisode, spoken_of
+from demorec.datasets.lerobot.language import PERSISTENT, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.episode.episode import Columns, Outcome, frame_time_ns
@@ -205,10 +205,10 @@ class DatasetRecording:
     depth = distances
 
     @cached_property
-    def spoken(self) -> SpokenEpisode:
+    def spoken(self) -> EpisodeLanguage:
         """What its language columns hold; nothing in a dataset without them."""
         stream = self.dataset.language_stream
-        return SpokenEpisode(persistent=[]) if stream is None else spoken_of(stream.batches(self.place), self.path)
+        return EpisodeLanguage() if stream is None else spoken_of(stream.batches(self.place), self.path)
 
     @cached_property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
