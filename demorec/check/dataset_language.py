@@ -316,9 +316,8 @@ def _boxes_of(dataset: Dataset) -> dict[str, dict[int, Boxes]]:
     found: dict[str, dict[int, Boxes]] = {}
     for path in sorted((dataset.path / BOXES_DIR).glob("*.json")):
         of_camera = found.setdefault(path.stem, {})
-        for item in read_boxes(path):
-            x, y, width, height = item.box
-            of_camera.setdefault(item.index, {})[item.object] = [x, y, x + width - 1, y + height - 1]
+        for index, name, (x, y, width, height) in read_boxes(path):
+            of_camera.setdefault(index, {})[name] = [x, y, x + width - 1, y + height - 1]
     return found
 
 

@@ -152,8 +152,8 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
 def _boxes(recording: DatasetRecording, camera: str) -> dict[int, list[tuple[str, Box]]]:
     """Frame -> what a camera sees there."""
     seen: dict[int, list[tuple[str, Box]]] = {}
-    for frame, item in recording.boxes(camera):
-        seen.setdefault(frame, []).append((item.object, item.box))
+    for frame, name, box in recording.boxes(camera):
+        seen.setdefault(frame, []).append((name, box))
     return seen
 
 

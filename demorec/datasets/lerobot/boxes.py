@@ -7,7 +7,6 @@ import shutil
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -42,13 +41,8 @@ def box_entry(item: SeenObject, *, width: int, height: int) -> BoxEntry:
     return item.row, item.noun, values
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadBox:
-    """One line of a file of boxes: `index` of the row in the dataset, name of the body, (x, y, width, height) px."""
-
-    index: int
-    object: str
-    box: tuple[float, float, float, float]
+ReadBox = tuple[int, str, tuple[float, float, float, float]]
+"""`index` of the row in the dataset, name of the body, (x, y, width, height) px."""
 
 
 def read_boxes(path: Path) -> Iterator[ReadBox]:
@@ -65,7 +59,7 @@ def read_boxes(path: Path) -> Iterator[ReadBox]:
             if line.startswith('{"id"'):
                 item = parse_json(line)
                 x, y, width, height = (float(number) for number in item["bbox"])
-                yield ReadBox(index=int(item["image_id"]), object=str(item["object"]), box=(x, y, width, height))
+                yield int(item["image_id"]), str(item["object"]), (x, y, width, height)
         raise ValueError("its end is missing")
 
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, facts_of
 from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
@@ -39,7 +41,7 @@ class Existing:
         tasks: In the order of their indices.
         statistics: Of the camera features.
         configs: Of the sidecar: config digest -> configuration.
-        facts: Which columns of facts its table of episodes has.
+        facts: Columns of facts that its table of episodes has -> type.
     """
 
     root: Path
@@ -47,7 +49,7 @@ class Existing:
     tasks: tuple[str, ...]
     statistics: Mapping[str, Statistics]
     configs: Mapping[str, Any]
-    facts: tuple[str, ...]
+    facts: Mapping[str, pa.DataType]
 
 
 def open_existing(root: Path) -> Existing:

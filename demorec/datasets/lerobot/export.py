@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, describe_error
 from demorec.core.processes import available_cores, in_turn
@@ -108,7 +109,7 @@ class _Export:
         self._intake.check()
         info = self._dataset_info(begun[-1])
         self._is_simulated = begun[-1].is_simulated
-        facts, there = fact_types(self._facts(begun[-1])), self._existing
+        facts, there = self._facts(begun[-1]), self._existing
         with (
             DatasetWriter(
                 self._folder, info, facts, there.tasks if there else (), there.statistics if there else {}
@@ -162,10 +163,10 @@ class _Export:
             video_files_size_in_mb=self._options.video_files_mb,
         )
 
-    def _facts(self, first: Reading) -> tuple[str, ...]:
-        """Which columns of facts the table of episodes has, or gets from the first episode."""
+    def _facts(self, first: Reading) -> Mapping[str, pa.DataType]:
+        """The columns of facts that the table of episodes has, or gets from the first episode."""
         if self._existing is None:
-            return () if first.data is None else tuple(first.data.facts)
+            return {} if first.data is None else fact_types(first.data.facts)
         has_progress = set(STAGE_COLUMNS) <= set(self._existing.facts)
         if has_progress != self._options.progress:
             raise ConfigError(

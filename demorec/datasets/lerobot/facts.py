@@ -161,23 +161,20 @@ DRAWN, CHECKED = "drawn/", "success_checks/"
 """Beginnings of the columns of numbers whose names follow from the recording."""
 
 
-def fact_type(name: str) -> pa.DataType | None:
-    """Type of a column of facts; None for every other column."""
-    return pa.float64() if name.startswith((DRAWN, CHECKED)) else _TYPES.get(name)
-
-
 def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
-    """Columns of facts -> type."""
-    return {name: kind for name in names if (kind := fact_type(name)) is not None}
+    """Of some columns those of facts -> type."""
+    known = {name: pa.float64() if name.startswith((DRAWN, CHECKED)) else _TYPES.get(name) for name in names}
+    return {name: kind for name, kind in known.items() if kind is not None}
 
 
-def facts_of(root: Path) -> tuple[str, ...]:
-    """Names of the columns of facts in the table of episodes of a dataset; ExportError when it is damaged."""
+def facts_of(root: Path) -> dict[str, pa.DataType]:
+    """Columns of facts in the table of episodes of a dataset -> type; ExportError when it is damaged."""
     tables = tables_in(root, "meta/episodes")
     if not tables:
-        return ()
+        return {}
     schema = open_table(tables[0]).schema_arrow
-    return tuple(item.name for item in schema if (kind := fact_type(item.name)) is not None and kind == item.type)
+    known = fact_types(schema.names)
+    return {item.name: item.type for item in schema if item.name in known and known[item.name] == item.type}
 
 
 def episode_facts(recording: Recording, columns: Columns) -> dict[str, Any]:

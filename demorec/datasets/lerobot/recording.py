@@ -229,12 +229,12 @@ class DatasetRecording:
                 texts[round(frame)] = text
         return tuple(sorted(texts.items()))
 
-    def boxes(self, camera: str) -> Iterator[tuple[int, ReadBox]]:
-        """(frame, box) of what a camera sees, of a dataset with boxes beside it."""
+    def boxes(self, camera: str) -> Iterator[ReadBox]:
+        """What a camera sees, with frames in place of rows, of a dataset with boxes beside it."""
         path = self.path / BOXES_DIR / f"{self.dataset.keys[camera]}.json"
-        for item in read_boxes(path) if path.exists() else ():
-            if 0 <= (frame := item.index - self.place.from_index) < self.num_frames:
-                yield frame, item
+        for index, name, box in read_boxes(path) if path.exists() else ():
+            if 0 <= (frame := index - self.place.from_index) < self.num_frames:
+                yield frame, name, box
 
 
 def with_robot(info: EpisodeInfo, robot: DatasetRobot) -> EpisodeInfo:
