@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -80,9 +80,7 @@ def _write(
                 if goes_in(recording, options):
                     episode = ExportEpisode(recording, options)
                     intake.take(path, dict(episode.traits()))
-                    _add(data.create_group(f"demo_{intake.num_taken - 1}"), episode, options.compression)
-                    if intake.num_taken == 1:
-                        data.attrs.update(_attributes(episode))
+                    _add(data, intake.num_taken - 1, episode, options.compression)
                     depth_left_out = depth_left_out or episode.depth_left_out
                     num_frames += len(episode.rows)
                     file.flush()
@@ -117,14 +115,22 @@ _ROBOSUITE = {
 """Of simulated arms: feature -> robosuite's observations, and which elements each of them has."""
 
 
-def _add(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
-    """Fill in the group of an episode: numbers at once, images one by one, compressed by that level of gzip.
+def _add(data: h5py.Group, number: int, episode: ExportEpisode, compression: int) -> None:
+    """Append an episode: numbers at once, images one by one, compressed by that level of gzip.
 
     Raises:
         ConfigError: It has no actions, two of its streams would get one name, or images are missing.
         ExportError: It has no frames, a number that is not finite, or frames without an image.
         RecordingError: It is damaged.
     """
+    demo = data.create_group(f"demo_{number}")
+    _fill(demo, episode, compression)
+    if number == 0:
+        data.attrs.update(_attributes(episode))
+
+
+def _fill(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
+    """Write the numbers and images of an episode; how long an object stays open decides where its bytes are."""
     observations, images = _observation_names(episode), _image_names(episode)
     info, count = episode.recording.info, len(episode.rows)
     demo.attrs["num_samples"] = count
@@ -147,17 +153,8 @@ def _add(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
         _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
     for name, camera in zip(images, episode.cameras, strict=True):
         settings = episode.recording.video_settings(camera.name)
-        shape = (settings.height, settings.width, 1 if camera.is_depth else 3)
-        stored = group.create_dataset(
-            name,
-            (count, *shape),
-            np.float32 if camera.is_depth else np.uint8,
-            chunks=(1, *shape),  # so that one image is read by itself
-            compression="gzip" if compression else None,
-            compression_opts=compression or None,
-        )
-        for index, image in enumerate(episode.images(camera)):
-            stored[index] = image.reshape(shape)
+        shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
+        _add_images(group, name, shape, episode.images(camera), compression)
 
 
 def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
@@ -248,3 +245,19 @@ def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], comp
     """(T, D) numbers as a dataset whose attribute `names` has those of the D components."""
     stored = group.create_dataset(name, data=values)
     stored.attrs["names"] = json.dumps(components)
+
+
+def _add_images(
+    group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
+) -> None:
+    """(T, H, W, 3) uint8 colours or (T, H, W, 1) float32 distances, each image a chunk that is read by itself."""
+    stored = group.create_dataset(
+        name,
+        shape,
+        np.uint8 if shape[-1] == 3 else np.float32,
+        chunks=(1, *shape[1:]),
+        compression="gzip" if compression else None,
+        compression_opts=compression or None,
+    )
+    for index, image in enumerate(images):
+        stored[index] = image.reshape(shape[1:])
