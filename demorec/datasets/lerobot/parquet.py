@@ -11,11 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError
 from demorec.core.files import sync_path
 from demorec.datasets.lerobot.files import plain_column
 from demorec.datasets.lerobot.layout import MEBIBYTE, DatasetInfo, FilePosition
-from demorec.datasets.lerobot.paths import INFO_PATH
 
 _ROWS_PER_TABLE = 100
 _ROWS_PER_GROUP = 4096
@@ -151,10 +149,7 @@ def vector_array(values: NDArray[Any] | pa.Array, arrow_type: pa.DataType) -> pa
     """A column of scalars (T,) or fixed-size vectors (T, D); a column that is one already keeps every bit."""
     if isinstance(values, pa.Array):
         values = plain_column(values)
-        try:
-            return values if values.type == arrow_type else values.cast(arrow_type)
-        except pa.ArrowException as error:
-            raise ExportError(f"A column of {values.type} is none of {arrow_type}, as {INFO_PATH} has it.") from error
+        return values if values.type == arrow_type else values.cast(arrow_type)
     if pa.types.is_fixed_size_list(arrow_type):
         flat = pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type.value_type)
         return pa.FixedSizeListArray.from_arrays(flat, type=arrow_type)

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing, sync_path
 from demorec.datasets.lerobot.files import tables_in
 from demorec.datasets.lerobot.language import (
@@ -170,11 +170,7 @@ class DatasetWriter(Closing):
         }
         position = self._data.make_room(frames)
         texts = language_arrays(episode.language, frames) if spoken else {}
-        arrays = [
-            texts[item.name] if item.name in spoken else vector_array(columns[item.name], item.type)
-            for item in self._schema
-        ]
-        self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
+        self._write_rows({**columns, **{name: texts[name] for name in spoken}})
         row: dict[str, Any] = {
             "episode_index": self.num_episodes,
             "tasks": list(tasks),
@@ -204,6 +200,14 @@ class DatasetWriter(Closing):
             values.update(language_digests(episode.language, frames))
         has_digest = len(digests) == len(self._cameras) and all(digests.values())
         return episode_digest(episode.task, values, digests) if has_digest else ""
+
+    def _write_rows(self, columns: Mapping[str, NDArray[Any] | pa.Array]) -> None:
+        try:
+            arrays = [vector_array(columns[item.name], item.type) for item in self._schema]
+        except pa.ArrowException as error:
+            said = f"is not as {INFO_PATH} says ({describe_error(error)})"
+            raise ExportError(f"A column of what would be episode {self.num_episodes} {said}.") from error
+        self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
 
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
         """The statistics of a camera in an episode, which those of all episodes take in."""
