@@ -120,46 +120,6 @@ def with_lead(frames: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(np.unique(np.maximum(frames[:, None] - np.arange(LEAD + 1), 0)))
 
 
-def encoded_again(
-    settings: VideoSettings,
-    drawn: Sequence[Rgb],
-    frames: NDArray[np.int64],
-    seen: Mapping[int, Rgb],
-    *,
-    tries_qualities: bool,
-) -> NDArray[np.uint8]:
-    """(N, H, W, 3) what the encoder makes of drawn frames.
-
-    Args:
-        settings: Of the encoder.
-        drawn: N images.
-        frames: (N,) which they are, those of one keyframe one after the other.
-        seen: Frame -> recorded image, also of the frames before.
-        tries_qualities: Whether the quality is found that explains the recorded images best, instead of taking the one
-            that was asked for.
-
-    Raises:
-        ConfigError: This build of FFmpeg lacks the encoder.
-    """
-    recorded = VideoConfig(
-        codec=settings.codec,  # type: ignore[arg-type]
-        gop=max(settings.gop, 1),
-        crf=settings.crf,
-        preset=settings.preset or None,
-        jpeg_quality=settings.jpeg_quality or VideoConfig.jpeg_quality,
-    )
-    images: list[Rgb] = []
-    for part in np.split(np.arange(len(frames)), np.flatnonzero(np.diff(frames) > 1) + 1):
-        first = int(frames[part[0]])
-        lead = LEAD // recorded.gop * recorded.gop  # so that the first of them is a keyframe as it was
-        before = [seen[frame] for frame in range(max(first - lead, 0), first)]
-        given = [*before, *(drawn[n] for n in part)]
-        steps = (_STEPS if before else _FAR_STEPS) if tries_qualities else _STEPS[:1]
-        true = np.stack([seen[int(frame)] for frame in frames[part]])
-        images += _most_alike(settings, recorded, given, true, steps)
-    return np.stack(images)
-
-
 def _most_alike(
     settings: VideoSettings,
     config: VideoConfig,
@@ -217,16 +177,29 @@ def compare_with_encoder(
     Raises:
         ConfigError: This build of FFmpeg lacks the encoder.
     """
+    config = VideoConfig(
+        codec=settings.codec,  # type: ignore[arg-type]
+        gop=max(settings.gop, 1),
+        crf=settings.crf,
+        preset=settings.preset or None,
+        jpeg_quality=settings.jpeg_quality or VideoConfig.jpeg_quality,
+    )
+    lead = LEAD // config.gop * config.gop  # so that the first of them is a keyframe as it was
     images, recorded = (np.stack([of[frame] for frame in frames.tolist()]) for of in (drawn, seen))
     for tries_qualities in (False, True):  # which takes long, and is seldom needed
-        expected = encoded_again(settings, list(images), frames, seen, tries_qualities=tries_qualities)
-        found = compare_full_size(recorded, expected, images, frames)
+        expected: list[Rgb] = []
+        for part in np.split(np.arange(len(frames)), np.flatnonzero(np.diff(frames) > 1) + 1):
+            first = int(frames[part[0]])
+            before = [seen[frame] for frame in range(max(first - lead, 0), first)]
+            steps = (_STEPS if before else _FAR_STEPS) if tries_qualities else _STEPS[:1]
+            expected += _most_alike(settings, config, [*before, *images[part]], recorded[part], steps)
+        found = _compared(recorded, np.stack(expected), images, frames)
         if found.is_clear:
             break
     return found
 
 
-def compare_full_size(
+def _compared(
     seen: NDArray[np.uint8], expected: NDArray[np.uint8], drawn: NDArray[np.uint8], frames: NDArray[np.int64]
 ) -> FullSize:
     """Compare images (N, H, W, 3): recorded, encoded again, and drawn."""

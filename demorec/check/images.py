@@ -48,9 +48,7 @@ def of_each_camera[Seen](
 ) -> Callable[[Callable[[CheckedEpisode, SceneCamera, Seen], Found]], _OfEpisode]:
     """A check of what is known of one camera (by `look`), as one of all cameras of a recording."""
 
-    def of_all(
-        judge: Callable[[CheckedEpisode, SceneCamera, Seen], Found],
-    ) -> Callable[[CheckedEpisode], Iterator[Found]]:
+    def of_all(judge: Callable[[CheckedEpisode, SceneCamera, Seen], Found]) -> _OfEpisode:
         @wraps(judge)
         def judge_all(episode: CheckedEpisode) -> Iterator[Found]:
             for camera in episode.cameras:
