@@ -70,6 +70,14 @@ class Film:
         return np.asarray(np.linalg.norm(np.diff(self.state / (self.state.std(axis=0) + 1e-3), axis=0), axis=1))
 
     @cached_property
+    def moves(self) -> NDArray[np.bool_]:
+        """(N - 1,) from which image to the next the robot moves, by how far its state goes; all, where that is not
+        known."""
+        if self.speed is None:
+            return np.ones(len(self.step), dtype=np.bool_)
+        return np.asarray(self.speed > MOVING * float(np.sqrt((self.speed**2).sum() / max(len(self.speed), 1))))
+
+    @cached_property
     def flat(self) -> NDArray[np.bool_]:
         """(N,) images of one colour."""
         return np.asarray(self.cells.std(axis=(1, 2)).max(axis=1, initial=0.0) < _BLANK_LEVELS)
@@ -122,6 +130,8 @@ class Film:
         return np.array(gains), float(np.quantile(np.max(stays, axis=0), 0.9))
 
 
+MOVING = 0.3
+"""Of the root mean square step of the state: more is a moving frame."""
 STANDS = 0.02
 """Share by which half of a fixed camera's parts stay what they are, but for the gain of all."""
 _DIFFERENT, _ALIKE = 0.9, 0.98

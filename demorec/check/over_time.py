@@ -34,8 +34,6 @@ _EXPLAINED, _NEVER_EXPLAINED, _STANDS_OUT = 2.8, 5.0, 2.0
 so many times the steps beside it, or at all. Wrist cameras that noise shakes at 10 frames a second show up to 3.7.
 Where it stands out so, one of 2,976 clean films at 10 to 15 frames a second shows 2.3 times as much, the others less
 than 2."""
-MOVING = 0.3
-"""Of the root mean square step of the state: more is a moving frame."""
 _REACH_S = 0.7
 """How far apart in time motions of images and state are compared, seconds."""
 _SHOWN = 0.35
@@ -63,9 +61,10 @@ Filmed = CheckedEpisode | Dataset
 film_check = partial(image_check, on=("external", "dataset"), needs=IMAGES)
 
 
-def _all(subject: Filmed) -> Iterator[Film]:
+def _all(subject: Filmed, fewest: int = 0) -> Iterator[Film]:
+    """Every film of so many images at least."""
     for films in subject.films.values():
-        yield from films
+        yield from (film for film in films if len(film.cells) >= fewest)
 
 
 @film_check(
@@ -92,20 +91,15 @@ def _alien(film: Film) -> Flags:
     least = np.minimum(film.step[:-1], film.step[1:])
     levels = _CLEAR_LEVELS if film.speed is None else _ALIEN_LEVELS
     alien[1:-1] = (least > levels) & (least > _ALIEN_TIMES * difference(film.cells[2:], film.cells[:-2]))
-    if not alien.any() or film.state is None or film.speed is None or not (moves := moving(film.speed)).any():
+    if not alien.any() or film.state is None or film.speed is None or not film.moves.any():
         return alien
     state = film.state / (film.state.std(axis=0) + 1e-3)
-    shown = float(np.quantile(film.step[moves] / film.speed[moves], 0.9))
+    shown = float(np.quantile(film.step[film.moves] / film.speed[film.moves], 0.9))
     there_and_back = np.linalg.norm(state[1:-1] - (state[2:] + state[:-2]) / 2, axis=1)
     explained = np.maximum(shown * there_and_back, 1e-9)
     beside = np.maximum(np.pad(film.step[:-2], (1, 0)), np.pad(film.step[2:], (0, 1)))
     alien[1:-1] &= least > explained * np.where(least > _STANDS_OUT * beside, _EXPLAINED, _NEVER_EXPLAINED)
     return alien
-
-
-def moving(speed: Array) -> Flags:
-    """(N - 1,) steps in which the robot moves, by how far its state goes in each."""
-    return np.asarray(speed > MOVING * float(np.sqrt((speed**2).sum() / max(len(speed), 1))))
 
 
 @film_check(
@@ -116,8 +110,8 @@ def moving(speed: Array) -> Flags:
 def image_cuts(subject: Filmed) -> Iterator[Found]:
     """What a camera sees goes on from frame to frame: catches one that is hit, light that is switched, films that were
     put together. What falls away before it takes several frames."""
-    for film in _all(subject):
-        if len(film.cells) < FEWEST_IMAGES or film.is_blank:
+    for film in _all(subject, FEWEST_IMAGES):
+        if film.is_blank:
             continue
         times = _times_beside(film)
         row = int(np.argmax(times))
@@ -150,9 +144,7 @@ def _times_beside(film: Film) -> Array:
 )
 def images_stay_upright(subject: Filmed) -> Iterator[Found]:
     """A camera's images do not turn round or change the order of their colours in the midst of an episode."""
-    for film in _all(subject):
-        if len(film.cells) < 2 * _BESIDE:
-            continue
+    for film in _all(subject, 2 * _BESIDE):
         row = int(np.argmax(film.step[_BESIDE - 1 : -_BESIDE + 1])) + _BESIDE
         before, after = (np.median(film.cells[a:b], axis=0) for a, b in ((row - _BESIDE, row), (row, row + _BESIDE)))
         as_is, *otherwise = (float(np.abs(after - view).mean()) for view in (before, *turned(before)))
@@ -229,7 +221,7 @@ def _near(table: Array) -> float:
 )
 def steady_exposure(subject: Filmed) -> Iterator[Found]:
     """What stands still before a fixed camera keeps its colours: catches drifting exposure, white balance."""
-    for film in (film for film in _all(subject) if len(film.cells) >= FEWEST_IMAGES):
+    for film in _all(subject, FEWEST_IMAGES):
         gains = film.gains
         if isinstance(gains, NotMeasured):
             yield gains
@@ -251,7 +243,7 @@ def _coarse(cells: NDArray[np.uint8]) -> NDArray[np.float32]:
 )
 def steady_sharpness(subject: Filmed) -> Iterator[Found]:
     """What stands still before a fixed camera stays as sharp: catches lost focus, drops on the lens, noise."""
-    for film in (film for film in _all(subject) if len(film.cells) >= FEWEST_IMAGES):
+    for film in _all(subject, FEWEST_IMAGES):
         if isinstance(film.gains, NotMeasured):
             yield film.gains
             continue

@@ -8,8 +8,8 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured
 from demorec.check.evidence import Flags
-from demorec.check.films import Film, difference
-from demorec.check.over_time import CHANGES, FEWEST_IMAGES, MOVING, Filmed, film_check, moving
+from demorec.check.films import MOVING, Film, difference
+from demorec.check.over_time import CHANGES, FEWEST_IMAGES, Filmed, film_check
 
 _NEARLY, _NEARLY_COUNTS, _CATCHES_UP = 0.05, 0.25, 2.0
 """Share of the usual change at a speed below which an image is nearly the same; what counts of such a time: of clean
@@ -119,16 +119,11 @@ def _repeats(films: Sequence[Film], least: float) -> tuple[list[int], int]:
         reach = min(max(round(film.fps / _SLOWEST_FPS), 1), _COPIES)
         beside = np.lib.stride_tricks.sliding_window_view(film.step, 2 * reach + 1)
         around = np.minimum(beside[:, :reach].max(axis=1), beside[:, -reach:].max(axis=1))
-        moves = np.lib.stride_tricks.sliding_window_view(_robot_moves(film), 2 * reach + 1).all(axis=1)
+        moves = np.lib.stride_tricks.sliding_window_view(film.moves, 2 * reach + 1).all(axis=1)
         changes = (around > least) & moves
         places += np.flatnonzero(changes & (film.step[reach:-reach] < _STALE * around)).tolist()
         changing += int(changes.sum())
     return places, changing
-
-
-def _robot_moves(film: Film) -> Flags:
-    """(N - 1,) from which image to the next the robot moves; all, where its state is not known."""
-    return np.ones(len(film.step), dtype=np.bool_) if film.speed is None else moving(film.speed)
 
 
 @film_check(
@@ -146,7 +141,7 @@ def interpolated_images(subject: Filmed) -> Iterator[Found]:
         nearer = []
         for film in (film for film in films if len(film.cells) >= FEWEST_IMAGES):
             off = difference(film.cells[1:-1], (film.cells[2:].astype(np.float32) + film.cells[:-2]) / 2)
-            changes = (film.step[1:] > CHANGES / 2) & _robot_moves(film)[1:]
+            changes = (film.step[1:] > CHANGES / 2) & film.moves[1:]
             sides = [off[first::2][changes[first::2]] for first in (0, 1)]
             if min(map(len, sides)) >= _FEWEST_OF_SIDE:
                 means = [float(side.mean()) for side in sides]
