@@ -43,10 +43,10 @@ def nearest_lag(
 def servo_response(commands: Array, *, start: Array, substeps: int) -> Array:
     """(T, n) where joints must be at each frame, if command t is sent after observation t.
 
-    The targets move linearly from one command to the next over `substeps` physics steps, and each step takes the
-    joint by the servo's gain towards them: what `demorec.sim` does, without forces.
+    The targets move linearly from one command to the next over `substeps` physics steps (one at least), and each step
+    takes the joint by the servo's gain towards them: what `demorec.sim` does, without forces.
     """
-    keep = 1.0 - POSITION_GAIN
+    keep, substeps = 1.0 - POSITION_GAIN, max(substeps, 1)
     powers = POSITION_GAIN * keep ** np.arange(substeps - 1, -1, -1)
     share = np.arange(1, substeps + 1) / substeps
     from_new, from_old = float((powers * share).sum()), float((powers * (1 - share)).sum())
@@ -67,11 +67,8 @@ def command_lag(episode: CheckedEpisode) -> Measurement | None:
     constant, with a parabola through the best lag and its neighbours; infinite for unrelated motions.
     """
     c, info = episode.columns, episode.info
-    expected = servo_response(
-        c.command_joint_target,
-        start=np.array(info.scene.robot.joint_position),
-        substeps=max(info.physics_hz // info.fps, 1),
-    )
+    start = np.array(info.scene.robot.joint_position)
+    expected = servo_response(c.command_joint_target, start=start, substeps=info.physics_hz // info.fps)
     if len(expected) < 4 * _MAX_LAG:
         return None
     speed = np.sqrt((np.diff(expected, axis=0) ** 2).mean(axis=0))
@@ -148,29 +145,25 @@ def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
     """
     wishes, changes = [], []
     for each in dataset.described():
-        rows, info = each.rows, each.info
-        if (kind := dataset.action_kind(info)) is None:
+        rows, info, kind = each.rows, each.info, dataset.action_kind(each.info)
+        poses, is_joint = dataset.tcp_poses(info, rows), kind in ("joint", "joint_increment")
+        if kind is None or not (is_joint or poses):
             continue
-        action, state = rows[ACTION].astype(np.float64), rows[STATE].astype(np.float64)
-        arm = len(info.robot.arm_joints)
-        is_joint = kind in ("joint", "joint_increment")
         if is_joint:
-            reached = state[:, :arm]
-        elif poses := dataset.tcp_poses(info, rows):
-            reached = next(iter(poses.values()))[:, :3]
+            reached = rows[STATE].astype(np.float64)[:, : len(info.robot.arm_joints)]
+            start = np.array(info.scene.robot.joint_position)
         else:
-            continue
-        width = reached.shape[1]
-        start = np.array(info.scene.robot.joint_position) if is_joint else reached[0]
-        substeps = max(info.physics_hz // dataset.info.fps, 1)
-        if kind in ("joint_increment", "ee_delta") and not info.behaviour.get("action_noise", 0.0):
-            action = np.concatenate([start + np.cumsum(action[:, :width], axis=0), action[:, -1:]], axis=1)
-        elif kind in ("joint_increment", "ee_delta"):
-            # The servo is linear: its response to increments is the increments of its response.
-            wishes.append(servo_response(action[:, :width], start=np.zeros(width), substeps=substeps)[1:])
-            changes.append(np.diff(reached, axis=0))
-            continue
-        expected = servo_response(action[:, :width], start=start, substeps=substeps)
+            reached = next(iter(poses.values()))[:, :3]
+            start = reached[0]
+        wish, substeps = rows[ACTION].astype(np.float64)[:, : reached.shape[1]], info.physics_hz // dataset.info.fps
+        if kind in ("joint_increment", "ee_delta"):
+            if info.behaviour.get("action_noise", 0.0):
+                # The servo is linear: its response to increments is the increments of its response.
+                wishes.append(servo_response(wish, start=np.zeros_like(start), substeps=substeps)[1:])
+                changes.append(np.diff(reached, axis=0))
+                continue
+            wish = start + np.cumsum(wish, axis=0)
+        expected = servo_response(wish, start=start, substeps=substeps)
         if (nearest := nearest_lag(expected, reached, reached, reach=3, fewest=10)) is not None:
             lag, off = nearest
             value, words = (math.inf, "unrelated") if off > 3.0 else (abs(lag), f"{lag:+d} frames")
@@ -181,15 +174,12 @@ def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
 
 def _course_lag(wishes: list[Array], changes: list[Array], *, allowed: int, window: int = 9) -> Measurement:
     """By how many frames beyond those allowed changes run behind wishes, by the correlation of smoothed courses."""
+    from scipy.ndimage import uniform_filter1d
+
     reach = 2 * allowed
-    box = np.ones(window) / window
-
-    def smooth(table: Array) -> Array:
-        return np.stack([np.convolve(column, box, mode="same") for column in table.T], axis=1)
-
     products, sizes = np.zeros(2 * reach + 1), np.zeros(2)
     for wish, change in zip(wishes, changes, strict=True):
-        x, y = smooth(wish), smooth(change)
+        x, y = (uniform_filter1d(table, window, axis=0, mode="constant") for table in (wish, change))
         core = slice(reach, len(x) - reach)
         sizes += (x[core] ** 2).sum(), (y[core] ** 2).sum()
         products += [float((x[core] * np.roll(y, -k, axis=0)[core]).sum()) for k in range(-reach, reach + 1)]

@@ -50,13 +50,10 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     for name in _numeric(dataset):
         episodes = [_vectors(dataset, name, rows[name]) for rows in dataset.rows]
         count, weights = sum(len(rows[name]) for rows in dataset.rows), [len(values) for values in episodes]
-        own = [_quantile_ranges(values) for values in episodes]
-        # (2, D) of each quantile: lowest and highest that it may be.
-        averaged = {q: np.average([ranges[q] for ranges in own], axis=0, weights=weights) for q in QUANTILES}
-        between = {
-            q: np.stack([np.min([r[q][0] for r in own], axis=0), np.max([r[q][1] for r in own], axis=0)])
-            for q in QUANTILES
-        }
+        each = [_quantile_ranges(values) for values in episodes]
+        own = {q: np.stack([ranges[q] for ranges in each]) for q in QUANTILES}  # (E, 2, D)
+        averaged = {q: np.average(ranges, axis=0, weights=weights) for q, ranges in own.items()}
+        between = {q: np.stack([ranges[:, 0].min(axis=0), ranges[:, 1].max(axis=0)]) for q, ranges in own.items()}
         merged = {} if dataset.sidecar else between
         yield _off(stats.get(name), np.concatenate(episodes), count, name, averaged, merged)
     strays = [name for name in stats if name not in dataset.info.features]
