@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import pyarrow as pa
 
 from demorec.check.base import Measurement, counted, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.core.errors import ExportError, MissingDependencyError, ResourceError, describe_error
+from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
 from demorec.core.tables import ROBOTS
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_json, read_table
@@ -31,11 +32,10 @@ from demorec.datasets.lerobot.layout import (
     DatasetFeature,
     FilePosition,
 )
-from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.robots import ELEMENT_SUFFIX
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
-from demorec.datasets.lerobot.videos import PacketReader
+from demorec.datasets.lerobot.videos import PacketReader, opened_video
 from demorec.episode.features import STATE
 
 _TYPES = {
@@ -175,20 +175,18 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
         return None
     wrong = []
     for key in dataset.info.video_keys:
-        reader = PacketReader(key)
         ends: dict[Path, int] = {}
         try:
-            for place in dataset.places:
-                path, first = place.videos[key]
-                end, ends[path] = ends.get(path, 0), first + place.length
-                for number, _ in enumerate(reader.read(place)):
-                    # Between two episodes there is nothing but what the second one is decoded from.
-                    if number == 0 and first != end and reader.keyframe != end:
-                        wrong.append(f"{key}, episode {place.episode_index}: starts at image {first}")
+            with closing(PacketReader(key)) as reader:
+                for place in dataset.places:
+                    path, first = place.videos[key]
+                    end, ends[path] = ends.get(path, 0), first + place.length
+                    for number, _ in enumerate(reader.read(place)):
+                        # Between two episodes there is nothing but what the second one is decoded from.
+                        if number == 0 and first != end and reader.keyframe != end:
+                            wrong.append(f"{key}, episode {place.episode_index}: starts at image {first}")
         except ExportError as error:
             wrong.append(str(error))
-        finally:
-            reader.close()
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
 
 
@@ -262,7 +260,11 @@ def _videos(dataset: Dataset) -> Iterator[str]:
         said |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
         said |= {"sound": info["has_audio"]} if isinstance(info.get("has_audio"), bool) else {}
         for path in dict.fromkeys(place.videos[key][0] for place in dataset.places):
-            found, rate = _stream(path)
+            with opened_video(path) as (container, stream):
+                context, rate = stream.codec_context, float(stream.average_rate or 0)
+                codec = {"libdav1d": "av1"}.get(context.name, context.name)
+                found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}
+                found["sound"] = bool(container.streams.audio)
             for quantity, value in found.items():
                 if quantity in said and said[quantity] != value:
                     yield f"{key}: {quantity} is {said[quantity]} in info.json, {value} in {path.name}"
@@ -275,23 +277,6 @@ def _videos(dataset: Dataset) -> Iterator[str]:
                 yield f"{key}: video.{quantity} is {info[f'video.{quantity}']}, the shape has {value}"
         if info.get("video.fps", dataset.info.fps) != dataset.info.fps:
             yield f"{key}: video.fps is {info['video.fps']}, the dataset has {dataset.info.fps}"
-
-
-def _stream(path: Path) -> tuple[dict[str, Any], float]:
-    """What an mp4 file says of its images, and how many a second it has."""
-    import av
-
-    check_video(path)
-    try:
-        with av.open(str(path), format="mp4") as container:
-            context = container.streams.video[0].codec_context
-            rate = container.streams.video[0].average_rate
-            codec = {"libdav1d": "av1"}.get(context.name, context.name)
-            found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}
-            found["sound"] = bool(container.streams.audio)
-    except (OSError, IndexError, av.FFmpegError) as error:
-        raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
-    return found, float(rate or 0)
 
 
 def _splits(dataset: Dataset) -> Iterator[str]:

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from demorec.check.base import NotMeasured
 from demorec.check.cells import correlation
 from demorec.check.evidence import course_of
-from demorec.core.errors import ExportError, describe_error
+from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.layout import DatasetInfo
-from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.reader import EpisodePlace
+from demorec.datasets.lerobot.videos import opened_video
 from demorec.episode.episode import NO_IMAGE, Columns
 from demorec.episode.features import STATE
 from demorec.mcap import Recording
@@ -265,23 +265,19 @@ def _decoded(path: Path, shape: tuple[int, ...]) -> Iterator[_Decoded]:
     """(rows, columns, 3) mean colours of the parts of every image, 0 to 255, and `detail_of` it; of some (2, 3) means
     of colours of 1, and of their squares, over all pixels.
     """
-    import av
     from av.video.reformatter import VideoReformatter
 
-    check_video(path)
     height, width = shape[:2]
     columns, rows = part_counts(width, height)
     reformatter, in_gray = VideoReformatter(), VideoReformatter()  # a frame's own would be set up anew for each
-    try:
-        with av.open(str(path), format="mp4") as container:
-            for stream in container.streams.video:  # a few bytes can announce images of gigabytes
-                stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
-            for number, frame in enumerate(container.decode(video=0)):
-                small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
-                cells = cast("NDArray[np.uint8]", small.to_ndarray())
-                yield cells, _detail(frame, in_gray), None if number % _EVERY else _moments(frame)
-    except (OSError, av.FFmpegError) as error:
-        raise ExportError(f"The video cannot be decoded ({describe_error(error)}): {path}") from error
+    with opened_video(path) as (container, stream):
+        stream.thread_type = "SLICE"
+        # Not what the file's own head says, which may be much more.
+        stream.codec_context.options = {"max_pixels": str((height + 128) * (width + 128))}
+        for number, frame in enumerate(container.decode(stream)):
+            small = reformatter.reformat(frame, columns, rows, "rgb24", interpolation="AREA")
+            cells = cast("NDArray[np.uint8]", small.to_ndarray())
+            yield cells, _detail(frame, in_gray), None if number % _EVERY else _moments(frame)
 
 
 def _detail(frame: av.VideoFrame, reformatter: VideoReformatter) -> float:
