@@ -113,26 +113,20 @@ def start_vector(scene: Scene) -> Array:
 
 def twins(rows: Sequence[Array], names: Sequence[str], what: str) -> Measurement:
     """How many rows are within 1e-4 (root mean square) of an earlier one, and the first such pair; `what` they are."""
+    from scipy.spatial import cKDTree
+
     count, first = 0, ""
     by_length: dict[int, list[int]] = {}
     for index, row in enumerate(rows):
-        by_length.setdefault(len(row), []).append(index)
-    for group in by_length.values():
+        if np.isfinite(row).all():
+            by_length.setdefault(len(row), []).append(index)
+    for length, group in by_length.items():
         table = np.array([rows[index] for index in group])
-        # Sorted along the widest column, only neighbours within the tolerance have to be compared.
-        axis = int(np.argmax(np.ptp(table, axis=0))) if len(table) > 1 else 0
-        order = np.argsort(table[:, axis], kind="stable")
-        reach = TWIN_DISTANCE * math.sqrt(table.shape[1]) if table.size else 0.0
-        is_twin = np.zeros(len(group), dtype=bool)
-        for place, i in enumerate(order):
-            for j in order[place + 1 :]:
-                if table[j, axis] - table[i, axis] > reach:
-                    break
-                if math.sqrt(float(((table[i] - table[j]) ** 2).mean())) <= TWIN_DISTANCE:
-                    later, earlier = max(i, j), min(i, j)
-                    is_twin[later] = True
-                    first = first or f"{names[group[later]]} is like {names[group[earlier]]}"
-        count += int(is_twin.sum())
+        tree, reach = cKDTree(table), TWIN_DISTANCE * math.sqrt(length)
+        for later, point in enumerate(table):
+            if (earlier := min(tree.query_ball_point(point, reach))) < later:
+                count += 1
+                first = first or f"{names[group[later]]} is like {names[group[earlier]]}"
     return Measurement(value=count, detail=first or f"{len(rows)} different {what}")
 
 

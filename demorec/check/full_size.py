@@ -314,13 +314,10 @@ def _ratio(sums: Array, different: Array, *, least: float) -> Array:
 
 def _error(off: Array, own: Array) -> float:
     """Of the blocks (h, w) of one image: its worst, or nine tenths of them, against the encoder's around."""
-    around = own.copy()
-    around[1:], around[:-1] = np.maximum(around[1:], own[:-1]), np.maximum(around[:-1], own[1:])
-    wide = around.copy()
-    wide[:, 1:] = np.maximum(wide[:, 1:], around[:, :-1])
-    wide[:, :-1] = np.maximum(wide[:, :-1], around[:, 1:])
+    from scipy.ndimage import maximum_filter
+
     least = max(_WORST_SHARE * float(own.max(initial=0.0)), 0.5)
-    worst = float(((off - _LEVELS) / np.maximum(wide, least)).max(initial=0.0))
+    worst = float(((off - _LEVELS) / np.maximum(maximum_filter(own, size=3, mode="nearest"), least)).max(initial=0.0))
     usual = float(np.quantile(off / np.maximum(own, 1.0), 0.9)) if off.size else 0.0
     return max(worst, usual)
 
