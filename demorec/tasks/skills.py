@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -61,34 +60,27 @@ class GaveUp(Exception):
         self.phase, self.reason = phase, reason
 
 
-@dataclass
 class Expert:
     """The arm's skills in one episode; its methods yield control steps.
 
     Attributes:
         world: After reset.
         behaviour: How fast, how high, with which errors.
+        reach: Where the hand gets to.
+        joint_target, gripper_target: What the next step commands: (n_arm,) rad, and metres.
         phase: Present phase.
         num_retries: How often something had to be tried again.
         trouble: (phase, reason) of what went wrong last.
     """
 
-    world: World
-    behaviour: Behaviour = field(default_factory=Behaviour)
-    phase: str = "start"
-    num_retries: int = 0
-    trouble: tuple[str, str] = ("", "")
-    _events: list[Event] = field(default_factory=list)
-    _free: bool = False
-    _missing: bool = False
-    _has_missed: bool = False
-    _clear_height: float = -math.inf
-
-    def __post_init__(self) -> None:
-        robot = self.world.robot
-        self.reach = Reach(self.world.scene, robot)
-        self.joint_target = self.world.arm.target.copy()
-        self.gripper_target = self.world.arm.gripper_target
+    def __init__(self, world: World, behaviour: Behaviour | None = None) -> None:
+        self.world, self.behaviour, robot = world, behaviour or Behaviour(), world.robot
+        self.reach = Reach(world.scene, robot)
+        self.joint_target, self.gripper_target = world.arm.target.copy(), world.arm.gripper_target
+        self.phase, self.num_retries, self.trouble = "start", 0, ("", "")
+        self._events: list[Event] = []
+        self._free, self._clear_height = False, -math.inf
+        self._missing = self._has_missed = False
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
         # Recordings of arms of six joints and more are made again byte for byte: what was learnt later is not for them.
         self._keeps_bytes = self.reach.arm.freedom == WHOLE_POSE
