@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -40,72 +39,51 @@ FIVE_JOINTS = Freedom(cone=math.radians(15.0), roll=math.radians(2.0))
 """What an arm of fewer than six joints needs where nothing else is said: it cannot tilt its hand to every side."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class ArmKinematics:
-    """A serial chain of n revolute joints from the base to the tool centre point.
+    """A serial chain of n revolute joints from the base of a URDF to the tool centre point.
+
+    Fixed joints are merged, every other joint on the way must be one of `arm_joints`.
+
+    Args:
+        urdf: Whose arm it is.
+        arm_joints: Names of its joints, base to flange.
+        tcp_link: Link whose frame is the tool centre point.
+        lower, upper: (n,) position limits that the inverse kinematics keeps, rad.
 
     Attributes:
+        num_joints: n.
         origins: (n, 3) position of each joint in the frame of the one before, metres.
-        rotations: (n, 3, 3) its rotation there.
-        axes: (n, 3) unit axes in the joint frames.
-        tool: (3,) TCP in the last joint's frame, metres.
-        tool_rotation: (3, 3).
-        lower, upper: (n,) position limits that the inverse kinematics keeps, rad.
+        lower, upper: As given.
         freedom: What poses leave open unless a caller says otherwise.
+        tables: What the compiled loops know of the arm: `origins`, (n, 3, 3) the joints' rotations there, (n, 3) their
+            unit axes, (3,) the TCP in the last joint's frame, metres, (3, 3) its rotation there, and the limits.
+
+    Raises:
+        ValueError: The joints on the way to `tcp_link` are not `arm_joints`, or one does not turn.
     """
 
-    origins: Array
-    rotations: Array
-    axes: Array
-    tool: Array
-    tool_rotation: Array
-    lower: Array
-    upper: Array
-    freedom: Freedom = WHOLE_POSE
-
-    @classmethod
-    def from_urdf(
-        cls,
-        urdf: Urdf,
-        *,
-        arm_joints: Sequence[str],
-        tcp_link: str,
-        lower: Sequence[float],
-        upper: Sequence[float],
-    ) -> ArmKinematics:
-        """From a URDF: fixed joints are merged, every other joint on the way must be one of `arm_joints`.
-
-        Raises:
-            ValueError: The joints on the way to `tcp_link` are not `arm_joints`, or one does not turn.
-        """
+    def __init__(
+        self, urdf: Urdf, *, arm_joints: Sequence[str], tcp_link: str, lower: Sequence[float], upper: Sequence[float]
+    ) -> None:
         joints = urdf.path_to(tcp_link)
         moving = [joint for joint in joints if joint.kind != "fixed"]
         if [joint.name for joint in moving] != list(arm_joints) or any(j.kind == "prismatic" for j in moving):
             found = [f"{joint.name} ({joint.kind})" for joint in moving]
             raise ValueError(f"the way to {tcp_link} has the joints {found}, expected turning {list(arm_joints)}")
-        origins, axes = [], []
-        pending = Pose()
+        origins, tool = [], Pose()
         for joint in joints:
-            pending = pending @ joint.parent_from_joint
+            tool = tool @ joint.parent_from_joint
             if joint.kind != "fixed":
-                origins.append(pending)
-                axes.append(joint.axis)
-                pending = Pose()
-        return cls(
-            origins=np.array([pose.position for pose in origins]),
-            rotations=np.array([pose.rotation for pose in origins]),
-            axes=np.array(axes),
-            tool=np.array(pending.position),
-            tool_rotation=pending.rotation,
-            lower=np.array(lower, dtype=np.float64),
-            upper=np.array(upper, dtype=np.float64),
-            freedom=WHOLE_POSE if len(origins) >= 6 else FIVE_JOINTS,
-        )
-
-    @property
-    def num_joints(self) -> int:
-        """n."""
-        return len(self.origins)
+                origins.append(tool)
+                tool = Pose()
+        self.num_joints = len(origins)
+        self.lower, self.upper = (np.array(limit, dtype=np.float64) for limit in (lower, upper))
+        self.freedom = WHOLE_POSE if len(origins) >= 6 else FIVE_JOINTS
+        self.origins = np.array([pose.position for pose in origins])
+        rotations = np.array([pose.rotation for pose in origins])
+        axes = np.array([joint.axis for joint in moving])
+        self._upwards = float(rotations[0][2] @ axes[0])
+        self.tables = (self.origins, rotations, axes, np.array(tool.position), tool.rotation, self.lower, self.upper)
 
     def turned_towards(self, joint_position: Array, point: Array) -> Array:
         """A configuration (n,) of an arm that stands upright, its first joint turned so that the hand is at the azimuth
@@ -114,8 +92,7 @@ class ArmKinematics:
         hand = self.forward(joint_position).position
         turn = wrap_angle(math.atan2(point[1] - y, point[0] - x) - math.atan2(hand[1] - y, hand[0] - x))
         turned = np.array(joint_position)
-        upwards = float(self.rotations[0][2] @ self.axes[0])
-        turned[0] += math.copysign(turn, upwards * turn)
+        turned[0] += math.copysign(turn, self._upwards * turn)
         return turned
 
     def forward(self, joint_position: Array) -> Pose:
@@ -234,8 +211,3 @@ class ArmKinematics:
             self.tables,
         )
         return cast(Array, path) if reached else None
-
-    @cached_property
-    def tables(self) -> tuple[Array, ...]:
-        """What the compiled loops know of the arm."""
-        return (self.origins, self.rotations, self.axes, self.tool, self.tool_rotation, self.lower, self.upper)

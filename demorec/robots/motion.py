@@ -18,6 +18,10 @@ from demorec.robots.kinematics import WHOLE_POSE, ArmKinematics
 PEAK_VELOCITY = 1.875
 PEAK_ACCELERATION = 5.774
 
+LINEAR_ACCELERATION, ANGULAR_VELOCITY, ANGULAR_ACCELERATION = 1.5, 1.5, 6.0
+"""Of the TCP at most, m/s^2, rad/s, rad/s^2."""
+MIN_SECONDS = 0.2
+"""Of the shortest motion."""
 _ROUNDS, _ROUNDS_WITH_FREEDOM = 5, 20
 """How often a motion is slowed down at most. Where a joint of an arm of few joints meets its limit, the others take
 over from one step to the next, and at half the speed the acceleration of such a kink is half, not a quarter."""
@@ -27,21 +31,10 @@ _LONGEST_S = 60.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionLimits:
-    """What a motion keeps to.
-
-    Attributes:
-        joint_velocity, joint_acceleration: (n,) rad/s, rad/s^2, already reduced by a margin.
-        linear_acceleration: Of the TCP, m/s^2.
-        angular_velocity, angular_acceleration: Of the TCP, rad/s, rad/s^2.
-        min_seconds: Shortest motion.
-    """
+    """What the joints keep to in a motion: (n,) rad/s, rad/s^2, already reduced by a margin."""
 
     joint_velocity: Array
     joint_acceleration: Array
-    linear_acceleration: float = 1.5
-    angular_velocity: float = 1.5
-    angular_acceleration: float = 6.0
-    min_seconds: float = 0.2
 
 
 def quintic(u: Array) -> Array:
@@ -70,7 +63,7 @@ def plan_straight(
         rest: (n,) configuration towards which the goal configuration is pulled in the null space.
         speed: Peak speed of the TCP, m/s.
         turn_speed: Factor on the angular velocity limit.
-        limits: Joint and TCP limits.
+        limits: Joint limits.
         dt: Control step, s.
     """
     goal_q = arm.find(goal, start=start, rest=rest)
@@ -81,11 +74,11 @@ def plan_straight(
     distance = math.sqrt(float((delta * delta).sum()))
     angle = angle_between(base_from_start, goal)
     seconds = max(
-        limits.min_seconds,
+        MIN_SECONDS,
         PEAK_VELOCITY * distance / speed,
-        math.sqrt(PEAK_ACCELERATION * distance / limits.linear_acceleration),
-        PEAK_VELOCITY * angle / (limits.angular_velocity * turn_speed),
-        math.sqrt(PEAK_ACCELERATION * angle / limits.angular_acceleration),
+        math.sqrt(PEAK_ACCELERATION * distance / LINEAR_ACCELERATION),
+        PEAK_VELOCITY * angle / (ANGULAR_VELOCITY * turn_speed),
+        math.sqrt(PEAK_ACCELERATION * angle / ANGULAR_ACCELERATION),
     )
     longest = max(_LONGEST_S, 2 * seconds)
     for _ in range(_ROUNDS if arm.freedom == WHOLE_POSE else _ROUNDS_WITH_FREEDOM):
@@ -117,7 +110,7 @@ def plan_joints(*, start: Array, goal: Array, speed: float, limits: MotionLimits
         limits: Joint limits.
         dt: Control step, s.
     """
-    seconds = PEAK_VELOCITY * max(float(np.abs(goal - start).max()) / speed, limits.min_seconds)
+    seconds = PEAK_VELOCITY * max(float(np.abs(goal - start).max()) / speed, MIN_SECONDS)
     while True:
         steps = max(1, math.ceil(seconds / dt))
         path = start + quintic(np.arange(1, steps + 1) / steps)[:, np.newaxis] * (goal - start)

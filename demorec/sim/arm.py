@@ -173,7 +173,7 @@ class Arm:
 
 def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
     """Kinematics of a robot from its URDF."""
-    return ArmKinematics.from_urdf(
+    return ArmKinematics(
         Urdf.load(asset_path(spec.urdf), scale=scale),
         arm_joints=spec.arm_joints,
         tcp_link=spec.tcp_link,

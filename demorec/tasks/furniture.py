@@ -56,14 +56,14 @@ def table_and_floor() -> tuple[Body, Body]:
     return floor(-TABLE_HEIGHT), table
 
 
-def walls() -> tuple[Body, Body, Body]:
+def walls() -> tuple[Body, ...]:
     """Behind the table and at both sides, out of the arm's reach, only seen; named "wall..."."""
     places = {
         "wall_back": (-1.3, 0.0, 0.0),
         "wall_left": (0.7, 1.5, -math.pi / 2),
         "wall_right": (0.7, -1.5, math.pi / 2),
     }
-    back, left, right = (
+    return tuple(
         Body(
             name=name,
             role="fixture",
@@ -74,7 +74,6 @@ def walls() -> tuple[Body, Body, Body]:
         )
         for name, (x, y, yaw) in places.items()
     )
-    return back, left, right
 
 
 def mark(name: str, point: tuple[float, float], yaw: float, *, side: float, color_name: str) -> Body:

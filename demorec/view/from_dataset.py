@@ -161,7 +161,7 @@ def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> A
     """(T, 7) from the joints, of a dataset that leaves observation.ee_pose out."""
     spec = info.robot
     urdf = Urdf.load(asset_path(spec.urdf), scale=info.scene.robot.scale) if robot is None else robot.model
-    arm = ArmKinematics.from_urdf(
+    arm = ArmKinematics(
         urdf,
         arm_joints=spec.arm_joints,
         tcp_link=spec.tcp_link,

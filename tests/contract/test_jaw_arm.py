@@ -36,7 +36,7 @@ from demorec.testing import RobotContract, run_expert
 FOLDER = Path(__file__).parents[1] / "support" / "jaw_arm"
 assert isinstance(JAW_ARM.gripper, JawGripper)
 JAW, HOME = JAW_ARM.gripper, np.array(JAW_ARM.home_q)
-ARM = ArmKinematics.from_urdf(
+ARM = ArmKinematics(
     Urdf.load(FOLDER / "jaw_arm.urdf"),
     arm_joints=JAW_ARM.arm_joints,
     tcp_link="tcp",

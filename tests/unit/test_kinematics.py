@@ -149,7 +149,7 @@ def test_a_straight_path_is_straight_and_turns_evenly(robot: SimulatedRobot) -> 
 def test_a_chain_with_other_joints_is_refused() -> None:
     spec = ROBOTS.load("panda")
     with pytest.raises(ValueError, match="panda_joint7"):
-        ArmKinematics.from_urdf(
+        ArmKinematics(
             Urdf.load(asset_path(spec.urdf)),
             arm_joints=spec.arm_joints[:6],
             tcp_link=spec.tcp_link,
