@@ -46,7 +46,7 @@ STATE_KINDS: tuple[StateKind, ...] = get_args(StateKind)
 NOISE_DECAY = 0.3
 """Share of the exploration noise on the executed commands that goes away within 1/30 s, when none is added.
 
-Known to both sides: `demorec.loop.agents.ActionNoise` makes the noise so, and the increments below contain this return.
+Known to both sides: `demorec.loop.session.ActionNoise` makes the noise so, and increments below contain this return.
 """
 
 NEAR = 0.02

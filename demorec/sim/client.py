@@ -48,15 +48,12 @@ class BulletClient:
 
     It is freed by `disconnect`, else when nothing refers to it any more, at the latest before the interpreter ends
     (`pybullet_utils` has a client that is freed so late that PyBullet is gone, and that binds at every call).
-
-    Args:
-        connection_mode: `pybullet.DIRECT`: without a window.
     """
 
-    def __init__(self, connection_mode: int) -> None:
+    def __init__(self) -> None:
         import pybullet
 
-        self._number: int = pybullet.connect(connection_mode)
+        self._number: int = pybullet.connect(pybullet.DIRECT)
         self._free = weakref.finalize(self, pybullet.disconnect, physicsClientId=self._number)
 
     def __getattr__(self, name: str) -> Any:
@@ -79,6 +76,4 @@ class BulletClient:
 def connect() -> BulletClient:
     """A new client without a window."""
     with silence():
-        import pybullet
-
-        return BulletClient(pybullet.DIRECT)
+        return BulletClient()

@@ -19,7 +19,7 @@ from demorec.gym_env import SUCCESS_FRAMES, DemorecEnv
 from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.policy import Policy
 from demorec.learn.evaluate.watch import Watch, correcting_behaviour
-from demorec.loop.agents import ActionNoise
+from demorec.loop.session import ActionNoise
 from demorec.mcap import open_recording
 from demorec.sim.world import World
 from demorec.tasks.recovery import TAKE_OVER
