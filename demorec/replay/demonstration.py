@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,7 @@ from demorec.robots.robot import RobotSpec
 if TYPE_CHECKING:
     from demorec.check.evidence import Motion
 
-_EE_POSE = "the EE pose"
+JOINTS, OPENING, EE_POSE, POSE_OF = "joint positions", "gripper opening", "the EE pose", "the pose of "
 _LEAST_HZ = Physics.hz
 """Of the physics of a real arm's replay, which takes whole steps between frames."""
 
@@ -88,10 +88,8 @@ class Demonstration:
         commands: What to send, one a step; of a recording.
         actions: (T, D) what to send is decoded from these; of a dataset.
         action_kind: What `actions` mean; None where `commands` tell.
-        joint_position: (T, n) recorded before each command; n = n_joints, or n_arm of a dataset.
-        gripper_width: (T,) m.
-        object_poses: name -> (T, 7); empty for a dataset.
-        sensed: Words for what else is compared, "joint efforts" -> (T, D) recorded.
+        compared: Words for what is compared, as of `seen_in` -> (T, D) recorded before each command; of a dataset the
+            arm's joints and the opening alone.
         recorded_success: Whether the episode succeeded when it was recorded; None if that is not known.
         final_state_digest: Of the recording, or "".
         tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.
@@ -106,10 +104,7 @@ class Demonstration:
     name: str
     info: EpisodeInfo
     fps: int
-    joint_position: Array
-    gripper_width: Array
-    object_poses: Mapping[str, Array]
-    sensed: Mapping[str, Array] = field(default_factory=dict)
+    compared: Mapping[str, Array]
     recorded_success: bool | None
     commands: tuple[Action, ...] = ()
     actions: Array | None = None
@@ -126,7 +121,12 @@ class Demonstration:
     @property
     def num_steps(self) -> int:
         """T."""
-        return len(self.joint_position)
+        return len(self.compared[JOINTS])
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of those whose poses are recorded."""
+        return tuple(name.removeprefix(POSE_OF) for name in self.compared if name.startswith(POSE_OF))
 
 
 def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstration:
@@ -148,18 +148,15 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
     # As the export does: where the arm shall be when the next observation is taken.
     sent = np.minimum(rows + stride - 1, columns.num_frames - 1)
     outcome = recording.outcome
-    sensed = [sensed_of(observation_at(columns, int(row))) for row in rows]
-    # Without physics only what follows from the states.
-    compared = [name for name in sensed[0] if name == _EE_POSE or not options.states]
+    seen = [seen_in(observation_at(columns, int(row))) for row in rows]
+    # Without physics only the states that a world can be put in, and what follows from them.
+    compared = [n for n in seen[0] if not options.states or n in (JOINTS, OPENING, EE_POSE) or n.startswith(POSE_OF)]
     return Demonstration(
         name=recording.path.name,
         info=info,
         fps=fps,
         commands=tuple(action_at(columns, int(row), "command") for row in sent),
-        joint_position=columns.joint_position[rows],
-        gripper_width=columns.gripper_width[rows],
-        object_poses={name: poses[rows] for name, poses in columns.object_poses.items()},
-        sensed={name: np.array([values[name] for values in sensed]) for name in compared},
+        compared={name: np.array([values[name] for values in seen]) for name in compared},
         recorded_success=None if outcome is None else outcome.success,
         final_state_digest="" if outcome is None or stride > 1 else outcome.final_state_digest,
         # Placing a body normalises its quaternion once more.
@@ -171,14 +168,17 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
     )
 
 
-def sensed_of(observation: Observation) -> dict[str, Array]:
-    """Words -> (D,) of what is sensed beside the states that a world can be put in."""
+def seen_in(observation: Observation) -> dict[str, Array]:
+    """All that is sensed, in words -> (D,)."""
     return {
+        JOINTS: observation.joint_position,
+        OPENING: np.array([observation.gripper_width]),
         "joint velocities": observation.joint_velocity,
         "joint efforts": observation.joint_effort,
         "the contact force": np.array([observation.contact_force]),
-        _EE_POSE: observation.base_from_tcp.vector(),
+        EE_POSE: observation.base_from_tcp.vector(),
         **{f"the {name}": values for name, values in observation.sensed.items()},
+        **{f"{POSE_OF}{name}": pose.vector() for name, pose in observation.object_poses.items()},
     }
 
 
@@ -243,9 +243,7 @@ def dataset_demonstrations(
             fps=dataset.info.fps,
             actions=rows[ACTION].astype(np.float64),
             action_kind=kind,
-            joint_position=state[:, :arm],
-            gripper_width=state[:, arm],
-            object_poses={},
+            compared={JOINTS: state[:, :arm], OPENING: state[:, arm : arm + 1]},
             recorded_success=bool(row["success"]),
             tolerance=1e-6,
             digest=str(row["content_digest"]),
@@ -309,9 +307,7 @@ def demonstration_of(
         fps=fps,
         actions=action,
         action_kind="joint",
-        joint_position=state[:, :count],
-        gripper_width=state[:, count],
-        object_poses={},
+        compared={JOINTS: state[:, :count], OPENING: state[:, count:]},
         recorded_success=None,
         is_measured=True,
         digest=hashlib.sha256(state.tobytes() + action.tobytes()).hexdigest(),

@@ -22,7 +22,7 @@ from demorec.loop.actions import ActionDecoder
 from demorec.mcap import EpisodeWriter
 from demorec.mcap.frames import pose_of
 from demorec.render.painter import Painter
-from demorec.replay.demonstration import Demonstration, ReplayOptions, sensed_of
+from demorec.replay.demonstration import JOINTS, OPENING, POSE_OF, Demonstration, ReplayOptions, seen_in
 from demorec.replay.rerender import config_as, recorded_view, view_behaviour, view_painter
 from demorec.robots.assets import allow_models
 from demorec.sim.world import World
@@ -183,8 +183,8 @@ def _placed(session: Session, d: Demonstration) -> Iterator[Frame]:
     for step, recorded in zip(range(d.num_steps), chain(d.recorded, repeat(None)), strict=False):
         session.place(
             step,
-            joint_position=d.joint_position[step],
-            object_poses={name: pose_of(poses[step]) for name, poses in d.object_poses.items()},
+            joint_position=d.compared[JOINTS][step],
+            object_poses={name: pose_of(d.compared[f"{POSE_OF}{name}"][step]) for name in d.objects},
         )
         command = session.world.hold() if recorded is None else recorded.command
         yield session.frame(_step(command, recorded))
@@ -215,8 +215,8 @@ def _report(
         first = d.num_steps, "the final state"
     elif is_judged and d.final_state_digest and outcome.checks != d.recorded_checks:
         first = d.num_steps, _other_condition(outcome.checks, d.recorded_checks)
-    arm = np.abs(off["joint positions"][:, : len(d.info.robot.arm_joints)]).max(axis=1)
-    distances = np.array([np.linalg.norm(off[f"the pose of {name}"][:, :3], axis=1) for name in d.object_poses])
+    arm = np.abs(off[JOINTS][:, : len(d.info.robot.arm_joints)]).max(axis=1)
+    distances = np.array([np.linalg.norm(off[f"{POSE_OF}{name}"][:, :3], axis=1) for name in d.objects])
     number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
     distance = float(distances[number, step]) if len(distances) else 0.0
     checks = outcome.checks if is_judged else ()
@@ -225,17 +225,17 @@ def _report(
     return ReplayReport(
         name=d.name,
         num_steps=len(seen),
-        is_bitwise=bool(d.sensed),
+        is_bitwise=d.action_kind is None,
         compared=tuple(off),
         is_identical=first is None,
         first_difference=first,
         joint_error=float(arm.max()),
         joint_error_step=int(arm.argmax()),
-        gripper_error=float(np.abs(off["gripper opening"]).max()),
+        gripper_error=float(np.abs(off[OPENING]).max()),
         object_error=distance,
         object_error_step=step,
-        object_error_name="" if distance == 0.0 else list(d.object_poses)[number],
-        compares_objects=bool(d.object_poses),
+        object_error_name="" if distance == 0.0 else d.objects[number],
+        compares_objects=bool(d.objects),
         recorded_success=d.recorded_success,
         success=success,
         is_outcome_as_recorded=None in (success, d.recorded_success)
@@ -249,7 +249,7 @@ def _report(
 
 def _tracking(d: Demonstration, off: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
     """As of the report."""
-    columns = np.abs(np.column_stack([off["joint positions"], off["gripper opening"]])).T
+    columns = np.abs(np.column_stack([off[JOINTS], off[OPENING]])).T
     names = (*d.info.robot.arm_joints, "gripper")
     return {name: (float(np.median(column)), float(column.max())) for name, column in zip(names, columns, strict=True)}
 
@@ -262,16 +262,11 @@ def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessChec
 
 def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Array]:
     """What was compared -> (T, D), what is seen now minus what was recorded."""
-    num_steps, width = len(seen), d.joint_position.shape[1]
-    off = {
-        "joint positions": np.array([now.joint_position[:width] for now in seen]) - d.joint_position[:num_steps],
-        "gripper opening": (np.array([now.gripper_width for now in seen]) - d.gripper_width[:num_steps])[:, None],
+    now = [seen_in(observation) for observation in seen]
+    return {
+        name: np.array([values[name][: recorded.shape[1]] for values in now]) - recorded[: len(seen)]
+        for name, recorded in d.compared.items()
     }
-    for name, recorded in d.sensed.items():
-        off[name] = np.array([sensed_of(now)[name] for now in seen]) - recorded[:num_steps]
-    for name, poses in d.object_poses.items():
-        off[f"the pose of {name}"] = np.array([now.object_poses[name].vector() for now in seen]) - poses[:num_steps]
-    return off
 
 
 def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: bool = True) -> bool:
