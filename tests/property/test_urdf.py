@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.robots.urdf import Urdf
+from demorec.robots.urdf import Urdf, read_links
 
 links = st.integers(0, 6).map("link{}".format)
 
@@ -62,3 +62,16 @@ def test_every_tree_is_read(choices: list[int], random: object) -> None:
 def test_joints_that_are_no_tree_are_named(pairs: list[tuple[str, str]]) -> None:
     with pytest.raises(ValueError, match=r"one tree.*joint"):
         Urdf.parse(urdf_text(pairs))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("no xml", "no XML"),
+        ('<robot><link name="a"><visual><geometry><box/></geometry></visual></link></robot>', "size"),
+        ('<robot><link name="a"><visual><geometry><box size="1 x 1"/></geometry></visual></link></robot>', "x"),
+    ],
+)
+def test_links_that_cannot_be_read_are_named(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        read_links(text)
