@@ -29,7 +29,7 @@ from demorec.tasks.base import Task
 from demorec.tasks.interjection import Interjection, draw_interjection
 from demorec.tasks.sampling import Sampler, stratified_point
 from demorec.tasks.script import Behaviour
-from demorec.tasks.vary import calibration_errors, draw_behaviour, vary_cameras, vary_looks, vary_physics
+from demorec.tasks.vary import calibration_errors, draw_behaviour, moved_camera, vary_cameras, vary_looks, vary_physics
 
 EVAL_SEED_OFFSET = 2**63
 MAX_LAYOUTS = 10
@@ -113,7 +113,7 @@ def prepare(plan: EpisodePlan) -> Episode:
     camera_rng = _rng(plan, "cameras")
     cameras = vary_cameras(tuple(_cameras(task, robot, config)), ranges, camera_rng)
     errors = calibration_errors(cameras, ranges, camera_rng)
-    scene = replace(scene, cameras=tuple(_miscalibrated(camera, errors[camera.name]) for camera in cameras))
+    scene = replace(scene, cameras=tuple(moved_camera(camera, errors[camera.name]) for camera in cameras))
     info = EpisodeInfo(
         episode_index=plan.episode_index,
         attempt=plan.attempt,
@@ -195,12 +195,6 @@ def _sampler(plan: EpisodePlan, ranges: Ranges, task: Task) -> Sampler:
         shelves=[load_shelf(name, config.modules) for name in config.objects or task.shelves],
         object_split=config.object_split,
     )
-
-
-def _miscalibrated(camera: SceneCamera, true_from_recorded: Pose) -> SceneCamera:
-    if true_from_recorded == Pose():
-        return camera
-    return replace(camera, mount_from_camera=camera.mount_from_camera @ true_from_recorded)
 
 
 def make_world(info: EpisodeInfo) -> World:

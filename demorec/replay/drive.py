@@ -140,7 +140,9 @@ class DemonstrationAgent:
                 self._num_held += 1
                 command = replace(world.hold(), gripper_target=command.gripper_target)
             if options.noise > 0.0:
-                command = _noisy(command, world, rng.normal(0.0, options.noise, len(command.joint_target)))
+                low, high = world.arm.kinematics.lower, world.arm.kinematics.upper
+                target = command.joint_target + rng.normal(0.0, options.noise, len(command.joint_target))
+                command = world.arm.action(np.clip(target, low, high), command.gripper_target)
             yield command
 
     def _commands(self, world: World) -> Iterable[Action]:
@@ -164,16 +166,6 @@ def _step(command: Action, recorded: Frame | None) -> Step:
         phase=recorded.phase,
         events=recorded.events,
         is_deliberate_miss=recorded.is_deliberate_miss,
-    )
-
-
-def _noisy(command: Action, world: World, noise: Array) -> Action:
-    low, high = np.array(world.robot.position_lower), np.array(world.robot.position_upper)
-    target = np.clip(command.joint_target + noise, low, high)
-    return Action(
-        joint_target=target,
-        gripper_target=command.gripper_target,
-        base_from_tcp_target=world.arm.kinematics.forward(target),
     )
 
 

@@ -193,9 +193,13 @@ def vary_cameras(cameras: tuple[SceneCamera, ...], ranges: Ranges, rng: np.rando
     for camera in cameras:
         nudge = small_pose(rng, position=ranges.number("camera_position"), rotation=ranges.number("camera_rotation"))
         zoom = 1.0 + ranges.number("camera_fov") * float(rng.uniform(-1.0, 1.0))
-        pose = camera.mount_from_camera if nudge == Pose() else camera.mount_from_camera @ nudge
-        nudged.append(replace(camera, mount_from_camera=pose, fov_y=camera.fov_y * zoom))
+        nudged.append(replace(moved_camera(camera, nudge), fov_y=camera.fov_y * zoom))
     return tuple(nudged)
+
+
+def moved_camera(camera: SceneCamera, by: Pose) -> SceneCamera:
+    """A camera moved along and about its own axes; to the bit the same one where it is not moved."""
+    return camera if by == Pose() else replace(camera, mount_from_camera=camera.mount_from_camera @ by)
 
 
 def calibration_errors(cameras: tuple[SceneCamera, ...], ranges: Ranges, rng: np.random.Generator) -> dict[str, Pose]:
