@@ -38,6 +38,35 @@ def covered(low, high, count):
 
 
 @inlined
+def edge_function(a, b, x, y):
+    """What an edge function gains from one sample to the next, along a row and down, and what it is at (x, y).
+
+    It is below zero outside, and on an edge that belongs to the neighbour.
+    """
+    step_x = a[1] - b[1]
+    step_y = b[0] - a[0]
+    value = step_x * (x - a[0]) + step_y * (y - a[1])
+    if not (step_x > 0.0 or (step_x == 0.0 and step_y > 0.0)):
+        value -= 1.0
+    return step_x * 256.0, step_y * 256.0, value
+
+
+@inlined
+def within_edge(step_x, value, low, high):
+    """The part of a span of samples for which an edge function is not below zero.
+
+    Quotients of exact whole numbers round to the right side.
+    """
+    if step_x > 0.0:
+        low = max(low, -value / step_x)
+    elif step_x < 0.0:
+        high = min(high, -value / step_x)
+    elif value < 0.0:
+        high = -1.0
+    return low, high
+
+
+@inlined
 def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record, with_ids, left, right):
     """Draw one triangle of positive area where its value is greater than what is there.
 
@@ -65,32 +94,14 @@ def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record,
     d2 = v2 - v0
     step_x = (d1 * (y2 - y0) - d2 * (y1 - y0)) * inverse_area
     step_y = (d2 * (x1 - x0) - d1 * (x2 - x0)) * inverse_area
-    a0 = y0 - y1
-    b0 = x1 - x0
-    a1 = y1 - y2
-    b1 = x2 - x1
-    a2 = y2 - y0
-    b2 = x0 - x2
     x = x_first * 256.0 + 128.0
     y = y_first * 256.0 + 128.0
-    e0 = a0 * (x - x0) + b0 * (y - y0)
-    e1 = a1 * (x - x1) + b1 * (y - y1)
-    e2 = a2 * (x - x2) + b2 * (y - y2)
-    if not (a0 > 0.0 or (a0 == 0.0 and b0 > 0.0)):
-        e0 -= 1.0
-    if not (a1 > 0.0 or (a1 == 0.0 and b1 > 0.0)):
-        e1 -= 1.0
-    if not (a2 > 0.0 or (a2 == 0.0 and b2 > 0.0)):
-        e2 -= 1.0
+    a0, b0, e0 = edge_function(a, b, x, y)
+    a1, b1, e1 = edge_function(b, c, x, y)
+    a2, b2, e2 = edge_function(c, a, x, y)
     row_value = v0 + step_x * (x - x0) + step_y * (y - y0)
     value_step = f4(step_x * 256.0)
     step_y *= 256.0
-    a0 *= 256.0
-    a1 *= 256.0
-    a2 *= 256.0
-    b0 *= 256.0
-    b1 *= 256.0
-    b2 *= 256.0
     span = x_last - x_first
     strips = span // STRIP + 1
     # What lies beyond the row's end is read and written back: within the image, that is.
@@ -141,27 +152,9 @@ def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record,
         return nearer_count > 0
     hit = False
     for row in range(y_first, y_last + 1):
-        # Ends of the row's span: the quotients of exact whole numbers round to the right side.
-        low = 0.0
-        high = float(span)
-        if a0 > 0.0:
-            low = max(low, -e0 / a0)
-        elif a0 < 0.0:
-            high = min(high, -e0 / a0)
-        elif e0 < 0.0:
-            high = -1.0
-        if a1 > 0.0:
-            low = max(low, -e1 / a1)
-        elif a1 < 0.0:
-            high = min(high, -e1 / a1)
-        elif e1 < 0.0:
-            high = -1.0
-        if a2 > 0.0:
-            low = max(low, -e2 / a2)
-        elif a2 < 0.0:
-            high = min(high, -e2 / a2)
-        elif e2 < 0.0:
-            high = -1.0
+        low, high = within_edge(a0, e0, 0.0, float(span))
+        low, high = within_edge(a1, e1, low, high)
+        low, high = within_edge(a2, e2, low, high)
         if low <= high:
             first = math.ceil(low)
             last = math.floor(high)

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from demorec.render.raster.kernels import layout as at
-from demorec.render.raster.kernels.jit import f4, index, kernel
+from demorec.render.raster.kernels.jit import f4, index, inlined, kernel
 
 LANES, BLOCK = at.LANES, at.BLOCK
 PX, PY, PZ, NX, NY, NZ = at.POS_X, at.POS_Y, at.POS_Z, at.NORMAL_X, at.NORMAL_Y, at.NORMAL_Z
@@ -127,6 +127,18 @@ def project_instances(
         visible[k] = abs(x) < w + slope_x * r and abs(y) < w + slope_y * r and w > near - r and w < far + r
 
 
+@inlined
+def matrix_row(matrix, row):
+    """A row of a (3, 4) matrix in single precision."""
+    return f4(matrix[row, 0]), f4(matrix[row, 1]), f4(matrix[row, 2]), f4(matrix[row, 3])
+
+
+@inlined
+def moved(row, x, y, z):
+    """A coordinate of a point that a matrix moves, by its row."""
+    return row[0] * x + row[1] * y + row[2] * z + row[3]
+
+
 @kernel
 def transform_vertices(
     first,
@@ -155,13 +167,9 @@ def transform_vertices(
         if not visible[k]:
             continue
         m = clip_from_shape[k]
-        m00, m01, m02, m03 = f4(m[0, 0]), f4(m[0, 1]), f4(m[0, 2]), f4(m[0, 3])
-        m10, m11, m12, m13 = f4(m[1, 0]), f4(m[1, 1]), f4(m[1, 2]), f4(m[1, 3])
-        m20, m21, m22, m23 = f4(m[2, 0]), f4(m[2, 1]), f4(m[2, 2]), f4(m[2, 3])
+        m0, m1, m2 = matrix_row(m, 0), matrix_row(m, 1), matrix_row(m, 2)
         s = shadow_from_shape[k]
-        s00, s01, s02, s03 = f4(s[0, 0]), f4(s[0, 1]), f4(s[0, 2]), f4(s[0, 3])
-        s10, s11, s12, s13 = f4(s[1, 0]), f4(s[1, 1]), f4(s[1, 2]), f4(s[1, 3])
-        s20, s21, s22, s23 = f4(s[2, 0]), f4(s[2, 1]), f4(s[2, 2]), f4(s[2, 3])
+        s0, s1, s2 = matrix_row(s, 0), matrix_row(s, 1), matrix_row(s, 2)
         l0, l1, l2 = f4(light_in_shape[k, 0]), f4(light_in_shape[k, 1]), f4(light_in_shape[k, 2])
         w = world_from_shape[k]
         u0, u1, u2 = f4(w[2, 0]), f4(w[2, 1]), f4(w[2, 2])
@@ -179,9 +187,9 @@ def transform_vertices(
                 x = vertices[i]
                 y = vertices[i + index(PY)]
                 z = vertices[i + index(PZ)]
-                cx = m00 * x + m01 * y + m02 * z + m03
-                cy = m10 * x + m11 * y + m12 * z + m13
-                cw = m20 * x + m21 * y + m22 * z + m23
+                cx = moved(m0, x, y, z)
+                cy = moved(m1, x, y, z)
+                cw = moved(m2, x, y, z)
                 inverse = f4(1) / cw
                 vertices[i + index(CX)] = cx
                 vertices[i + index(CY)] = cy
@@ -210,9 +218,9 @@ def transform_vertices(
                 x += n0 * offset
                 y += n1 * offset
                 z += n2 * offset
-                vertices[i + index(LX)] = s00 * x + s01 * y + s02 * z + s03
-                vertices[i + index(LY)] = s10 * x + s11 * y + s12 * z + s13
-                vertices[i + index(LZ)] = s20 * x + s21 * y + s22 * z + s23
+                vertices[i + index(LX)] = moved(s0, x, y, z)
+                vertices[i + index(LY)] = moved(s1, x, y, z)
+                vertices[i + index(LZ)] = moved(s2, x, y, z)
 
 
 @kernel
@@ -221,9 +229,7 @@ def transform_casters(first, last, geometry, shadow_from_shape):
     vertices = geometry.vertices
     for k in range(first, last):
         s = shadow_from_shape[k]
-        s00, s01, s02, s03 = f4(s[0, 0]), f4(s[0, 1]), f4(s[0, 2]), f4(s[0, 3])
-        s10, s11, s12, s13 = f4(s[1, 0]), f4(s[1, 1]), f4(s[1, 2]), f4(s[1, 3])
-        s20, s21, s22, s23 = f4(s[2, 0]), f4(s[2, 1]), f4(s[2, 2]), f4(s[2, 3])
+        s0, s1, s2 = matrix_row(s, 0), matrix_row(s, 1), matrix_row(s, 2)
         vertex = geometry.vertex_start[k]
         end = vertex + geometry.vertex_count[k]
         while vertex < end:
@@ -238,6 +244,6 @@ def transform_casters(first, last, geometry, shadow_from_shape):
                 y = vertices[i + index(PY)]
                 z = vertices[i + index(PZ)]
                 # Texel centres lie at whole numbers of the lookup, at half ones of the rasteriser.
-                vertices[i + index(SX)] = np.floor((s00 * x + s01 * y + s02 * z + s03 + f4(0.5)) * f4(256) + f4(0.5))
-                vertices[i + index(SY)] = np.floor((s10 * x + s11 * y + s12 * z + s13 + f4(0.5)) * f4(256) + f4(0.5))
-                vertices[i + index(IW)] = s20 * x + s21 * y + s22 * z + s23
+                vertices[i + index(SX)] = np.floor((moved(s0, x, y, z) + f4(0.5)) * f4(256) + f4(0.5))
+                vertices[i + index(SY)] = np.floor((moved(s1, x, y, z) + f4(0.5)) * f4(256) + f4(0.5))
+                vertices[i + index(IW)] = moved(s2, x, y, z)
