@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.annotate.situation import nouns_of
-from demorec.core.geometry import Array, Pose
+from demorec.core.geometry import Array, Pose, rotation_rows
 from demorec.episode.episode import Columns
 from demorec.episode.scene import SceneCamera, Shape
 from demorec.mcap import Recording
@@ -91,13 +91,7 @@ def project(camera: SceneCamera, world_from_camera: Array, points: Array) -> Arr
         points: (T, N, 3) metres, in the world frame.
     """
     x, y, z, w = (world_from_camera[:, index, np.newaxis] for index in range(3, 7))
-    # Of the conjugate quaternion; sums written out, as in demorec.core.geometry, and to the same bit.
-    x, y, z = -x, -y, -z
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
+    rows = rotation_rows(-x, -y, -z, w)  # of the conjugate quaternion
     eye = [world_from_camera[:, index, np.newaxis] for index in range(3)]
     seen = [
         points[..., 0] * a + points[..., 1] * b + points[..., 2] * c - (a * eye[0] + b * eye[1] + c * eye[2])
