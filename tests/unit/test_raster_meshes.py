@@ -12,8 +12,8 @@ from support import render as scenes
 import demorec
 from demorec.core.errors import RenderError
 from demorec.render.raster import RasterRenderer
-from demorec.render.raster.cache import cached_mesh
 from demorec.render.raster.decimate import decimate
+from demorec.render.raster.mesh import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
 
 SO101_MESHES = Path(demorec.__file__).parent / "sim" / "assets" / "so101"

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.episode.scene import Light, SceneCamera
+from demorec.render import RenderSetup
 from demorec.render.raster.batch import Batch, Floats32
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.antialias import STILL, centre_of_mixed, resolve, shade_edges
@@ -32,9 +33,7 @@ class Canvas:
         camera: Size, lens and clipping distances.
         batch: The scene's meshes at this camera's level of detail.
         stage: What all cameras share.
-        light: For the sky.
-        antialias: 2x2 samples a pixel instead of one.
-        depth, segmentation: Whether these are drawn.
+        setup: Of which the light, for the sky, and what is drawn count: 2x2 samples a pixel where it is antialiased.
 
     Attributes:
         samples: Along a pixel's side, 1 or 2.
@@ -46,21 +45,12 @@ class Canvas:
         looks, still_looks: What decides the colour of pixels, and of what stands still with its own shadows alone.
     """
 
-    def __init__(
-        self,
-        camera: SceneCamera,
-        batch: Batch,
-        stage: Stage,
-        light: Light,
-        *,
-        antialias: bool,
-        depth: bool,
-        segmentation: bool,
-    ) -> None:
+    def __init__(self, camera: SceneCamera, batch: Batch, stage: Stage, setup: RenderSetup) -> None:
         self.camera = camera
         self._stage = stage
+        antialias = setup.antialias
         self.samples = 2 if antialias else 1
-        self.want_depth, self.want_segments = depth, segmentation
+        self.want_depth, self.want_segments = setup.depth, setup.segmentation
         h, w = camera.height, camera.width
         sh, sw = h * self.samples, w * self.samples
         n = len(stage.instances)
@@ -71,7 +61,7 @@ class Canvas:
         self.ids = np.zeros((sh, sw), dtype=np.int32)
         self.pixel_ids = np.full((h, w), STILL, dtype=np.int32) if antialias else self.ids
         self.edges = np.zeros(h * w if antialias else 1, dtype=np.int32)
-        self._mixed = np.zeros(h * w if antialias and (depth or segmentation) else 0, dtype=np.int32)
+        self._mixed = np.zeros(h * w if antialias and (setup.depth or setup.segmentation) else 0, dtype=np.int32)
         self._far_value = np.float32(1 / camera.far)
         self.geometry = batch.geometry._replace(vertices=batch.geometry.vertices.copy())
         self.records = _empty_records(len(batch.geometry.faces) + 1024)
@@ -80,7 +70,7 @@ class Canvas:
         self._focal = float(k[0, 0])
         self._clip_from_world = np.zeros((3, 4))
         self.looks = Looks(
-            *batch[1:], stage.light_table, _sky_table(light), stage.heights.reshape(-1), stage.shadow_size
+            *batch[1:], stage.light_table, _sky_table(setup.light), stage.heights.reshape(-1), stage.shadow_size
         )
         self.still_looks = self.looks._replace(heights=stage.still_heights.reshape(-1))
 

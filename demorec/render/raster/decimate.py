@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.render.raster.cache import cached_mesh
-from demorec.render.raster.mesh import Faces, Floats, RasterMesh, face_normals, make_mesh, unit, weld
+from demorec.render.raster.mesh import Faces, Floats, RasterMesh, cached_mesh, face_normals, make_mesh, unit, weld
 
 SMALLEST = 64
 """Triangles below which nothing is decimated."""

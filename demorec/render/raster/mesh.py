@@ -1,14 +1,22 @@
-"""Triangle meshes as the renderer wants them, and the geometry that is done on them once, when they are loaded."""
+"""Triangle meshes as the renderer wants them, the geometry that is done on them once, and their cache between runs."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import logging
 import math
+import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.cache import cache_folder, folder_lock, write_whole
+
+log = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
 CREASE_ANGLE = math.radians(35)
@@ -116,3 +124,58 @@ def crease_normals(points: Floats, faces: Faces, angle: float = CREASE_ANGLE) ->
     empty = (total * total).sum(1) < 1e-30
     total[empty] = units[corner_face[empty]]
     return np.asarray(unit(total).reshape(-1, 3, 3))
+
+
+_SOURCES = ("mesh.py", "mesh_files.py", "decimate.py", "textures.py")
+
+
+@functools.cache
+def _version() -> str:
+    """Digest of the code that makes meshes: another version reads nothing of this one's."""
+    digest = hashlib.sha256()
+    for name in _SOURCES:
+        digest.update((Path(__file__).parent / name).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cached_mesh(key: str, make: Callable[[], RasterMesh]) -> RasterMesh:
+    """The mesh that `make` makes, from the cache when it was made before under this key.
+
+    A file that cannot be read, whatever the reason, is made anew; a folder that cannot be written to costs time only.
+    Of several processes that ask at once, one makes it and the others wait.
+    """
+    name = hashlib.sha256(key.encode()).hexdigest()[:32]
+    path = cache_folder("meshes", _version()) / f"{name}.npz"
+    mesh = _read(path)
+    if mesh is not None:
+        return mesh
+    with folder_lock(path.parent):
+        mesh = _read(path)
+        return mesh if mesh is not None else _make(path, make)
+
+
+def _make(path: Path, make: Callable[[], RasterMesh]) -> RasterMesh:
+    mesh = make()
+    arrays = {name: value for name, value in vars(mesh).items() if isinstance(value, np.ndarray)}
+    texture = np.array("" if mesh.texture is None else str(mesh.texture))
+    try:
+        write_whole(path, lambda temporary: np.savez(temporary, **arrays, texture=texture))
+    except OSError as error:
+        log.warning("The mesh cache cannot be written (%s): %s", error.strerror, path)
+    return mesh
+
+
+def _read(path: Path) -> RasterMesh | None:
+    try:
+        with np.load(path) as data:
+            texture = str(data["texture"])
+            return RasterMesh(
+                points=data["points"],
+                faces=data["faces"],
+                normals=data["normals"],
+                uv=data["uv"] if "uv" in data.files else None,
+                colors=data["colors"],
+                texture=Path(texture) if texture else None,
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

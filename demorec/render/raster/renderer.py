@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from demorec.core.cache import folder_lock
 from demorec.core.geometry import Array, Pose, look_at
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import Light, SceneCamera, Texture
+from demorec.episode.scene import SceneCamera, Texture
 from demorec.render import RenderSetup, Visual, VisualBody, VisualKind, check_setup, world_from_camera
 from demorec.render.raster.batch import Batch, make_batch
 from demorec.render.raster.canvas import Canvas
@@ -82,15 +83,7 @@ class RasterRenderer:
             levels = tuple(None if self._exact else self._level(instance, camera, setup) for instance in instances)
             if levels not in batches:
                 batches[levels] = make_batch(instances, levels, specular=setup.light.specular)
-            canvas = Canvas(
-                camera,
-                batches[levels],
-                self._stage,
-                setup.light,
-                antialias=setup.antialias,
-                depth=setup.depth,
-                segmentation=setup.segmentation,
-            )
+            canvas = Canvas(camera, batches[levels], self._stage, setup)
             self._views.append(CameraView(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
 
     def _level(self, instance: Instance, camera: SceneCamera, setup: RenderSetup) -> int | None:
@@ -154,7 +147,6 @@ def rehearse() -> None:
     texture = Texture(pattern="plain", colors=((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))
     bodies = [_body("box", 0.3, 0.3, 0.1, is_fixed=True, texture=texture), _body("sphere", 0.1, is_fixed=False)]
     instances = make_instances(bodies, ModelStore())
-    light = Light()
     camera = SceneCamera(
         name="rehearsal",
         width=32,
@@ -163,12 +155,13 @@ def rehearse() -> None:
         mount="world",
         mount_from_camera=look_at((0.8, 0, 0.5), (0, 0, 0)),
     )
-    stage = Stage(instances, light, shadow_size=64, caster_faces=[None, None])
+    setup = RenderSetup(bodies=(), cameras=(), depth=True, segmentation=True)
+    stage = Stage(instances, setup.light, shadow_size=64, caster_faces=[None, None])
     poses = np.array([[0.0, 0.0, 0.15 * body, 0.0, 0.0, 0.0, 1.0] for body in range(2)])
-    batch = make_batch(instances, [None, None], specular=light.specular)
+    batch = make_batch(instances, [None, None], specular=setup.light.specular)
     for antialias in (True, False):
         for keep_still in (True, False):
-            canvas = Canvas(camera, batch, stage, light, antialias=antialias, depth=True, segmentation=True)
+            canvas = Canvas(camera, batch, stage, replace(setup, antialias=antialias))
             view = CameraView(canvas, stage, keep_still=keep_still)
             stage.update(poses)
             view.draw(camera.mount_from_camera)

@@ -17,10 +17,9 @@ from demorec.episode.scene import Texture
 from demorec.render import Visual, VisualBody, first_rows
 from demorec.render.procedural import texture_pixels
 from demorec.render.raster import primitives
-from demorec.render.raster.cache import cached_mesh
 from demorec.render.raster.decimate import decimated
 from demorec.render.raster.kernels import layout
-from demorec.render.raster.mesh import Floats, RasterMesh, unit, weld
+from demorec.render.raster.mesh import Floats, RasterMesh, cached_mesh, unit, weld
 from demorec.render.raster.mesh_files import load_mesh
 from demorec.render.raster.textures import Pixels, load_image, palette_colors
 
