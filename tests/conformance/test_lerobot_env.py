@@ -89,6 +89,7 @@ def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> No
     assert "environment_state" not in cameras.features
 
 
+@pytest.mark.long
 def test_evaluate_records_every_rollout_goes_on_and_refuses_another(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,8 +17,8 @@ from demorec.core.tables import ROBOTS, TASKS
 from demorec.mcap import Recording
 
 SLOW = [pytest.mark.slow]
-FILMED = ("pick_place", "place_in_tray", "stack", "unstack", "pick_shapes", "pick_anything", "tutorial")
-"""Those that are quick to film; the others are as long again."""
+FILMED = ("unstack", "pick_anything", "tutorial")
+"""The others are more of the same."""
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def older(info: EpisodeInfo) -> EpisodeInfo:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [64, 224])
+@pytest.mark.parametrize("size", [64, pytest.param(224, marks=pytest.mark.long)])
 def test_the_found_turn_is_the_true_one(size: int, tmp_path: Path) -> None:
     cameras = ("front", "wrist")
     path = simulate(tmp_path / "e.mcap", variation="full", seed=31, cameras=cameras, width=size, height=size)

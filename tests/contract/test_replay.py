@@ -120,6 +120,7 @@ def test_an_expert_that_gave_up_is_a_failure_whatever_the_conditions_say(recorde
     assert level_of(path, "outcome_consistent") == "pass"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_noise_delay_and_rate_change_the_motion(recorded: Path) -> None:
     plain = _replay(recorded)
@@ -257,6 +258,7 @@ def test_what_is_no_number_is_not_sent(recorded: Path) -> None:
     assert np.isfinite(report.joint_error)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_increments_of_a_jaw_arm_are_judged_by_the_arm_alone(tmp_path: Path) -> None:
     """Without demorec's own files only the jaw's action is a target; it stops at what it holds, so it has no lag."""

@@ -158,7 +158,8 @@ USING_IT = "from demorec.sim.client import connect; connect()"
 
 
 @pytest.mark.parametrize(
-    ("robot", "task"), [("panda", "pick_shapes"), pytest.param("iiwa", "tutorial", marks=pytest.mark.slow)]
+    ("robot", "task"),
+    [("panda", "pick_shapes"), pytest.param("iiwa", "tutorial", marks=[pytest.mark.slow, pytest.mark.long])],
 )
 def test_the_recording_alone_is_drawn_without_a_simulator(robot: str, task: str, tmp_path: Path) -> None:
     # Both arms, one of them scaled; primitives, meshes and URDFs; textures, segmentation, a camera on the hand.

@@ -220,14 +220,21 @@ def many_messages(folder: Path) -> Path:
 
 
 BAGS = (
-    two_fields_a_type, two_empty_fields_a_type, a_thousand_of_a_thousand,
+    two_fields_a_type,
     a_definition_that_computes, empty_elements_of_many_fields, lists_of_nothing, messages_that_claim_64_megabytes,
     columns_that_compute, a_column_called_rowid, definitions_that_compute, a_view_of_messages, aliases, merge_keys,
-    images_of_nothing, lists_in_every_message, many_messages,
+    images_of_nothing, many_messages,
 )  # fmt: skip
 LONG = [
     pytest.param(make, marks=(pytest.mark.slow, pytest.mark.long))
-    for make in (a_definition_of_empty_lines, a_definition_in_brackets, many_names)
+    for make in (
+        a_definition_of_empty_lines,
+        a_definition_in_brackets,
+        many_names,
+        two_empty_fields_a_type,
+        a_thousand_of_a_thousand,
+        lists_in_every_message,
+    )
 ]
 
 

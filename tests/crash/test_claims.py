@@ -108,8 +108,8 @@ def features_of_very_many_numbers(root: Path) -> None:
     [
         pytest.param(one_long_task, marks=pytest.mark.slow),
         a_long_task_again_and_again,
-        pytest.param(long_tasks_in_a_list, marks=pytest.mark.slow),
-        a_footer_that_says_little,
+        pytest.param(long_tasks_in_a_list, marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param(a_footer_that_says_little, marks=pytest.mark.long),
         rows_of_millions_of_numbers,
         features_of_very_many_numbers,
     ],

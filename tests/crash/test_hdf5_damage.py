@@ -93,6 +93,7 @@ def test_a_sound_file_is_walked_through_whole(file: Path, monkeypatch: pytest.Mo
     assert len(attributes) == sum(attributes_of) > 5
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_many_datasets_and_long_texts_are_no_damage(tmp_path: Path) -> None:
     """The library keeps some 70 kB of each open dataset in chunks, which the walk's memory would not hold."""

@@ -15,6 +15,8 @@ from support.export import make_run
 
 pytestmark = pytest.mark.slow
 
+COMMANDS = ["export", pytest.param("check", marks=pytest.mark.long), pytest.param("render", marks=pytest.mark.long)]
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -43,7 +45,7 @@ def busy(run: Path, out: Path, name: str) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize("name", ["export", "check", "render"])
+@pytest.mark.parametrize("name", COMMANDS)
 def test_a_killed_command_leaves_no_orphans(run: Path, tmp_path: Path, name: str) -> None:
     """Killed as soon as two workers are there: they are starting, working or waiting for work."""
     process = busy(run, tmp_path, name)
@@ -54,7 +56,7 @@ def test_a_killed_command_leaves_no_orphans(run: Path, tmp_path: Path, name: str
     assert not alive
 
 
-@pytest.mark.parametrize("name", ["export", "check", "render"])
+@pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_whose_worker_is_killed_does_not_end_well(run: Path, tmp_path: Path, name: str) -> None:
     process = busy(run, tmp_path, name)
     workers_of(process)[0].kill()

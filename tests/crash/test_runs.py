@@ -130,6 +130,7 @@ def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_b
     assert again.run.digest == reference.run.digest
 
 
+@pytest.mark.long
 def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path: Path) -> None:
     """5000 were asked for and some were made; then 3 are asked for."""
     out = tmp_path / "run"
@@ -332,6 +333,7 @@ def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path: Path, make
     assert_gone(workers)
 
 
+@pytest.mark.long
 def test_the_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     out = tmp_path / "run"
     process = driver(out, "make_stubbornly", 4, grace_s=10 * PATIENCE_S)
@@ -355,7 +357,7 @@ def test_a_killed_driver_leaves_no_orphans(tmp_path: Path) -> None:
     assert_gone(workers)
 
 
-@pytest.mark.parametrize("kills", [4, pytest.param(40, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kills", [2, pytest.param(40, marks=pytest.mark.long)])
 def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path: Path, kills: int) -> None:
     """SIGKILL to the driver or to a worker, at moments spread over the run."""
     num_episodes, chance = 20 * kills, random.Random(kills)

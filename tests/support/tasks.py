@@ -22,5 +22,8 @@ PAIRS = [
 
 
 def tasks_with_slow_ones() -> list[Any]:
-    """Parameters: every row of the table, all but the quick ones marked as slow."""
-    return [pytest.param(name, marks=() if name in QUICK_TASKS else pytest.mark.slow) for name in TASKS.names()]
+    """Parameters: every row of the table; slow is the one that asks most of everything, and long are the others that
+    are not quick."""
+    slow, long = [pytest.mark.slow], [pytest.mark.slow, pytest.mark.long]
+    marks: dict[str, list[Any]] = {name: [] for name in QUICK_TASKS} | {"pick_anything": slow}
+    return [pytest.param(name, marks=marks.get(name, long)) for name in TASKS.names()]

@@ -218,6 +218,7 @@ def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> 
     assert np.hypot(inside[:, 0], inside[:, 1]).max() < vessel.shape.size[0] / 2
 
 
+@pytest.mark.long
 def test_fingers_sink_into_a_light_thing_no_deeper_than_their_stiffness_gives() -> None:
     """20 N at 120 kN/m; with the 50 iterations that heavier things get the solver leaves them far deeper."""
     made = next(
