@@ -1,13 +1,21 @@
-"""Is the file whole: index, checksums, topics, readable to the last message."""
+"""Is the file whole, readable to the last message, and do its streams tell the same time, every frame its own.
+
+Of a recording that somebody else made, whose streams have clocks of their own: are these in order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from demorec.check.base import Measurement, file_check
+import numpy as np
+
+from demorec.check.base import Found, Measurement, NotMeasured, external_check, file_check, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
+from demorec.episode.episode import NO_IMAGE
 from demorec.mcap import channels, messages
 from demorec.mcap.streams import frame_streams
+
+_NANOSECONDS = 1_000_000_000
 
 
 @file_check(
@@ -99,3 +107,149 @@ def complete(episode: CheckedEpisode) -> Measurement:
     """The episode was recorded to its end."""
     cut = episode.recording.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")
+
+
+@time_check(
+    measures="largest distance of a message from its frame's time",
+    unit="ms",
+)
+def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
+    """Times rise in equal steps of 1 / fps from 0, the same on every stream of numbers."""
+    expected = episode.frame_times
+    for topic in (stream.topic for stream in frame_streams(episode.info) if stream.topic in episode.scan):
+        times = episode.scan[topic].time_ns
+        if topic == channels.JOINT_STATES and len(times) != len(expected):
+            times = times[np.isin(times, expected)]  # others are between the frames
+        count = min(len(times), len(expected))
+        yield worst_frame(np.abs(times[:count] - expected[:count]) / 1e6, topic)
+
+
+@time_check(
+    measures="largest difference between a message's own stamp and its time",
+    unit="ms",
+)
+def stamps(episode: CheckedEpisode) -> Iterator[Found]:
+    """The stamp in each message's header, which ROS tools go by, is the time at which it was logged."""
+    for topic, scan in episode.scan.items():
+        if scan.stamp_ns is None or not len(scan.time_ns):
+            continue
+        off = np.abs(scan.stamp_ns - scan.time_ns)
+        index = int(np.argmax(off))
+        frame = int(np.searchsorted(episode.frame_times, scan.time_ns[index], side="right")) - 1
+        yield Measurement(value=float(off[index]) / 1e6, frame=max(frame, 0), detail=topic)
+
+
+@time_check(
+    measures="images missing, surplus, off their frame's time, or too far from a keyframe",
+)
+def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
+    """Each camera has one coded image a frame at the frame's time, and a keyframe at least every GOP."""
+    expected = episode.frame_times
+    for camera in episode.cameras:
+        settings = episode.recording.video_settings(camera.name)
+        topic = channels.video_topic(camera.name, settings.codec)
+        scan = episode.scan.get(topic)
+        times = np.empty(0, dtype=np.int64) if scan is None else scan.time_ns
+        count = min(len(times), len(expected))
+        off = np.flatnonzero(times[:count] != expected[:count])
+        if len(times) != len(expected) or len(off):
+            number = abs(len(times) - len(expected)) + len(off)
+            frame = int(off[0]) if len(off) else count
+            detail = f"camera {camera.name}: {len(times)} images for {len(expected)} frames"
+            yield Measurement(value=number, frame=frame, detail=detail)
+            continue
+        keyframes = episode.keyframes[camera.name].tolist()
+        gaps = np.diff([*keyframes, len(expected)]) if keyframes else np.array([len(expected)])
+        late = (0 if keyframes[:1] == [0] else 1) + int((gaps > settings.gop).sum())
+        place = keyframes[int(np.argmax(gaps))] if late and keyframes else None
+        detail = f"camera {camera.name}: {len(keyframes)} keyframes, GOP {settings.gop}"
+        yield Measurement(value=late, frame=place, detail=detail)
+
+
+@external_check(
+    group="time",
+    measures="frames and images that were dropped while recording",
+    fail=float("inf"),
+)
+def drops(subject: CheckedEpisode) -> Found:
+    """What came could be taken."""
+    outcome = subject.recording.outcome
+    if outcome is None:
+        return NotMeasured(why="the recording has no outcome, which would tell")
+    lost = ", ".join(f"{count} of {what}" for what, count in outcome.drops.items() if count)
+    return Measurement(value=sum(outcome.drops.values()), detail=lost)
+
+
+@external_check(
+    group="time",
+    measures="how much the frames' mean rate differs from the nominal one, as a share of it",
+    warn=0.05,
+    fail=0.5,
+)
+def rate(subject: CheckedEpisode) -> Found:
+    """The frames came at the rate that the episode names, by which datasets and policies go."""
+    times, fps = subject.columns.time_ns, subject.recording.info.fps
+    if len(times) < 2:
+        return None
+    rate = (len(times) - 1) * _NANOSECONDS / float(times[-1] - times[0])
+    return Measurement(value=abs(rate / fps - 1), detail=f"{rate:.4g} Hz instead of {fps} Hz")
+
+
+@external_check(
+    group="time",
+    measures="the longest time between two frames, in nominal periods",
+    warn=2.5,
+    fail=30,
+)
+def gaps(subject: CheckedEpisode) -> Found:
+    """No frames are missing between others."""
+    steps = np.diff(subject.columns.time_ns)
+    if not len(steps):
+        return None
+    frame = int(steps.argmax())
+    periods = float(steps[frame]) * subject.recording.info.fps / _NANOSECONDS
+    return Measurement(value=periods, frame=frame + 1, detail=f"{steps[frame] / 1e6:.4g} ms after the frame before")
+
+
+@external_check(
+    group="alignment",
+    unit="s",
+    measures="the largest distance between the stamps of a frame and of a sample that it holds",
+    warn=0.1,
+    fail=1.0,
+)
+def sample_age(subject: CheckedEpisode) -> Iterator[Found]:
+    """What a frame holds was sensed at about its time."""
+    columns = subject.columns
+    for name in columns.stamps:
+        yield worst_frame(np.abs(columns.age_ns(name)) / _NANOSECONDS, name)
+
+
+@external_check(
+    group="alignment",
+    unit="s",
+    measures="the largest distance between the stamps of a frame and of an image that it holds",
+    warn=0.2,
+    fail=1.0,
+)
+def image_age(subject: CheckedEpisode) -> Iterator[Found]:
+    """The images that a frame holds were taken at about its time."""
+    columns = subject.columns
+    for camera, numbers in columns.images.items():
+        frames = np.flatnonzero(numbers != NO_IMAGE)
+        yield worst_frame(np.abs(columns.image_age_ns(camera)) / _NANOSECONDS, f"camera {camera}", frames=frames)
+
+
+@external_check(
+    group="images",
+    measures="the share of frames that have no image of a camera",
+    fail=0.5,
+)
+def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
+    """Every frame has an image of every camera."""
+    for camera, numbers in subject.columns.images.items():
+        without = np.flatnonzero(numbers == NO_IMAGE)
+        if len(numbers):
+            first = int(without[0]) if len(without) else None
+            text = f"camera {camera}: {len(without)} of {len(numbers)} frames"
+            yield Measurement(value=len(without) / len(numbers), frame=first, detail=text)

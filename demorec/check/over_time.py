@@ -68,7 +68,22 @@ def _all(subject: Filmed, fewest: int = 0) -> Iterator[Film]:
 
 
 @film_check(
-    measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so"
+    measures="cameras whose images are of one colour, or show no distance, in more than half of them",
+)
+def images_show_something(subject: Filmed) -> Found:
+    """No camera is covered, and none of depth sees nothing."""
+    blank = [camera for camera, films in subject.films.items() if any(film.is_blank for film in films)]
+    for camera, images in subject.distances():
+        shares = [float(np.mean(np.isfinite(values) & (values > 0))) for values in images]
+        if shares and float(np.median(shares)) == 0:
+            blank.append(camera)
+    if not subject.films and not blank:
+        return None
+    return Measurement(value=len(blank), detail=", ".join(f"camera {camera} shows nothing" for camera in blank))
+
+
+@film_check(
+    measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
 )
 def stray_images(subject: Filmed) -> Iterator[Found]:
     """No image is empty (where most are, `images_show_something` says so), and none is from another moment or place."""

@@ -96,7 +96,7 @@ CHECKS: Registry[Check] = Registry(
     rows=_named_alike(
         "demorec.check",
         ("file", "opens", "checksums", "topics", "readable", "complete"),
-        ("timing", "frame_times", "stamps", "video_frames"),
+        ("file", "frame_times", "stamps", "video_frames"),
         ("outcome", "outcome_consistent", "conditions_as_known", "instruction_fits_scene", "final_state"),
         ("outcome", "at_rest_in_the_end"),
         ("physics", "finite_numbers", "action_acceleration", "joint_acceleration"),
@@ -123,7 +123,8 @@ CHECKS: Registry[Check] = Registry(
         ("images", "images_decode", "exposure", "images_as_drawn", "image_colors", "image_sharpness"),
         ("images", "image_errors", "odd_images", "frozen"),
         ("images", "repeated_images", "distinct_cameras", "pixel_statistics"),
-        ("external", "drops", "rate", "gaps", "sample_age", "image_age", "missing_images", "images_show_something"),
+        ("file", "drops", "rate", "gaps", "sample_age", "image_age", "missing_images"),
+        ("over_time", "images_show_something"),
         ("run", "import_times", "import_numbers", "import_images", "import_dropped"),
         ("run", "run_files", "run_agrees", "run_dataset"),
         ("run_dataset", "run_dataset_content"),
