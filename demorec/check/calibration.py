@@ -44,10 +44,10 @@ def intrinsics(episode: CheckedEpisode) -> Iterator[Found]:
         if scan is None or not scan.first:
             yield Measurement(value=math.inf, detail=f"camera {camera.name} has no calibration")
             continue
-        recorded = episode.recording.calibration(camera.name)
+        (height, width), recorded = episode.recording.calibration(camera.name)
         settings = episode.recording.video_settings(camera.name)
-        off = float(np.abs(recorded.intrinsics - camera.intrinsics).max())
-        off = max(off, abs(recorded.width - settings.width), abs(recorded.height - settings.height))
+        off = float(np.abs(recorded - camera.intrinsics).max())
+        off = max(off, abs(width - settings.width), abs(height - settings.height))
         yield Measurement(value=off, detail=f"camera {camera.name}")
 
 
@@ -101,7 +101,7 @@ def projection(episode: CheckedEpisode, camera: SceneCamera, compared: ImageComp
     if usual > UNRELATED:
         detail = f"camera {camera.name}: its images show something else than the recorded numbers ({usual:.0f})"
         return Measurement(value=math.inf, frame=int(np.argmax(compared.unlike)), detail=detail)
-    recorded = (episode.recording.calibration(camera.name).intrinsics - camera.intrinsics)[:2, 2] / camera.height
+    recorded = (episode.recording.calibration(camera.name)[1] - camera.intrinsics)[:2, 2] / camera.height
     off = float(np.linalg.norm(compared.shift - recorded))
     detail = f"camera {camera.name}: {off * camera.height:.2f} px"
     return Measurement(value=100 * max(off - _allowance(episode, camera), 0.0), detail=detail)

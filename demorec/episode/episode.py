@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,28 +232,8 @@ class SampledFrame:
     subtask: str = ""
 
 
-class Simulated[V]:
-    """A column that only simulated episodes have: of any other, asking for it raises NotSimulatedError."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    @overload
-    def __get__(self, columns: None, owner: type) -> None: ...
-
-    @overload
-    def __get__(self, columns: Columns, owner: type) -> V: ...
-
-    def __get__(self, columns: Columns | None, owner: type) -> V | None:
-        if columns is None:
-            return None  # the field's default
-        values: V | None = vars(columns)[self._name]
-        if values is None:
-            raise NotSimulatedError(self._name)
-        return values
-
-    def __set__(self, columns: Columns, values: V | None) -> None:
-        vars(columns)[self._name] = values
+def _nothing() -> Any:
+    """Of a column that only simulated episodes have: of any other, asking for it raises NotSimulatedError."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -266,27 +246,36 @@ class Columns:
     """
 
     time_ns: NDArray[np.int64]  # (T,) stamps of the frames
-    joint_position: Simulated[Array] = Simulated()  # (T, n_joints)
-    joint_velocity: Simulated[Array] = Simulated()  # (T, n_joints)
-    joint_effort: Simulated[Array] = Simulated()  # (T, n_joints)
-    gripper_width: Simulated[Array] = Simulated()  # (T,)
-    base_from_tcp: Simulated[Array] = Simulated()  # (T, 7)
+    joint_position: Array = field(default_factory=_nothing)  # (T, n_joints)
+    joint_velocity: Array = field(default_factory=_nothing)  # (T, n_joints)
+    joint_effort: Array = field(default_factory=_nothing)  # (T, n_joints)
+    gripper_width: Array = field(default_factory=_nothing)  # (T,)
+    base_from_tcp: Array = field(default_factory=_nothing)  # (T, 7)
     object_poses: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7), world_from_object
-    contact_force: Simulated[Array] = Simulated()  # (T,)
+    contact_force: Array = field(default_factory=_nothing)  # (T,)
     sensed: Mapping[str, Array] = field(default_factory=dict)  # quantity -> (T, D), of those of the format version
-    action_joint_target: Simulated[Array] = Simulated()  # (T, n_arm)
-    action_gripper: Simulated[Array] = Simulated()  # (T,)
-    action_base_from_tcp: Simulated[Array] = Simulated()  # (T, 7)
-    command_joint_target: Simulated[Array] = Simulated()  # (T, n_arm)
-    command_gripper: Simulated[Array] = Simulated()  # (T,)
-    command_base_from_tcp: Simulated[Array] = Simulated()  # (T, 7)
+    action_joint_target: Array = field(default_factory=_nothing)  # (T, n_arm)
+    action_gripper: Array = field(default_factory=_nothing)  # (T,)
+    action_base_from_tcp: Array = field(default_factory=_nothing)  # (T, 7)
+    command_joint_target: Array = field(default_factory=_nothing)  # (T, n_arm)
+    command_gripper: Array = field(default_factory=_nothing)  # (T,)
+    command_base_from_tcp: Array = field(default_factory=_nothing)  # (T, 7)
     phase: tuple[str, ...] = ()  # T, or none where nobody states any
-    is_deliberate_miss: Simulated[NDArray[np.bool_]] = Simulated()  # (T,)
+    is_deliberate_miss: NDArray[np.bool_] = field(default_factory=_nothing)  # (T,)
     world_from_camera: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7)
     features: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # feature -> (T, D) in its own dtype
     stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # feature -> (T,) stamps of the samples
     images: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (T,) number of the image held
     image_stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (P,) stamps of its images
+
+    def __post_init__(self) -> None:
+        for name in [name for name, values in vars(self).items() if values is None]:
+            del vars(self)[name]
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            raise (NotSimulatedError if name in self.__dataclass_fields__ else AttributeError)(name)
 
     @property
     def num_frames(self) -> int:

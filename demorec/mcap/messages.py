@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -189,15 +189,6 @@ def _varint(data: bytes, position: int) -> tuple[int, int]:
     raise ValueError("a video message that ends within a number")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Calibration:
-    """What a `camera_info` message says: image size in pixels and K (3, 3)."""
-
-    width: int
-    height: int
-    intrinsics: Array
-
-
 def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
     """sensor_msgs/CameraInfo of (height, width) pixels and K (3, 3), with the distortion of the plumb bob model."""
     projection = np.hstack((k, np.zeros((3, 1))))
@@ -207,11 +198,10 @@ def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequ
     return encode(CAMERA_INFO, header, *size, "plumb_bob", distortion, *matrices, 0, 0, whole_image)
 
 
-def read_camera_info(data: bytes) -> Calibration:
-    """Inverse of `camera_info`."""
+def read_camera_info(data: bytes) -> tuple[tuple[int, int], Array]:
+    """(height, width) in pixels and K (3, 3) of a `camera_info`."""
     values, _ = decode(CAMERA_INFO, data)
-    intrinsics = values["k"].astype(np.float64).reshape(3, 3)
-    return Calibration(width=values["width"], height=values["height"], intrinsics=intrinsics)
+    return (values["height"], values["width"]), values["k"].astype(np.float64).reshape(3, 3)
 
 
 def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from heapq import merge
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -230,7 +231,7 @@ class EpisodeWriter(Closing):
         is_simulated = self._info.simulation is not None
         if not is_simulated:
             self._write_images({name: camera.num_ready for name, camera in self._cameras.items()})
-        frames = self._pending[: self._count_ready()]
+        frames = list(takewhile(self._has_its_images, self._pending))
         if not frames:
             return
         self._write_numbers(frames)
@@ -238,12 +239,9 @@ class EpisodeWriter(Closing):
             self._write_images({name: number + 1 for name, number in frames[-1].images.items()})
         del self._pending[: len(frames)]
 
-    def _count_ready(self) -> int:
-        """Of the pending frames, how many have images that have all left the encoders."""
-        for index, frame in enumerate(self._pending):
-            if any(number >= self._cameras[name].num_ready for name, number in frame.images.items()):
-                return index
-        return len(self._pending)
+    def _has_its_images(self, frame: _Pending) -> bool:
+        """Whether all images of a frame have left the encoders."""
+        return all(number < self._cameras[name].num_ready for name, number in frame.images.items())
 
     def _write_images(self, until: Mapping[str, int]) -> None:
         """Write the images of each camera before that number, in the order of their stamps."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -75,7 +75,7 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
     columns = recording.columns()
     time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
     places = joint_places(info.features)
-    positions: Sequence[Array] = joint_positions(places, columns.features).T if places else ()
+    positions: Iterable[Array] = joint_positions(places, columns.features).T if places else ()
     return PlayedEpisode(
         **known,
         info=info,

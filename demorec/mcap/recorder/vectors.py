@@ -107,9 +107,10 @@ def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[Feature, ...]
     """What the first frame says of the features that nobody described."""
     found = []
     for name, (vector, given) in vectors.items():
-        is_robot = name in (STATE, ACTION)
-        names = given or (_element_names(len(vector), robot.joints) if is_robot else _numbers(len(vector)))
-        joints = tuple(_joint(element, robot) if is_robot else "" for element in names)
+        known = robot.joints if name in (STATE, ACTION) else ()
+        names = given or _element_names(len(vector), known)
+        # LeRobot's robots call the position of a joint "JOINT.pos".
+        joints = tuple(joint if (joint := element.removesuffix(".pos")) in known else "" for element in names)
         found.append(
             Feature(
                 name=name,
@@ -121,23 +122,13 @@ def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[Feature, ...]
     return tuple(found)
 
 
-def _numbers(count: int) -> tuple[str, ...]:
-    return tuple(map(str, range(count)))
-
-
 def _element_names(count: int, joints: tuple[str, ...]) -> tuple[str, ...]:
-    """The robot's joints where there are so many, or one more for a gripper."""
-    if joints and count == len(joints):
+    """The robot's joints where there are so many, or one more for a gripper; else numbers."""
+    if count == len(joints):
         return joints
     if joints and count == len(joints) + 1 and "gripper" not in joints:
         return (*joints, "gripper")
-    return _numbers(count)
-
-
-def _joint(element: str, robot: RobotFacts) -> str:
-    """The joint of which an element is the position: LeRobot's robots call that "JOINT.pos"."""
-    name = element.removesuffix(".pos")
-    return name if name in robot.joints else ""
+    return tuple(map(str, range(count)))
 
 
 RobotLike = str | Path | RobotSpec | Sequence[str]
