@@ -109,23 +109,20 @@ def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
 @functools.lru_cache(maxsize=256)
 def _mesh_primitives(path: Path, scale: tuple[float, ...]) -> list[Primitive]:
     try:
-        vertices, faces = _load_mesh(path)
+        if path.suffix.lower() == ".obj":
+            found = read_obj(path)
+            if not len(found.faces):
+                raise ValueError("no triangles")
+            vertices, faces = found.points, found.faces
+        else:
+            import trimesh  # takes a second to load, and the usual robot needs it for nothing
+
+            mesh = trimesh.load(path, force="mesh", process=False)
+            vertices = np.asarray(mesh.vertices, dtype=np.float64)
+            faces = np.asarray(mesh.faces, dtype=np.int64)
     except (OSError, ValueError, IndexError) as error:
         raise SceneError(f"A mesh of the scene cannot be read ({describe_error(error)}): {path}") from error
     return fit_primitives(vertices * np.array(scale), faces)
-
-
-def _load_mesh(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (V, 3) and triangles (F, 3) of a mesh file."""
-    if path.suffix.lower() == ".obj":
-        found = read_obj(path)
-        if not len(found.faces):
-            raise ValueError("no triangles")
-        return found.points, found.faces
-    import trimesh  # takes a second to load, and the usual robot needs it for nothing
-
-    mesh = trimesh.load(path, force="mesh", process=False)
-    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
 
 def _add_visual(link: ET.Element, primitive: Primitive, frame: Pose, rgba: Sequence[float]) -> None:
@@ -254,15 +251,13 @@ def surface_points(vertices: Array, faces: NDArray[np.int64]) -> Array:
 def _fit(points: Array) -> Primitive:
     """The smallest box, cylinder along an axis or sphere around the points, in their frame."""
     low, high = points.min(axis=0), points.max(axis=0)
-    extent = np.maximum(high - low, 1e-4)
     middle = (low + high) / 2
     center = (float(middle[0]), float(middle[1]), float(middle[2]))
-    sides = tuple(extent.tolist())
-    best = Primitive(kind="box", center=center, axis=2, size=sides, volume=math.prod(sides))
+    sides = tuple(np.maximum(high - low, 1e-4).tolist())
+    best = Primitive(kind="box", center=center, size=sides, volume=math.prod(sides))
     squares = (points - middle) ** 2
-    for axis in range(3):
-        others = [other for other in range(3) if other != axis]
-        radius = math.sqrt(float((squares[:, others[0]] + squares[:, others[1]]).max()))
+    for axis, (first, second) in enumerate(((1, 2), (0, 2), (0, 1))):
+        radius = math.sqrt(float((squares[:, first] + squares[:, second]).max()))
         volume = math.pi * radius * radius * sides[axis]
         if volume < best.volume:
             size = (max(radius, 1e-4), sides[axis])
@@ -270,7 +265,7 @@ def _fit(points: Array) -> Primitive:
     radius = math.sqrt(float(squares.sum(axis=1).max()))
     volume = 4 / 3 * math.pi * radius**3
     if volume < best.volume:
-        best = Primitive(kind="sphere", center=center, axis=2, size=(radius,), volume=volume)
+        best = Primitive(kind="sphere", center=center, size=(radius,), volume=volume)
     return best
 
 

@@ -31,22 +31,13 @@ _READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
 
 
 class EpisodeFile(Closing):
-    """Context manager over the file of one episode.
-
-    Attributes:
-        path: Of the file.
-        info: What was known before the first frame.
-        outcome: How the episode ended; None when a crash cut it off.
-        num_frames: Length.
-        is_recovered: Whether a crash cut it off.
-    """
+    """Context manager over the file of one episode: a `Recording` without its numbers."""
 
     info: EpisodeInfo
     outcome: Outcome | None
     num_frames: int
     is_recovered: bool
     _cameras: Mapping[str, CameraStreams]
-    """What was recorded of each camera."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -136,7 +127,6 @@ class EpisodeFile(Closing):
         return self._camera(camera).segmentation
 
     def _size(self, camera: str) -> tuple[int, int]:
-        """(height, width) of all images of a camera."""
         settings = self.video_settings(camera)
         return settings.height, settings.width
 

@@ -40,8 +40,9 @@ class Recording(EpisodeFile):
     Attributes:
         path: Of the file.
         info: What was known before the first frame.
-        outcome: How the episode ended; None when a crash cut it off (`is_recovered`).
+        outcome: How the episode ended; None when a crash cut it off.
         num_frames: Length.
+        is_recovered: Whether a crash cut it off.
 
     Raises:
         RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
@@ -302,9 +303,7 @@ _NOT_RECORDED = ("features", "stamps", "images", "image_stamps")
 
 def _column_bytes(columns: Columns) -> Iterator[tuple[str, bytes]]:
     """Name and bytes of every column that was recorded."""
-    for field in fields(columns):
-        if field.name in _NOT_RECORDED:
-            continue
+    for field in (field for field in fields(columns) if field.name not in _NOT_RECORDED):
         value = getattr(columns, field.name)
         if isinstance(value, Mapping):
             for key in sorted(value):

@@ -59,13 +59,7 @@ class ScannedChannel:
 
 
 class ScannedMessage(NamedTuple):
-    """A message as the file has it.
-
-    Attributes:
-        channel: Of which topic and type it is.
-        log_ns: When it was recorded, nanoseconds.
-        data: Its bytes.
-    """
+    """A message as the file has it, and when it was recorded, nanoseconds."""
 
     channel: ScannedChannel
     log_ns: int

@@ -41,20 +41,12 @@ _SECOND_NS = 1_000_000_000
 
 
 class _Pending(NamedTuple):
-    """A frame that waits to be written, without its images.
-
-    Attributes:
-        time_ns: When.
-        values: What the streams that have one message a frame are made of.
-        images: Camera -> number of the image that it holds.
-        changes: Messages of what is written only when it changes.
-        joint_samples: Joint states since the frame before.
-    """
+    """A frame that waits to be written, without its images."""
 
     time_ns: int
     values: FrameValues | SampledFrame
-    images: Mapping[str, int]
-    changes: list[Message]
+    images: Mapping[str, int]  # camera -> number of the image that it holds
+    changes: list[Message]  # of what is written only when it changes
     joint_samples: tuple[JointSample, ...] = ()
 
 

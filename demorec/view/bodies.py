@@ -222,10 +222,8 @@ def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf,
 
 
 def _same_joints(a: Urdf, b: Urdf) -> bool:
-    if [joint.name for joint in a.joints] != [joint.name for joint in b.joints]:
-        return False
-    distances = [
-        np.abs(first.parent_from_joint.position - second.parent_from_joint.position).max()
+    return len(a.joints) == len(b.joints) and all(
+        first.name == second.name
+        and np.abs(first.parent_from_joint.position - second.parent_from_joint.position).max() < _SAME_PLACE
         for first, second in zip(a.joints, b.joints, strict=True)
-    ]
-    return max(distances, default=0.0) < _SAME_PLACE
+    )
