@@ -64,6 +64,10 @@ def state_names(robot: RobotSpec, kind: StateKind) -> tuple[str, ...]:
     return (*joints, *_TCP_NAMES) if kind == "joint_ee" else joints
 
 
+def _velocity_names(robot: RobotSpec) -> tuple[str, ...]:
+    return (*(f"{joint}.vel" for joint in robot.arm_joints), "gripper.vel")
+
+
 def observation_names(
     robot: RobotSpec,
     scene: Scene,
@@ -75,7 +79,7 @@ def observation_names(
     """Feature name -> name of every component, in the order of `observation_vectors`."""
     names = {
         STATE: state_names(robot, state),
-        VELOCITY: (*(f"{joint}.vel" for joint in robot.arm_joints), "gripper.vel"),
+        VELOCITY: _velocity_names(robot),
         EE_POSE: _TCP_NAMES,
     }
     if privileged:
@@ -107,7 +111,7 @@ def observation_vectors(
     tcp = _continuous(rows.base_from_tcp)
     features = {
         STATE: [rows.joint_position[:, :arm], rows.gripper_width, *([tcp] if state == "joint_ee" else [])],
-        VELOCITY: [rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)],
+        VELOCITY: _velocities(rows, robot),
         EE_POSE: [tcp],
     }
     if privileged:
@@ -134,8 +138,7 @@ def _environment_names(robot: RobotSpec, scene: Scene) -> Iterable[str]:
         if goal.yaw_symmetry:
             yield from _yaw_names(f"{wanted}.yaw", goal.yaw_symmetry)
             yield from _yaw_names(f"{wanted}.from_{goal.object}.yaw", goal.yaw_symmetry)
-    yield from (f"{joint}.vel" for joint in robot.arm_joints)
-    yield "gripper.vel"
+    yield from _velocity_names(robot)
     for body in scene.movable:
         yield from (f"{body.name}.pose.{axis}" for axis in _POSE)
 
@@ -157,7 +160,7 @@ def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) 
     its yaw as sine and cosine of n times the angle, absolute and relative to the hand. The same of the wanted pose
     (the extents are those of the body that is placed onto, 0 for a place in the world; the relative yaw is that
     to the object), and the offsets object - TCP, goal - TCP and goal - object once more as near-field components
-    (`_near`). Then the velocities of `observation.velocity`, because LeRobot's ACT takes no second state
+    (`near_field`). Then the velocities of `observation.velocity`, because LeRobot's ACT takes no second state
     vector, and last the raw poses of all movable bodies.
     """
     count = len(rows.gripper_width)
@@ -169,22 +172,18 @@ def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) 
     for _, goal in _labelled_goals(scene):
         body = scene.body(goal.object)
         onto_pose, onto_size = _onto(scene, goal, poses, base_from_world)
-        wanted = _compose(onto_pose, goal.onto_from_goal.vector()[np.newaxis])
-        wanted = np.broadcast_to(wanted, (count, 7))
+        wanted = np.broadcast_to(_compose(onto_pose, goal.onto_from_goal.vector()[np.newaxis]), (count, 7))
         object_ = poses[goal.object]
         columns += [object_[:, :3], _repeat(body.shape.extents, count), *_seen_from(tcp, object_)]
         if body.yaw_symmetry:
             object_yaw = _yaw(object_, body.yaw_symmetry)
             columns += [*object_yaw, *_difference(object_yaw, _yaw(tcp, body.yaw_symmetry))]
         columns += [wanted[:, :3], _repeat(onto_size, count), *_seen_from(tcp, wanted)]
-        columns += [_near(object_, tcp), _near(wanted, tcp), _near(wanted, object_)]
+        columns += [near_field(a[:, :3] - b[:, :3]) for a, b in ((object_, tcp), (wanted, tcp), (wanted, object_))]
         if goal.yaw_symmetry:
             wanted_yaw = _yaw(wanted, goal.yaw_symmetry)
             columns += [*wanted_yaw, *_difference(wanted_yaw, _yaw(object_, goal.yaw_symmetry))]
-    arm = len(robot.arm_joints)
-    columns += [rows.joint_velocity[:, :arm], _gripper_velocity(rows, robot)]
-    columns += [poses[body.name] for body in scene.movable]
-    return columns
+    return [*columns, *_velocities(rows, robot), *(poses[body.name] for body in scene.movable)]
 
 
 def _labelled_goals(scene: Scene) -> list[tuple[str, Goal]]:
@@ -212,12 +211,6 @@ def _seen_from(tcp: Array, pose: Array) -> tuple[Array, Array]:
     offset = pose[:, :3] - tcp[:, :3]
     conjugate = tcp[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
     return offset, _rotate(conjugate, offset)
-
-
-def _near(pose: Array, origin: Array) -> Array:
-    """(T, 3) offset d from another pose, base axes, each as d / (|d| + 2 cm): -1 .. 1, steep where it matters."""
-    offset = pose[:, :3] - origin[:, :3]
-    return near_field(offset)
 
 
 def near_field(offset: Array) -> Array:
@@ -251,11 +244,11 @@ def _difference(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, 
 def action_names(robot: RobotSpec, kind: ActionKind) -> tuple[str, ...]:
     """Name of every component of `action_vectors`."""
     if kind == "joint":
-        return (*(f"{joint}.pos" for joint in robot.arm_joints), "gripper.width")
+        return state_names(robot, "joint")
     if kind == "joint_increment":
         return (*(f"{joint}.delta" for joint in robot.arm_joints), "gripper.width")
     if kind == "ee":
-        return (*(f"tcp.{axis}" for axis in _POSE), "gripper.width")
+        return (*_TCP_NAMES, "gripper.width")
     return ("tcp.dx", "tcp.dy", "tcp.dz", "tcp.rx", "tcp.ry", "tcp.rz", "gripper.width")
 
 
@@ -361,9 +354,11 @@ def _repeat(values: tuple[float, ...], count: int) -> Array:
     return np.broadcast_to(np.array(values, dtype=np.float64), (count, len(values)))
 
 
-def _gripper_velocity(rows: ObservationRows, robot: RobotSpec) -> Array:
+def _velocities(rows: ObservationRows, robot: RobotSpec) -> list[Array]:
+    """Of the arm's joints, and of the gripper's opening."""
     arm = len(robot.arm_joints)
-    return robot.gripper.width_velocity(rows.joint_position[:, arm:], rows.joint_velocity[:, arm:])
+    opening = robot.gripper.width_velocity(rows.joint_position[:, arm:], rows.joint_velocity[:, arm:])
+    return [rows.joint_velocity[:, :arm], opening]
 
 
 def _continuous(pose: Array) -> Array:
