@@ -249,7 +249,7 @@ def test_a_wrong_k(filmed: Path, tmp_path: Path) -> None:
     def edit(m: Message) -> list[Message]:
         if m[0] != channels.camera_topic("front", "camera_info"):
             return [m]
-        k = messages.read_camera_info(m[2]).intrinsics
+        _, k = messages.read_camera_info(m[2])
         old, new = struct.pack("<d", k[0, 2]), struct.pack("<d", k[0, 2] * 1.2)
         return [(m[0], m[1], m[2].replace(old, new), m[3])]
 

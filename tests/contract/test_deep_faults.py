@@ -89,7 +89,7 @@ def calibration(offset: int, value: float) -> Edit:
     def edit(m: Message) -> list[Message]:
         if m[0] != INFO:
             return [m]
-        k = messages.read_camera_info(m[2]).intrinsics
+        _, k = messages.read_camera_info(m[2])
         start = m[2].index(struct.pack("<d", k[0, 0])) + 8 * offset
         return [(m[0], m[1], m[2][:start] + struct.pack("<d", value) + m[2][start + 8 :], m[3])]
 
