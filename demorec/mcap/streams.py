@@ -63,7 +63,7 @@ class FrameValues(NamedTuple):
         return cls(frame.observation, frame.action, frame.command, poses)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class FrameStream:
     """One stream that has a message at each frame.
 
@@ -96,11 +96,13 @@ def frame_streams(info: EpisodeInfo, tree: FrameTree | None = None) -> tuple[Fra
 
     `/joint_states` of a simulated episode comes first; it may have more messages between the frames.
     """
+    moving: tuple[FrameStream, ...] = ()
+    if tree is not None and tree.moving:  # what moves follows from other streams, so it becomes no column
+        moving = (FrameStream(TF, messages.TRANSFORMS, transforms_layout(tree.moving), tree.rows, lambda values: {}),)
     if info.simulation is None:
-        features = (_feature(feature) for feature in info.features)
-        return (*features, *_moving_frames(tree), _held(info))
+        return (*(_feature(feature) for feature in info.features), *moving, _held(info))
     streams = (stream for stream in _simulated_streams(info) if stream.since <= info.format_version)
-    return (*streams, *_moving_frames(tree))
+    return (*streams, *moving)
 
 
 def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
@@ -122,18 +124,6 @@ def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
     for camera in scene.cameras:
         topic = camera_topic(camera.name, "pose")
         yield _pose(topic, WORLD, "world_from_camera", "world_from_camera", camera.name)
-
-
-def _moving_frames(tree: FrameTree | None) -> Iterator[FrameStream]:
-    """The coordinate frames that move; they follow from other streams, so they become no column."""
-    if tree is not None and tree.moving:
-        yield FrameStream(
-            topic=TF,
-            schema=messages.TRANSFORMS,
-            layout=transforms_layout(tree.moving),
-            rows=tree.rows,
-            columns=lambda values: {},
-        )
 
 
 # ------------------------------------------------------------------------------------ what the rows are made of
@@ -187,29 +177,19 @@ def _joints(
     columns: Callable[[NDArray[Any]], ColumnArrays],
 ) -> FrameStream:
     slots = (Slot.VALUE,) * len(names)  # position, velocity, effort
-    return FrameStream(
-        topic=topic,
-        schema=messages.JOINT_STATE,
-        layout=layout(messages.JOINT_STATE, (Slot.TIME, ""), tuple(names), slots, slots, slots),
-        rows=rows,
-        columns=columns,
-    )
+    laid_out = layout(messages.JOINT_STATE, (Slot.TIME, ""), tuple(names), slots, slots, slots)
+    return FrameStream(topic, messages.JOINT_STATE, laid_out, rows, columns)
 
 
 def _sensed(row: Sensed, robot: RobotSpec) -> FrameStream:
     if row.layout == "wrench":
         schema, force_and_torque = messages.WRENCH, ((Slot.VALUE,) * 3, (Slot.VALUE,) * 3)
-        messages_layout = layout(schema, (Slot.TIME, robot.hand_link), force_and_torque)
+        laid_out = layout(schema, (Slot.TIME, robot.hand_link), force_and_torque)
     else:
-        schema = messages.FLOAT64_ARRAY
-        messages_layout = _array_layout(schema, row.names(robot))
+        schema, laid_out = messages.FLOAT64_ARRAY, _array_layout(messages.FLOAT64_ARRAY, row.names(robot))
+    rows = _gathered(lambda values: (values.observation.sensed[row.quantity],))
     return FrameStream(
-        topic=row.topic,
-        schema=schema,
-        layout=messages_layout,
-        rows=_gathered(lambda values: (values.observation.sensed[row.quantity],)),
-        columns=lambda values: {"sensed": {row.quantity: values}},
-        since=row.since,
+        row.topic, schema, laid_out, rows, lambda values: {"sensed": {row.quantity: values}}, since=row.since
     )
 
 
@@ -221,13 +201,11 @@ def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> F
         pose: Pose = found(values)[key] if key else found(values)
         return pose.position, pose.quat_xyzw
 
-    return FrameStream(
-        topic=topic,
-        schema=messages.POSE,
-        layout=layout(messages.POSE, (Slot.TIME, frame_id), POSE_SLOTS),
-        rows=_gathered(parts),
-        columns=lambda values: {column: {key: values}} if key else {column: values},
-    )
+    def columns(values: NDArray[Any]) -> ColumnArrays:
+        return {column: {key: values}} if key else {column: values}
+
+    laid_out = layout(messages.POSE, (Slot.TIME, frame_id), POSE_SLOTS)
+    return FrameStream(topic, messages.POSE, laid_out, _gathered(parts), columns)
 
 
 FRAMES = "/frames"
@@ -237,14 +215,19 @@ SUBTASK = "/language/subtask"
 
 def _feature(feature: Feature) -> FrameStream:
     """The messages of a feature: sensor_msgs/JointState where there are joints, else std_msgs/Float64MultiArray."""
-    name, has_joints = feature.name, any(feature.joints)
-    schema = messages.JOINT_STATE if has_joints else messages.FLOAT64_ARRAY
+    name = feature.name
+    if any(feature.joints):  # velocity and effort are empty: they are not known, and zeros would be invented
+        joints = tuple(joint or name for name, joint in zip(feature.names, feature.joints, strict=True))
+        schema = messages.JOINT_STATE
+        laid_out = layout(schema, (Slot.TIME, ""), joints, (Slot.VALUE,) * len(joints), (), ())
+    else:
+        schema, laid_out = messages.FLOAT64_ARRAY, _array_layout(messages.FLOAT64_ARRAY, feature.names)
     return FrameStream(
-        topic="/" + name.replace(".", "/"),
-        schema=schema,
-        layout=_joints_layout(feature) if has_joints else _array_layout(schema, feature.names),
-        rows=_gathered(lambda frame: (frame.samples[name].vector,)),  # float64 holds every bit of a float32
-        columns=lambda values: {"features": {name: values.astype(feature.dtype)}},
+        "/" + name.replace(".", "/"),
+        schema,
+        laid_out,
+        _gathered(lambda frame: (frame.samples[name].vector,)),  # float64 holds every bit of a float32
+        lambda values: {"features": {name: values.astype(feature.dtype)}},
         stamp_ns=lambda frame: int(frame.samples[name].stamp_ns),
     )
 
@@ -262,23 +245,14 @@ def _held(info: EpisodeInfo) -> FrameStream:
         return np.array(table, dtype=np.int64)
 
     def columns(values: NDArray[Any]) -> ColumnArrays:
-        names = {"stamps": features, "images": cameras}
         taken = iter(values.T.copy())
-        return {column: {name: next(taken) for name in of} for column, of in names.items()}
+        return {
+            column: {name: next(taken) for name in names}
+            for column, names in (("stamps", features), ("images", cameras))
+        }
 
-    return FrameStream(
-        topic=FRAMES,
-        schema=messages.INT64_ARRAY,
-        layout=_array_layout(messages.INT64_ARRAY, [*features, *cameras]),
-        rows=rows,
-        columns=columns,
-    )
-
-
-def _joints_layout(feature: Feature) -> Layout:
-    """Velocity and effort are empty: they are not known, and zeros would be invented."""
-    names = tuple(joint or name for name, joint in zip(feature.names, feature.joints, strict=True))
-    return layout(messages.JOINT_STATE, (Slot.TIME, ""), names, (Slot.VALUE,) * len(names), (), ())
+    laid_out = _array_layout(messages.INT64_ARRAY, [*features, *cameras])
+    return FrameStream(FRAMES, messages.INT64_ARRAY, laid_out, rows, columns)
 
 
 def _array_layout(schema: str, columns: Sequence[str]) -> Layout:

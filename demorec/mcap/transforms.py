@@ -39,8 +39,7 @@ def camera_frame(camera: str) -> str:
 
 def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
     """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
-    rows = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames)
-    return layout(messages.TRANSFORMS, rows)
+    return layout(messages.TRANSFORMS, tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames))
 
 
 class FrameTree:
