@@ -174,7 +174,7 @@ def facts_of(root: Path) -> dict[str, pa.DataType]:
         return {}
     schema = open_table(tables[0]).schema_arrow
     known = fact_types(schema.names)
-    return {item.name: item.type for item in schema if item.name in known and known[item.name] == item.type}
+    return {item.name: known[item.name] for item in schema if item.name in known and known[item.name] == item.type}
 
 
 def episode_facts(recording: Recording, columns: Columns) -> dict[str, Any]:
