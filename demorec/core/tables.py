@@ -72,7 +72,7 @@ OBJECTS: Registry[Shelf] = Registry(
         "household": "demorec.objects.household:HOUSEHOLD",
         "blocks": "demorec.objects.blocks:BLOCKS",
         "cubes": "demorec.objects.blocks:CUBES",
-        "random": "demorec.objects.shelf:RANDOM",
+        "random": "demorec.objects.folder:RANDOM",
     },
     instance_of="demorec.objects.shelf:Shelf",
 )

@@ -19,7 +19,7 @@ from demorec.episode.camera_error import error_values
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
-from demorec.objects.shelf import load_shelf
+from demorec.objects.folder import load_shelf
 from demorec.render import Renderer
 from demorec.render.painter import WarmRenderer
 from demorec.robots.assets import allow_models, model_name

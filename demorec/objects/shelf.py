@@ -1,45 +1,20 @@
-"""What a shelf is: kinds of things, each in many shapes, of a material, in colours that have a name.
-
-Beside those that come along: a folder of meshes of the user's own, or the random shapes that PyBullet comes with.
-"""
+"""What a shelf is: kinds of things, each in many shapes, of a material, in colours that have a name."""
 
 from __future__ import annotations
 
-import functools
-import io
-import math
-import re
 import zlib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from demorec.annotate.situation import COLOR_WORDS
-from demorec.core.errors import ConfigError, describe_error
-from demorec.core.files import open_regular
-from demorec.core.geometry import Array
-from demorec.core.tables import OBJECTS
-from demorec.episode.mesh import MAX_EXTENT, MAX_POINTS, UNIT, SolidMesh
+from demorec.episode.mesh import SolidMesh
 from demorec.episode.scene import Pattern
-from demorec.objects.antipodal import standing_rotation
-from demorec.robots.assets import data_folder
-from demorec.robots.obj import read_obj
 
 Split = Literal["all", "train", "eval"]
 HELD_OUT = 5
 """Each shape whose number is one less than a multiple of this is kept for `eval`."""
-SUFFIXES = (".obj", ".stl", ".glb")
-MAX_BYTES = 50_000_000
-WIDEST = 0.07
-"""Of the narrowest side, metres: what a hand of 8 cm takes."""
-FLAT = 2e-4
-"""Out of plane, metres, up to which points belong to one face."""
-RANDOM_SCALE = 0.015
-"""Of the files in `random_urdfs`, as their URDFs have it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,149 +96,3 @@ class Shelf:
     """Kinds of things that one draws from."""
 
     kinds: tuple[Kind, ...]
-
-
-def load_shelf(name: str, allowed: Collection[str] = ()) -> Shelf:
-    """`OBJECTS.load`, or with a slash in its name a folder of meshes.
-
-    Raises:
-        ConfigError: As `Registry.load`, or as `folder_shelf`.
-    """
-    return folder_shelf(Path(name)) if "/" in name else OBJECTS.load(name, allowed)
-
-
-@functools.lru_cache(maxsize=16)
-def folder_shelf(folder: Path) -> Shelf:
-    """The .obj, .stl and .glb files of a folder, in metres; of one name but for numbers and colours is one kind.
-
-    Raises:
-        ConfigError: There is no such folder, it has no such file, or one cannot be handled.
-    """
-    if not folder.is_dir():
-        raise ConfigError(f"The folder of objects was not found: {folder}")
-    kinds: dict[str, list[Path]] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in SUFFIXES:
-            kinds.setdefault(_noun(path.stem), []).append(path)
-    if not kinds:
-        raise ConfigError(f"The folder of objects has no .obj, .stl or .glb file: {folder}")
-    for files in kinds.values():
-        for path in files:
-            read_solid(path)
-    return Shelf(
-        kinds=tuple(
-            Kind(noun=noun, material="plastic", shape=_reader(files), count=len(files)) for noun, files in kinds.items()
-        )
-    )
-
-
-def _reader(files: list[Path]) -> Callable[[int], SolidMesh]:
-    return lambda number: read_solid(files[number])
-
-
-def __getattr__(name: str) -> Shelf:
-    """`RANDOM`, found when it is first asked for: that reads a thousand files."""
-    if name != "RANDOM":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return _random_urdfs()
-
-
-@functools.cache
-def _random_urdfs() -> Shelf:
-    """The shapes of pybullet_data's `random_urdfs` that are, as they are made, narrow enough for a hand from above.
-
-    Raises:
-        MissingDependencyError: pybullet_data is not installed.
-    """
-    files = []
-    for path in sorted(data_folder().glob("random_urdfs/*/*.obj")):
-        rows = [line.split()[1:3] for line in path.read_text().splitlines() if line.startswith("v ")]
-        sides = RANDOM_SCALE * np.ptp(np.array(rows, dtype=np.float64), axis=0)
-        if float(sides.min()) < WIDEST:
-            files.append(path)
-
-    @functools.lru_cache(maxsize=1024)
-    def shape(number: int) -> SolidMesh:
-        return on_steadiest_side(read_solid(files[number], RANDOM_SCALE))
-
-    return Shelf(kinds=(Kind(noun="blob", material="plastic", shape=shape, count=len(files)),))
-
-
-def on_steadiest_side(mesh: SolidMesh) -> SolidMesh:
-    """The solid turned so that it lies on that face of its hull from which it has to be tilted farthest to fall."""
-    from scipy.spatial import ConvexHull  # takes a while to load
-
-    mesh = mesh.centred()
-    hull = ConvexHull(mesh.points)
-    best, down = 0.0, np.array([0.0, 0.0, -1.0])
-    for normal in np.unique(np.round(hull.equations[:, :3], 3), axis=0):
-        out = normal / math.sqrt(float(normal @ normal))
-        heights = mesh.points @ out
-        face = mesh.points[heights > heights.max() - FLAT]
-        across = np.cross(out, np.eye(3)[int(np.argmin(np.abs(out)))])
-        corners = np.stack([face @ across, face @ np.cross(out, across)], axis=1) / math.sqrt(float(across @ across))
-        if np.linalg.matrix_rank(corners - corners[0], tol=FLAT) < 2:
-            continue
-        steady = -float(ConvexHull(corners).equations[:, 2].max()) / float(heights.max())
-        if steady > best:
-            best, down = steady, out
-    x, y, z = (-down).tolist()
-    return mesh.moved(standing_rotation((x, y, z)), np.zeros(3))
-
-
-def _noun(stem: str) -> str:
-    words = [word for word in re.findall("[a-z]+", stem.lower()) if word not in COLOR_WORDS]
-    return "_".join(words) or "object"
-
-
-@functools.lru_cache(maxsize=1024)
-def read_solid(path: Path, scale: float = 1.0) -> SolidMesh:
-    """The solid in a mesh file of so many metres a unit, without parts, its middle at the origin.
-
-    Raises:
-        ConfigError: The file cannot be read, or its mesh is open, huge, too wide or has too many points.
-    """
-    try:
-        points, faces = _read(path)
-    except Exception as error:  # trimesh raises what it happens to stumble over
-        raise ConfigError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
-    if not len(faces) or not np.isfinite(points).all():
-        raise ConfigError(f"The mesh has no triangles, or points that are no numbers: {path}")
-    points = scale * points
-    extents = points.max(axis=0) - points.min(axis=0)
-    size = " x ".join(f"{side:.3g}" for side in extents.tolist())
-    if float(extents.max()) > MAX_EXTENT:
-        raise ConfigError(f"The mesh is {size} m, at most {MAX_EXTENT} are allowed: is it in millimetres? {path}")
-    if float(extents.min()) > WIDEST:
-        raise ConfigError(f"The mesh is {size} m, a gripper takes {WIDEST} at most: scale it down: {path}")
-    grid = np.round((points - (points.max(axis=0) + points.min(axis=0)) / 2) / UNIT).astype(np.int64)
-    welded, rows = np.unique(grid, axis=0, return_inverse=True)
-    faces = rows.reshape(-1)[faces]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    if len(welded) > MAX_POINTS or len(faces) > 2 * MAX_POINTS:
-        raise ConfigError(f"The mesh has {len(welded):,} points, {MAX_POINTS:,} are allowed: simplify it: {path}")
-    solid = SolidMesh(points=welded * UNIT, faces=faces, parts=())
-    if not solid.is_closed() or solid.mass_properties()[0] <= 0:
-        raise ConfigError(f"The mesh is open or inside out, so it has no volume: close its surface: {path}")
-    return solid
-
-
-def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    """(V, 3) points and (F, 3) triangles."""
-    with open_regular(path) as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
-    if path.suffix.lower() == ".obj":
-        found = read_obj(path)
-        return found.points, found.faces
-    import trimesh  # takes a second to load
-
-    kind = path.suffix.lower()[1:]
-    mesh = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True)
-    points, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(points):
-        raise ValueError("a face names a point that it does not have")
-    if kind == "glb":  # whose y axis points up
-        points = points[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-    return points, faces

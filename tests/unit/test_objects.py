@@ -24,7 +24,8 @@ from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.episode.variation import Ranges
 from demorec.loop import ScriptAgent, Session, make_world
 from demorec.objects.antipodal import antipodal_grasps
-from demorec.objects.shelf import Kind, load_shelf, on_steadiest_side, read_solid
+from demorec.objects.folder import load_shelf, on_steadiest_side, read_solid
+from demorec.objects.shelf import Kind
 from demorec.objects.solids import dish
 from demorec.render.painter import Painter
 from demorec.robots.assets import data_folder
