@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from demorec.cli.shared.output import say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.core.errors import ConfigError, check_option
-from demorec.learn.evaluate import TakeOver
+from demorec.learn.evaluate import Plan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,7 @@ class Pretrain:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Improve:
+class Improve(Plan):
     """Train a policy, let the expert correct it where it strays, and train again on everything, in rounds.
 
     Round 0 learns from the demonstrations alone. In each later round, the policy of the round before acts in new
@@ -128,26 +128,6 @@ class Improve:
 
     demonstrations: Positional[Path]
     """A run of generate-dataset with --split train, which excludes the held-out scenes."""
-    config_path: Path
-    """Settings for lerobot-train (JSON); its dataset, output folder and seed are replaced."""
-    num_rounds: int = 2
-    """Number of rounds of corrections."""
-    num_episodes: int = 50
-    """Scenes per round in which the policy is corrected."""
-    num_scenes: int = 50
-    """Held-out scenes on which each policy is evaluated."""
-    seed: int = 1
-    """Seed of the trainings; the scenes of round k use the root seed of the demonstrations plus SEED + k."""
-    action: str = "joint_increment"
-    """joint, joint_increment, ee or ee_delta."""
-    state: str = "joint"
-    """joint or joint_ee, as in demorec export lerobot."""
-    privileged: bool = False
-    """As in demorec export lerobot: let the policy see observation.environment_state."""
-    features: tuple[str, ...] = ()
-    """As in demorec export lerobot: the features to learn from; all by default."""
-    takeover: TakeOver = field(default_factory=TakeOver)
-    """When the expert takes over."""
     out: Path = Path("outputs/improve")
     """Folder for the rounds."""
     workers: int | None = None
@@ -157,33 +137,21 @@ class Improve:
 
     def run(self) -> int:
         """Go through the rounds and report."""
-        check_option("num_rounds", self.num_rounds, 0, 1000)
-        check_option("num_episodes", self.num_episodes, 1, 1_000_000)
-        check_option("num_scenes", self.num_scenes, 1, 1_000_000)
+        self.validate()
         check_option("workers", self.workers, 1, 1024)
         self.takeover.validate()
         refuse_inside([self.out])
         from demorec.core.processes import available_cores
-        from demorec.core.registry import check_choice
-        from demorec.episode.features import STATE_KINDS
-        from demorec.learn.evaluate.improvement import Improvement, Plan
-        from demorec.loop.actions import ACTION_KINDS
+        from demorec.learn.evaluate.improvement import Improvement
 
-        plan = Plan(
+        improvement = Improvement(
+            self,
+            self.out,
             demonstrations=self.demonstrations,
-            config_path=self.config_path,
             words=self.others,
-            num_rounds=self.num_rounds,
-            num_episodes=self.num_episodes,
-            num_scenes=self.num_scenes,
-            seed=self.seed,
-            action=check_choice("action", self.action, ACTION_KINDS),
-            state=check_choice("state", self.state, STATE_KINDS),
-            privileged=self.privileged,
-            features=self.features,
-            takeover=self.takeover,
+            workers=self.workers or available_cores(),
+            tell=tell,
         )
-        improvement = Improvement(plan, self.out, workers=self.workers or available_cores(), tell=tell)
         rounds = list(improvement.rounds())
         say(
             f"{'round':>5} {'demonstrations':>15} {'corrected':>10} {'training CPU s':>15}  success (Wilson 95 %)",

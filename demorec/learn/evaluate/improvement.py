@@ -17,7 +17,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from demorec.core.config import GenerateConfig, deciding_versions
@@ -26,47 +26,19 @@ from demorec.core.files import LOCK_NAME, free_name, read_json_object, replace_t
 from demorec.core.own_versions import plain_differences
 from demorec.core.plain import to_plain
 from demorec.core.processes import start_program
+from demorec.core.registry import check_choice
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.episode.features import ActionKind, StateKind
-from demorec.learn.evaluate import TakeOver
+from demorec.episode.features import STATE_KINDS
+from demorec.learn.evaluate import Plan, TakeOver
 from demorec.learn.evaluate.policy import TRAIN_CONFIG_NAME, find_checkpoint, policy_summary
 from demorec.learn.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
 from demorec.learn.evaluate.statistics import Rate
 from demorec.learn.evaluate.turns import read_takeover
+from demorec.loop.actions import ACTION_KINDS
 from demorec.runs.run_file import load_run_file
 
 SETTINGS_NAME, TRAINED_NAME, LOG_NAME = "improve.json", "training.json", "training.log"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What decides the result.
-
-    Attributes:
-        demonstrations: A run of plain demonstrations.
-        config_path: Settings for lerobot-train; the rounds put their own dataset, output folder and seed into them.
-        words: Further flags of lerobot-train.
-        num_rounds: Rounds of corrections.
-        num_episodes: Scenes in which the policy of a round is corrected.
-        num_scenes: Held-out scenes on which each policy is tried.
-        seed: Of the trainings; the scenes of round k have the root seed of the demonstrations' plus `seed` + k.
-        action, state, privileged, features: As of the export.
-        takeover: When the expert takes over.
-    """
-
-    demonstrations: Path
-    config_path: Path
-    words: tuple[str, ...] = ()
-    num_rounds: int
-    num_episodes: int
-    num_scenes: int
-    seed: int
-    action: ActionKind
-    state: StateKind = "joint"
-    privileged: bool
-    features: tuple[str, ...]
-    takeover: TakeOver
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,13 +66,30 @@ class Improvement:
     Args:
         plan: What to do.
         out: Where.
+        demonstrations: A run of plain demonstrations.
+        words: Further flags of lerobot-train.
         workers: Processes that simulate.
         tell: Is given a line at every step.
+
+    Raises:
+        ConfigError: There is no such run, or no such kind of action or state.
     """
 
-    def __init__(self, plan: Plan, out: Path, *, workers: int, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        out: Path,
+        *,
+        demonstrations: Path,
+        words: Sequence[str],
+        workers: int,
+        tell: Callable[[str], None],
+    ) -> None:
         self._plan, self._out, self._workers, self._tell = plan, out, workers, tell
-        run = load_run_file(plan.demonstrations)
+        self._demonstrations, self._words = demonstrations, words
+        self._action = check_choice("action", plan.action, ACTION_KINDS)
+        self._state = check_choice("state", plan.state, STATE_KINDS)
+        run = load_run_file(demonstrations)
         self._config = replace(run.config, sampling="random")
         self._num_demonstrations = len(run.successes)
 
@@ -127,17 +116,17 @@ class Improvement:
         How many rounds and held-out scenes there are may change.
         """
         path = self._out / SETTINGS_NAME
-        plan = to_plain(replace(self._plan, num_rounds=0, num_scenes=0))
+        plan = replace(self._plan, num_rounds=0, num_scenes=0)
         try:
             settings = read_json_object(self._plan.config_path)
         except (OSError, ValueError) as error:
             raise ConfigError(
                 f"The settings of the training cannot be read ({describe_error(error)}): {self._plan.config_path}"
             ) from error
-        found = {**plan, "training": settings, "versions": deciding_versions(self._config)}
-        for name in ("demonstrations", "config_path"):
-            del found[name]  # what they hold counts, not where they lie
-        found["config"] = to_plain(self._config)
+        # What config_path holds counts, not where it lies.
+        names = [field.name for field in fields(Plan) if field.name != "config_path"]
+        found = {"words": list(self._words), **{name: to_plain(getattr(plan, name)) for name in names}}
+        found |= {"training": settings, "versions": deciding_versions(self._config), "config": to_plain(self._config)}
         if not path.exists():
             if strangers := [each.name for each in self._out.iterdir() if each.name != LOCK_NAME]:
                 raise ConfigError(
@@ -183,7 +172,7 @@ class Improvement:
         self, policy: Path, config: GenerateConfig, out: Path, count: int, takeover: TakeOver | None = None
     ) -> Evaluation:
         own = tuple(name for name in config.cameras if ":" in name)  # the others are named by the policy itself
-        settings = settings_for(policy, replace(config, cameras=own), action=self._plan.action)
+        settings = settings_for(policy, replace(config, cameras=own), action=self._action)
         return evaluate(replace(settings, takeover=takeover), out, num_episodes=count, workers=self._workers)
 
     def _corrections(self, number: int) -> Path:
@@ -197,14 +186,14 @@ class Improvement:
         part = dataset.with_name("dataset.part")
         options = ExportOptions(
             repo_id="local/improve",
-            action=self._plan.action,
-            state=self._plan.state,
+            action=self._action,
+            state=self._state,
             privileged=self._plan.privileged,
             features=(*self._plan.features, "intervention") if self._plan.features else (),
             intervention=True,
             verify=False,
         )
-        export_lerobot((self._plan.demonstrations,), part, replace(options, overwrite=True))
+        export_lerobot((self._demonstrations,), part, replace(options, overwrite=True))
         for k in range(1, number + 1):
             if corrected_episodes(self._corrections(k)):
                 more = replace(options, append=True, corrected_only=True)
@@ -238,7 +227,7 @@ class Improvement:
                 "--dataset.repo_id=local/improve",
                 f"--output_dir={train}",
                 f"--seed={self._plan.seed}",
-                *self._plan.words,
+                *self._words,
             ]
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         _run_training(words, folder / LOG_NAME)
