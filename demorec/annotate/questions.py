@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from demorec.episode.episode import Columns
 from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording
 
+Exchange = tuple[str, dict[str, Any]]
+"""A question and its answer."""
 ANSWERS = {
     "bbox": {"detections"},
     "keypoint": {"label", "point_format", "point"},
@@ -123,75 +126,51 @@ def questions(
         yield from of_camera
 
 
-def _ask(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
-    """The next kind of question that the image has an answer to."""
+def _ask(view: _View, turn: int) -> Exchange | None:
+    """The next kind of question that the image has an answer to; of one kind another one each time."""
     for step in range(len(_KINDS)):
-        asked = _KINDS[(turn + step) % len(_KINDS)](view, turn // len(_KINDS))
-        if asked is not None:
-            return asked
+        if found := list(_KINDS[(turn + step) % len(_KINDS)](view)):
+            return found[turn // len(_KINDS) % len(found)]
     return None
 
 
-def _bbox(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
-    if not view.clear:
-        return None
-    name, phrase = list(view.clear.items())[turn % len(view.clear)]
-    found = {"label": phrase, "bbox_format": "xyxy", "bbox": list(view.seen[name].box)}
-    return f"Where is {phrase}?", {"detections": [found]}
+def _bbox(view: _View) -> Iterator[Exchange]:
+    for name, phrase in view.clear.items():
+        found = {"label": phrase, "bbox_format": "xyxy", "bbox": list(view.seen[name].box)}
+        yield f"Where is {phrase}?", {"detections": [found]}
 
 
-def _keypoint(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+def _keypoint(view: _View) -> Iterator[Exchange]:
     pixels, inside = pixels_of(view.camera, np.array([view.middles[name] for name in view.clear]).reshape(-1, 2))
-    names = [
-        (name, pixel)
-        for name, pixel, is_inside in zip(view.clear, pixels.tolist(), inside.tolist(), strict=True)
-        if is_inside and view.seen[name].is_at(*pixel)
-    ]
-    if not names:
-        return None
-    name, pixel = names[turn % len(names)]
-    phrase = view.clear[name]
-    return f"Point at the middle of {phrase}.", {"label": phrase, "point_format": "xy", "point": pixel}
+    for (name, phrase), pixel, is_inside in zip(view.clear.items(), pixels.tolist(), inside.tolist(), strict=True):
+        if is_inside and view.seen[name].is_at(*pixel):
+            yield f"Point at the middle of {phrase}.", {"label": phrase, "point_format": "xy", "point": pixel}
 
 
-def _count(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
+def _count(view: _View) -> Iterator[Exchange]:
     nouns: dict[str, list[int]] = {}
     for thing in view.now.things:
         if thing.name in view.seen:
             for noun in thing.nouns:
                 nouns.setdefault(noun, []).append(view.seen[thing.name].num_pixels)
-    clear = sorted(noun for noun, pixels in nouns.items() if min(pixels) >= MIN_PIXELS)
-    if not clear:
-        return None
-    noun = clear[turn % len(clear)]
-    return f"How many {noun}s are visible?", {"label": noun, "count": len(nouns[noun])}
+    for noun in sorted(nouns):
+        if min(nouns[noun]) >= MIN_PIXELS:
+            yield f"How many {noun}s are visible?", {"label": noun, "count": len(nouns[noun])}
 
 
-def _attribute(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
-    found = []
+def _attribute(view: _View) -> Iterator[Exchange]:
     for name in view.clear:
         thing = view.now.thing(name)
         plain = (phrase for phrase in _phrases(name, view.now) if thing.color not in phrase.split())
         if thing.color and (phrase := next(plain, "")):
-            found.append((phrase, thing.color))
-    if not found:
-        return None
-    phrase, color = found[turn % len(found)]
-    return f"What colour is {phrase}?", {"label": phrase, "attribute": "color", "value": color}
+            yield f"What colour is {phrase}?", {"label": phrase, "attribute": "color", "value": thing.color}
 
 
-def _spatial(view: _View, turn: int) -> tuple[str, dict[str, Any]] | None:
-    found = []
-    for name in view.clear:
-        for other in view.clear:
-            if name != other and (relation := _relation(view, name, other)):
-                found.append((name, relation, other))
-    if not found:
-        return None
-    name, relation, other = found[turn % len(found)]
-    subject, object_ = view.clear[name], view.clear[other]
-    answer = {"subject": subject, "relation": relation, "object": object_}
-    return f"Where is {subject} relative to {object_}, as the camera sees it?", answer
+def _spatial(view: _View) -> Iterator[Exchange]:
+    for (name, subject), (other, object_) in permutations(view.clear.items(), 2):
+        if relation := _relation(view, name, other):
+            answer = {"subject": subject, "relation": relation, "object": object_}
+            yield f"Where is {subject} relative to {object_}, as the camera sees it?", answer
 
 
 def _relation(view: _View, name: str, other: str) -> str:
@@ -215,13 +194,7 @@ def rests_on(upper: NamedThing, lower: NamedThing) -> bool:
     return -2 * _TOUCHING < air < _TOUCHING and float(np.abs(offset[:2]).max()) < within
 
 
-_KINDS: tuple[Callable[[_View, int], tuple[str, dict[str, Any]] | None], ...] = (
-    _bbox,
-    _keypoint,
-    _count,
-    _attribute,
-    _spatial,
-)
+_KINDS: tuple[Callable[[_View], Iterator[Exchange]], ...] = (_bbox, _keypoint, _count, _attribute, _spatial)
 
 
 def traces(
