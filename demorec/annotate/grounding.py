@@ -38,12 +38,12 @@ class Seen:
     _label: int
     _labels: NDArray[np.uint16]
 
-    @cached_property
+    @property
     def pixels(self) -> NDArray[np.intp]:
-        """(N,) numbers of the pixels that show it, counted row by row from the upper left, in order."""
-        shown = self._labels == self._label
-        _, y_min, _, y_max = self.box
-        return np.asarray(np.flatnonzero(shown[y_min : y_max + 1]) + y_min * shown.shape[1])
+        """(N,) numbers of the pixels that show it, counted as COCO does, column by column from the upper left."""
+        x_min, _, x_max, _ = self.box
+        shown = self._labels[:, x_min : x_max + 1] == self._label
+        return np.asarray(np.flatnonzero(shown.T) + x_min * len(shown))
 
     @cached_property
     def box(self) -> tuple[int, int, int, int]:
@@ -166,15 +166,8 @@ def seen_objects(
                 box=(x_min, y_min, x_max - x_min + 1, y_max - y_min + 1),
                 area=seen.num_pixels,
                 visible_fraction=None if whole is None else round(min(1.0, seen.num_pixels / max(whole, 1e-9)), 4),
-                counts=run_lengths(_by_column(seen.pixels, labels.shape), labels.size),
+                counts=run_lengths(seen.pixels, labels.size),
             )
-
-
-def _by_column(pixels: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """Pixels of an image (height, width) that are counted row by row as COCO counts them, column by column."""
-    height, width = shape
-    rows, columns = np.divmod(pixels, width)
-    return np.sort(columns * height + rows)
 
 
 def run_lengths(pixels: NDArray[np.intp], size: int) -> tuple[int, ...]:

@@ -91,8 +91,10 @@ def _ordered(order: str, things: Sequence[NamedThing]) -> list[NamedThing]:
     """The one thing that is first in an order; none when it is not so by the margin, or when there are too few."""
     if order == "middle":
         return _middle(things)
-    at_least, at_most, value, margin = _ORDERS[order]
-    return _first(things, value, margin) if at_least <= len(things) <= at_most else []
+    at_least, at_most, sign, measure, margin = _ORDERS[order]
+    if not at_least <= len(things) <= at_most:
+        return []
+    return _first(things, lambda thing: sign * measure(thing), margin)
 
 
 def _first(things: Sequence[NamedThing], value: Callable[[NamedThing], float], margin: float) -> list[NamedThing]:
@@ -116,12 +118,8 @@ def _middle(things: Sequence[NamedThing]) -> list[NamedThing]:
     return chosen if chosen and detour(chosen[0]) < MIN_GAP else []
 
 
-def _to_the_right(thing: NamedThing) -> float:
+def _leftward(thing: NamedThing) -> float:
     return float(thing.position[1])
-
-
-def _to_the_left(thing: NamedThing) -> float:
-    return -float(thing.position[1])
 
 
 def _size(thing: NamedThing) -> float:
@@ -133,16 +131,17 @@ def _distance(thing: NamedThing) -> float:
 
 
 _RATIO = math.log(MIN_SIZE_RATIO)
-_ORDERS: dict[str, tuple[int, float, Callable[[NamedThing], float], float]] = {
-    "left": (2, 2, _to_the_left, MIN_GAP),
-    "right": (2, 2, _to_the_right, MIN_GAP),
-    "leftmost": (3, math.inf, _to_the_left, MIN_GAP),
-    "rightmost": (3, math.inf, _to_the_right, MIN_GAP),
-    "smaller": (2, 2, _size, _RATIO),
-    "larger": (2, 2, lambda thing: -_size(thing), _RATIO),
-    "smallest": (3, math.inf, _size, _RATIO),
-    "largest": (3, math.inf, lambda thing: -_size(thing), _RATIO),
-    "nearest to the robot": (2, math.inf, _distance, MIN_GAP),
-    "farthest from the robot": (2, math.inf, lambda thing: -_distance(thing), MIN_GAP),
+_ORDERS: dict[str, tuple[int, float, int, Callable[[NamedThing], float], float]] = {
+    "left": (2, 2, -1, _leftward, MIN_GAP),
+    "right": (2, 2, 1, _leftward, MIN_GAP),
+    "leftmost": (3, math.inf, -1, _leftward, MIN_GAP),
+    "rightmost": (3, math.inf, 1, _leftward, MIN_GAP),
+    "smaller": (2, 2, 1, _size, _RATIO),
+    "larger": (2, 2, -1, _size, _RATIO),
+    "smallest": (3, math.inf, 1, _size, _RATIO),
+    "largest": (3, math.inf, -1, _size, _RATIO),
+    "nearest to the robot": (2, math.inf, 1, _distance, MIN_GAP),
+    "farthest from the robot": (2, math.inf, -1, _distance, MIN_GAP),
 }
-"""Word -> of how many things it is said, at least and at most; what the chosen one has least of; and by how much."""
+"""Word -> of how many things it is said, at least and at most; whether the chosen one has least (1) or most (-1) of
+what; and by how much."""
