@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from multiprocessing import connection, resource_tracker
@@ -42,12 +42,8 @@ class _Process(SpawnProcess):
     def start(self) -> None:
         _start_tracker()
         # The new process inherits the mask: Ctrl-C waits until `run` can catch it, also while modules are imported.
-        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            with _main_hidden():
-                super().start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, held)
+        with blocked(signal.SIGINT), _main_hidden():
+            super().start()
 
     def run(self) -> None:
         try:
@@ -125,18 +121,36 @@ def _start_tracker() -> None:
 
     It removes the semaphores that a killed process leaves, and would call them leaked on the terminal.
     """
-    name = "PYTHONWARNINGS"
-    before = os.environ.get(name)
     quiet = f"ignore::UserWarning:{resource_tracker.__name__}"
     with _starting:
-        os.environ[name] = f"{before},{quiet}" if before else quiet
-        try:
+        before = os.environ.get("PYTHONWARNINGS")
+        with environment({"PYTHONWARNINGS": f"{before},{quiet}" if before else quiet}):
             resource_tracker.ensure_running()
-        finally:
-            if before is None:
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables for a child that starts inside; libraries read them when they are imported."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
                 del os.environ[name]
             else:
-                os.environ[name] = before
+                os.environ[name] = value
+
+
+@contextmanager
+def blocked(*numbers: signal.Signals) -> Iterator[None]:
+    """Hold signals back, here and in a child that starts inside, until each is ready for them."""
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, held)
 
 
 def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.connection import Connection
@@ -19,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 
 from demorec.core.config import EpisodePlan
-from demorec.core.processes import SPAWN
+from demorec.core.processes import SPAWN, blocked, environment
 from demorec.generate.executor import SINGLE_THREADED, Executor, Report, attempt_episode, lost
 
 _OF_THE_GROUP = frozenset({signal.SIGINT, signal.SIGTERM})
@@ -124,7 +123,7 @@ class LocalExecutor(Executor):
         process = SPAWN.Process(
             target=_worker_main, args=(theirs, self._maker, self._folder), name="demorec-worker", daemon=True
         )
-        with _environment(SINGLE_THREADED), _blocked(_OF_THE_GROUP):
+        with environment(SINGLE_THREADED), blocked(*_OF_THE_GROUP):
             process.start()
         theirs.close()  # else the pipe would never report that the worker is gone
         worker = _Worker(process=process, pipe=ours)
@@ -166,28 +165,3 @@ def _death(exitcode: int | None) -> str:
         name = signal.Signals(-exitcode).name
         return f"its worker was ended by {name}" + (" (out of memory?)" if exitcode == -signal.SIGKILL else "")
     return f"its worker ended with exit code {exitcode}"
-
-
-@contextmanager
-def _environment(variables: dict[str, str]) -> Iterator[None]:
-    """Set environment variables for a child that starts inside; libraries read them when they are imported."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def _blocked(numbers: frozenset[signal.Signals]) -> Iterator[None]:
-    """Hold signals back, here and in a child that starts inside, until each is ready for them."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
