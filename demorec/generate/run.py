@@ -179,7 +179,11 @@ class _Driver:
         """Until nothing is due any more; returns whether the user has interrupted it."""
         with _catch_interrupts() as interrupts:
             for reports in self._reports():
-                self._handle(reports)
+                for report in reports:
+                    if isinstance(report, Made):
+                        self._made(report)
+                    else:
+                        self._raised(report)
                 if interrupts:
                     break
             else:
@@ -204,13 +208,6 @@ class _Driver:
             for report in self._executor.wait(POLL_S):
                 if isinstance(report, Made):
                     self._made(report)
-
-    def _handle(self, reports: list[Report]) -> None:
-        for report in reports:
-            if isinstance(report, Made):
-                self._made(report)
-            else:
-                self._raised(report)
 
     def _made(self, report: Made) -> None:
         self._schedule.report(report.attempt)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Literal, Protocol
 
 from demorec.core.errors import RenderError
@@ -127,11 +128,7 @@ class Renderer(Protocol):
 
 def first_rows(bodies: Sequence[VisualBody]) -> list[int]:
     """Row of each body's base in the poses that `Renderer.render` is given; link n is n + 1 rows below it."""
-    rows, count = [], 0
-    for body in bodies:
-        rows.append(count)
-        count += 1 + body.num_links
-    return rows
+    return list(accumulate((1 + body.num_links for body in bodies), initial=0))[:-1]
 
 
 MAX_SAMPLES = 1 << 28

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Protocol, Self
+from typing import Protocol
 
+from demorec.core.files import Closing
 from demorec.core.geometry import Array, Pose
 from demorec.core.tables import RENDERERS
 from demorec.episode.episode import CameraImages
@@ -97,7 +98,7 @@ class Painter:
         return images
 
 
-class WarmRenderer:
+class WarmRenderer(Closing):
     """Hands out one renderer again and again, and another only when another name is asked for; a context manager.
 
     What it has read of meshes and textures is not read again.
@@ -106,12 +107,6 @@ class WarmRenderer:
     def __init__(self) -> None:
         self._name = ""
         self._renderer: Renderer | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def of(self, name: str) -> Renderer:
         """The entered renderer of a row of the renderers' table; it stays open, one of another name is closed.

@@ -159,7 +159,7 @@ def _make(path: Path, make: Callable[[], RasterMesh]) -> RasterMesh:
     arrays = {name: value for name, value in vars(mesh).items() if isinstance(value, np.ndarray)}
     texture = np.array("" if mesh.texture is None else str(mesh.texture))
     try:
-        write_whole(path, lambda temporary: np.savez(temporary, **arrays, texture=texture))
+        write_whole(path, lambda temporary: np.savez(temporary, **arrays, texture=texture))  # type: ignore[arg-type]
     except OSError as error:
         log.warning("The mesh cache cannot be written (%s): %s", error.strerror, path)
     return mesh

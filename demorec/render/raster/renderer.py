@@ -6,11 +6,11 @@ import functools
 import logging
 import math
 from dataclasses import replace
-from typing import Self
 
 import numpy as np
 
 from demorec.core.cache import folder_lock
+from demorec.core.files import Closing
 from demorec.core.geometry import Array, Pose, look_at
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import SceneCamera, Texture
@@ -33,7 +33,7 @@ CASTER_FACES_PER_METRE = 900.0
 """Triangles that a mesh keeps in the shadow map for each metre of its diameter."""
 
 
-class RasterRenderer:
+class RasterRenderer(Closing):
     """The default renderer, on the CPU, compiled with numba: no system package, no GPU. See docs/rendering.md.
 
     Args:
@@ -49,12 +49,6 @@ class RasterRenderer:
         self._views: list[CameraView] = []
         self._stage: Stage | None = None
         warm_up()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free buffers, meshes and textures; harmless when called twice."""
