@@ -90,12 +90,6 @@ def count(into: Components, feature: str, names: Iterable[str], values: NDArray[
         into.setdefault((feature, name), Histogram()).add(column)
 
 
-def merge(into: Components, found: Components) -> None:
-    """Add the counts of one episode to those of all."""
-    for key, histogram in found.items():
-        into.setdefault(key, Histogram()).merge(histogram)
-
-
 @dataclass(kw_only=True)
 class CheckSummary:
     """One check over everything that it looked at.

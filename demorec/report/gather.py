@@ -7,6 +7,9 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
 from demorec.core.errors import ConfigError, ExportError, RecordingError, without_path
@@ -25,7 +28,6 @@ from demorec.report.content import (
     common_facts,
     count,
     few,
-    merge,
 )  # fmt: skip
 from demorec.report.dataset import dataset_report
 from demorec.report.filmstrip import MAX_SHOWN, filmstrip, strip_budget
@@ -47,7 +49,11 @@ _KINDS: Mapping[PathKind, str] = {
     "evaluation": "evaluation of a policy",
     "recordings": "folder of recordings",
 }
-_Read = tuple[ReportedEpisode, Components, SubjectReport | None]
+_Vectors = dict[str, tuple[Sequence[str], NDArray[Any]]]
+"""Feature -> the names of its components, and its values (T, D)."""
+_Read = tuple[ReportedEpisode, _Vectors, SubjectReport | None]
+_AHEAD = 4
+"""Episodes that a process may have read before they are counted here."""
 
 
 def gather(
@@ -96,9 +102,10 @@ def _recordings_report(
     total = len(subjects) + len(folders)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for episode, counted, checked in _read_all(path, camera, checks, subjects, workers):
+    for episode, vectors, checked in _read_all(path, camera, checks, subjects, workers):
         episodes.append(episode)
-        merge(components, counted)
+        for feature, (names, values) in vectors.items():
+            count(components, feature, names, values)
         if checked is not None:
             summaries.add(checked.judged, episode.name)
         advance(len(episodes), total)
@@ -132,7 +139,9 @@ def _read_all(
     stride = -(-len(subjects) // MAX_SHOWN)
     budget = strip_budget(len(subjects))
     strips = [0 if number % stride and not s.is_failed_attempt else budget for number, s in enumerate(subjects)]
-    return in_turn(partial(_read, root, camera, checks), list(zip(subjects, strips, strict=True)), workers)
+    return in_turn(
+        partial(_read, root, camera, checks), list(zip(subjects, strips, strict=True)), workers, ahead=_AHEAD
+    )
 
 
 def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Subject, int]) -> _Read:
@@ -145,13 +154,13 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
     source = path.name if path == root else path.relative_to(root).as_posix()
     try:
         with open_recording(path) as recording:
-            episode, counts = _read_recording(recording, camera, strip_bytes)
+            episode, vectors = _read_recording(recording, camera, strip_bytes)
     except RecordingError as error:
-        episode, counts = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
-    return replace(episode, source=source, flags=tuple(flags)), counts, checked
+        episode, vectors = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
+    return replace(episode, source=source, flags=tuple(flags)), vectors, checked
 
 
-def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, Components]:
+def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, _Vectors]:
     info, content = recording.info, ExportEpisode(recording, CommonOptions())
     names = content.columns.phase
     if camera and camera not in recording.cameras:
@@ -181,19 +190,16 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tupl
         facts=tuple(_facts_of(recording)),
         info=None if simulated is None else info,
     )
-    return episode, _components(content)
+    return episode, _vectors(content)
 
 
-def _components(content: ExportEpisode) -> Components:
+def _vectors(content: ExportEpisode) -> _Vectors:
     """State and action as an export has them; nothing of an episode that could not be exported."""
-    counts: Components = {}
     try:
-        for feature in (STATE, ACTION):
-            if feature in content.vectors:
-                count(counts, feature, content.names[feature], content.vectors[feature])
+        vectors = content.vectors
+        return {name: (content.names[name], vectors[name]) for name in (STATE, ACTION) if name in vectors}
     except ExportError:  # no frames, or numbers that are not finite, which the checks report
         return {}
-    return counts
 
 
 def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:

@@ -1,8 +1,7 @@
 """Exact histograms of any number of values in bounded memory, without knowing their range beforehand.
 
 Bins are 2^k wide and begin at multiples of their width, so that two neighbours make one bin of the next width and no
-value is ever counted twice or moved: whatever the order in which values come, and from however many processes, the
-counts are the same.
+value is ever counted twice or moved: whatever the order in which values come, the counts are the same.
 """
 
 from __future__ import annotations
@@ -53,27 +52,19 @@ class Histogram:
         self.not_finite += len(flat) - len(finite)
         if not len(finite):
             return
-        self._take(float(finite.min()), float(finite.max()), float(finite.sum()), len(finite))
+        self.total += float(finite.sum())
+        self.count += len(finite)
+        self._make_room(float(finite.min()), float(finite.max()))
         places = np.floor(np.ldexp(finite, -self.exponent)).astype(np.int64)
         places[(places == 0) & (finite < 0)] = -1  # so small that dividing it made zero of it
         numbers, counts = np.unique(places, return_counts=True)
         self._count(zip(numbers.tolist(), counts.tolist(), strict=True), 0)
 
-    def merge(self, other: Histogram) -> None:
-        """Count what another one has counted."""
-        self.not_finite += other.not_finite
-        if not other.count:
-            return
-        self._take(other.minimum, other.maximum, other.total, other.count, other.exponent)
-        self._count(other.bins.items(), self.exponent - other.exponent)
-
-    def _take(self, low: float, high: float, total: float, count: int, least: int = -(1 << 20)) -> None:
-        """Make room for values from `low` to `high`."""
+    def _make_room(self, low: float, high: float) -> None:
+        """For values from `low` to `high`."""
         self.minimum, self.maximum = min(self.minimum, low), max(self.maximum, high)
-        self.total += total
-        self.count += count
         largest = max(abs(self.minimum), abs(self.maximum))
-        exponent = max(self.exponent, least, max(math.frexp(largest)[1], 0) - _FINEST)
+        exponent = max(self.exponent, max(math.frexp(largest)[1], 0) - _FINEST)
         while self._number(self.maximum, exponent) - self._number(self.minimum, exponent) >= MOST_BINS:
             exponent += 1
         if self.bins and exponent != self.exponent:
