@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.check.fingers import Convex, depth_in
+from demorec.check.gripper import Convex, depth_in
 from demorec.check.rows import LinkMatrices, inverse, matrices
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError

@@ -361,7 +361,7 @@ def compare_beginning(
         drawn = draw(world, scene.cameras, frames, dict.fromkeys(seen, ("color",)), grids)
     except NOT_DRAWABLE as error:
         return NotMeasured(why=f"the scene cannot be drawn here: {error}")
-    return {name: compare(cells, drawn.cells[name, "color"], drawn.frames) for name, cells in beginning.items()}
+    return {name: compare(cells, drawn[name, "color"], frames) for name, cells in beginning.items()}
 
 
 def _is_in_the_air(body: Body, bodies: Sequence[Body]) -> bool:

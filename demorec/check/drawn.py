@@ -46,33 +46,20 @@ LOSSLESS_PIXELS_PER_CELL = 4
 """The same where depth or labels are drawn: these have no smooth edges, and every cell of them is compared."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DrawnImages:
-    """What the cameras must have seen, T frames.
-
-    Attributes:
-        frames: (N,) frames that were drawn, in order, the first and the last among them; the images of the others are
-            means of the drawn ones before and after, weighted by time.
-        cells: (camera, kind) -> (T, h, w, channels).
-    """
-
-    frames: NDArray[np.int64]
-    cells: Mapping[tuple[str, ImageKind], Cells]
-
-
 def draw(
     world: RecordedWorld,
     cameras: Iterable[SceneCamera],
     frames: NDArray[np.int64],
     kinds: Mapping[str, Iterable[ImageKind]],
     counts: Mapping[str, tuple[int, int]],
-) -> DrawnImages:
-    """The frames of a world, up to the last of those that are drawn.
+) -> dict[tuple[str, ImageKind], Cells]:
+    """(camera, kind) -> (T, h, w, channels) what it must have seen in the frames of a world, up to the last one drawn.
 
     Args:
         world: What is drawn.
         cameras: Where from, in full size; those that are not among `kinds` are left out.
-        frames: Those that are drawn, in order, from 0 on; the others are filled in between.
+        frames: (N,) those that are drawn, in order, from 0 on; the images of the others are means of the drawn ones
+            before and after, weighted by time.
         kinds: Camera name -> what is to be drawn of it.
         counts: Camera name -> (columns, rows) of its grid.
 
@@ -111,7 +98,7 @@ def draw(
             rows[frame] = grids[name].read(kind, images).cells
     for rows in cells.values():
         fill_between(rows, frames)
-    return DrawnImages(frames=frames, cells=cells)
+    return cells
 
 
 _STRIDE = 3
@@ -258,7 +245,7 @@ def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> ImageCompar
 
     Args:
         seen: (T, h, w, channels) as recorded.
-        drawn: The same of at least T frames, as of `DrawnImages.cells`.
+        drawn: The same of at least T frames, as of `draw`.
         frames: Those that were drawn.
     """
     drawn, frames = drawn[: len(seen)], frames[frames < len(seen)]

@@ -227,9 +227,13 @@ class CheckedEpisode(ExitStack):
         return self.world_from_link(self.info.robot.tcp_link)
 
     def world_from_object(self, name: str) -> Array:
-        """(T, 4, 4) of a movable body as recorded."""
+        """(T, 4, 4) of a body: as recorded, or of a fixed one as the scene says."""
         if name not in self._bodies:
-            self._bodies[name] = matrices(self.columns.object_poses[name])
+            c = self.columns
+            if name in c.object_poses or (body := self.info.scene.body(name)).movable:
+                self._bodies[name] = matrices(c.object_poses[name])
+            else:
+                self._bodies[name] = np.broadcast_to(body.world_from_body.matrix(), (c.num_frames, 4, 4))
         return self._bodies[name]
 
     def is_carried(self, name: str, height: float) -> NDArray[np.bool_]:
@@ -314,7 +318,7 @@ class CheckedEpisode(ExitStack):
         if not len(seen):
             return NotMeasured(why=f"camera {camera.name} has no image that can be read")
         is_turned = camera.name in self._drawn.shift
-        return strays(seen, self._drawn.images.cells[camera.name, kind], kind, is_turned=is_turned)
+        return strays(seen, self._drawn.cells[camera.name, kind], kind, is_turned=is_turned)
 
     @cached_property
     def sampled(self) -> Mapping[str, NDArray[np.int64]]:
@@ -381,8 +385,7 @@ class CheckedEpisode(ExitStack):
         if len(seen) < 3:
             return NotMeasured(why=f"camera {camera.name} has {len(seen)} images")
         if (camera.name, kind) not in self._comparisons:
-            drawn = self._drawn.images
-            compared = compare(seen, drawn.cells[camera.name, kind], drawn.frames)
+            compared = compare(seen, self._drawn.cells[camera.name, kind], self._drawn.frames)
             shift = compared.shift + self._drawn.shift.get(camera.name, 0.0)
             self._comparisons[camera.name, kind] = replace(compared, shift=shift)
         return self._comparisons[camera.name, kind]

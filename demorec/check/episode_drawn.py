@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.cells import Cells, ImageKind, cell_counts, cell_side
-from demorec.check.drawn import DrawnImages, draw, fit, frames_to_draw, warm_renderer
+from demorec.check.drawn import draw, fit, frames_to_draw, warm_renderer
 from demorec.core.geometry import Array, Pose
 from demorec.episode.camera_error import stated_error, true_camera
 from demorec.episode.episode import Columns
@@ -37,11 +37,13 @@ class DrawnEpisode:
     """What the cameras of an episode must have seen.
 
     Attributes:
-        images: Of all frames, but for the cameras' calibration errors.
+        frames: (N,) that were drawn, in order, the first and the last among them.
+        cells: (camera, kind) -> (T, h, w, channels) as by `draw`, but for the cameras' calibration errors.
         shift: Camera name -> (2,) by how much the errors' turn moves its images to the right and down, of the height.
     """
 
-    images: DrawnImages
+    frames: NDArray[np.int64]
+    cells: Mapping[tuple[str, ImageKind], Cells]
     shift: Mapping[str, Array]
 
 
@@ -84,7 +86,8 @@ def draw_episode(
     else:
         frames = frames_to_draw(colors.values(), world.all_poses)
     return DrawnEpisode(
-        images=draw(world, cameras, frames, kinds, counts),
+        frames=frames,
+        cells=draw(world, cameras, frames, kinds, counts),
         shift={
             camera.name: np.array([turns[camera.name][1], -turns[camera.name][0]]) / _height(camera)
             for camera in cameras
@@ -165,7 +168,7 @@ def _turns(
         now = [_turned_back(camera, turns[camera.name]) for camera in cameras]
         drawn = draw(world, now, frames, dict.fromkeys(turns, ("color",)), counts)
         for camera in cameras:
-            right, down, _, about = fit(colors[camera.name][:count], drawn.cells[camera.name, "color"], frames)
+            right, down, _, about = fit(colors[camera.name][:count], drawn[camera.name, "color"], frames)
             # What is seen in the direction (x, y, 1) moves by the turn's cross product with it.
             size = cell_side(camera.width, camera.height, counts[camera.name]) / camera.height * _height(camera)
             turns[camera.name] = turns[camera.name] + np.array([-size * down, size * right, about])

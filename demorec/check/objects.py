@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, physics_check, worst_entry, worst_frame
 from demorec.check.episode import CheckedEpisode
-from demorec.check.fingers import NEAR, SOLID, depth_of_link
+from demorec.check.gripper import NEAR, SOLID, depth_of_link, top_of
 from demorec.check.rows import angle_between, displacement, held_for, inverse, longest_run, matrices
 from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Shape
@@ -41,10 +41,14 @@ def _speeds(episode: CheckedEpisode, name: str) -> Array:
     return np.asarray(np.diff(episode.columns.object_poses[name][:, :3], axis=0) * episode.info.fps)
 
 
+def _radius(body: Body) -> float:
+    """Of its bounding sphere, metres."""
+    return math.hypot(*body.shape.extents) / 2
+
+
 def _near_hand(episode: CheckedEpisode, body: Body) -> NDArray[np.bool_]:
     """(T,) whether hand or fingers may touch a body: its bounding sphere and a hand's breadth overlap."""
-    radius = math.hypot(*body.shape.extents) / 2
-    hand = episode.world_from_link(episode.info.robot.hand_link)
+    radius, hand = _radius(body), episode.world_from_link(episode.info.robot.hand_link)
     centre = episode.columns.object_poses[body.name][:, :3]
     near_tcp = np.linalg.norm(episode.world_from_tcp[:, :3, 3] - centre, axis=1) < radius + 0.06
     near_hand = np.linalg.norm(hand[:, :3, 3] - centre, axis=1) < radius + 0.12
@@ -76,12 +80,9 @@ def _touched(episode: CheckedEpisode) -> dict[str, NDArray[np.bool_]]:
             for other in bodies:
                 if other.name == body.name:
                     continue
-                reach = (math.hypot(*body.shape.extents) + math.hypot(*other.shape.extents)) / 2 + 0.01
-                gap = np.linalg.norm(
-                    episode.columns.object_poses[body.name][:, :3] - episode.columns.object_poses[other.name][:, :3],
-                    axis=1,
-                )
-                close = (gap < reach)[:-1] & active[other.name]
+                poses = episode.columns.object_poses
+                gap = np.linalg.norm(poses[body.name][:, :3] - poses[other.name][:, :3], axis=1)
+                close = (gap < _radius(body) + _radius(other) + 0.01)[:-1] & active[other.name]
                 active[body.name] = active[body.name] | held_for(close, coast)
     return active
 
@@ -208,16 +209,14 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
     for number, body in enumerate(movable):
         pose = episode.world_from_object(body.name)
         for other in (*still, *movable[number + 1 :]):
-            other_pose = (
-                episode.world_from_object(other.name) if other.movable else other.world_from_body.matrix()[None]
-            )
-            reach = (math.hypot(*body.shape.extents) + math.hypot(*other.shape.extents)) / 2
+            other_pose = episode.world_from_object(other.name)
+            reach = _radius(body) + _radius(other)
             near = np.flatnonzero(np.linalg.norm(pose[:, :3, 3] - other_pose[:, :3, 3], axis=1) < reach)
             if not len(near):
                 continue
-            depth = _depth_inside(body.shape, pose[near], other.shape, _rows(other_pose, near))
+            depth = _depth_inside(body.shape, pose[near], other.shape, other_pose[near])
             if other.movable or _is_at_surface(pose[near, :3, 3], body, other):
-                theirs = _depth_inside(other.shape, _rows(other_pose, near), body.shape, pose[near])
+                theirs = _depth_inside(other.shape, other_pose[near], body.shape, pose[near])
                 depth = np.maximum(depth, theirs)
             across, above = pose[near, :2, 3] - tcp[near, :2], pose[near, 2, 3] - tcp[near, 2]
             held = (np.linalg.norm(across, axis=1) < _IN_HAND) & (above < _IN_HAND)
@@ -239,11 +238,7 @@ def _is_at_surface(centres: Array, body: Body, other: Body) -> bool:
     pose = other.world_from_body.matrix()
     points = _surface_points(other.shape) @ pose[:3, :3].T + pose[:3, 3]
     least = np.linalg.norm(np.clip(points, centres.min(axis=0), centres.max(axis=0)) - points, axis=1).min()
-    return bool(least <= math.hypot(*body.shape.extents) / 2)
-
-
-def _rows(transforms: Array, rows: NDArray[np.intp]) -> Array:
-    return transforms if len(transforms) == 1 else transforms[rows]
+    return bool(least <= _radius(body))
 
 
 def _depth_inside(shape: Shape, pose: Array, other: Shape, other_pose: Array) -> Array:
@@ -303,10 +298,9 @@ def carried_by_gripper(episode: CheckedEpisode) -> Iterator[Found]:
         # A fall, and what follows it for a moment, needs no hand.
         falling = held_for(fall | (velocity[:, 2] < -0.5), round(COAST_SECONDS * fps))
         travelling = (np.linalg.norm(velocity, axis=1) > 0.08) & (pose[1:-1, 2] > pose[0, 2] + 0.03) & ~falling
-        reach = math.hypot(*body.shape.extents) / 2 + 0.03
         distance = np.linalg.norm(pose[1:-1, :3] - episode.world_from_tcp[1:-1, :3, 3], axis=1)
         thinnest = min(body.shape.extents) - 0.004 if body.shape.kind in SOLID else 0.002
-        held = (force > 0.3) & (distance < reach) & (width > thinnest)
+        held = (force > 0.3) & (distance < _radius(body) + 0.03) & (width > thinnest)
         wrong = travelling & ~held
         if wrong.any():
             frame = int(np.argmax(wrong))
@@ -358,16 +352,13 @@ def falls_unheld(episode: CheckedEpisode) -> Iterator[Found]:
 
 def _is_borne(episode: CheckedEpisode, body: Body, pose: Array) -> NDArray[np.bool_]:
     """(T,) whether anything is within reach below a body that may bear it, or beside it."""
-    half = math.hypot(*body.shape.extents) / 2
     bottom = pose[:, 2, 3] - np.abs(pose[:, 2, :3]) @ (np.array(body.shape.extents) / 2)
     borne = np.zeros(len(pose), dtype=np.bool_)
     for other in episode.info.scene.bodies:
         if other.name == body.name or not other.collides:
             continue
-        theirs = (
-            episode.world_from_object(other.name)[:, :3, 3] if other.movable else other.world_from_body.position[None]
-        )
-        reach = half + math.hypot(*other.shape.extents) / 2 + _GAP
+        theirs = episode.world_from_object(other.name)[:, :3, 3]
+        reach = _radius(body) + _radius(other) + _GAP
         if other.movable:
             borne |= np.linalg.norm(theirs - pose[:, :3, 3], axis=1) < reach
             continue
@@ -375,9 +366,3 @@ def _is_borne(episode: CheckedEpisode, body: Body, pose: Array) -> NDArray[np.bo
         is_large = other.shape.kind not in SOLID or not other.shape.size  # a plane has no end
         borne |= ((across < reach) | is_large) & (bottom < top_of(other) + _GAP)
     return borne
-
-
-def top_of(body: Body) -> float:
-    """Height of a standing body, metres, or more: a model may have its origin at its bottom."""
-    share = 0.5 if body.shape.kind in SOLID else 1.0
-    return float(body.world_from_body.position[2]) + share * body.shape.extents[2]

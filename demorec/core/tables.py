@@ -116,7 +116,7 @@ CHECKS: Registry[Check] = Registry(
         ("physics", "velocity_lag"),
         ("objects", "object_motion", "teleports", "spins", "starts_as_scene_says", "penetration", "carried_by_gripper"),
         ("objects", "slips", "falls_unheld"),
-        ("fingers", "finger_depth"),
+        ("gripper", "finger_depth"),
         ("alignment", "command_lag", "action_lag", "gripper_lag"),
         ("calibration", "intrinsics", "extrinsics", "projection", "image_placement", "depth_matches_scene"),
         ("calibration", "segmentation_matches_scene", "pixels_as_drawn", "image_lag"),

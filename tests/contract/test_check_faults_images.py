@@ -15,7 +15,7 @@ from support.check import checked, simulate
 from support.faults import Good, Rows
 
 from demorec.check.cells import ImageKind
-from demorec.check.drawn import DrawnImages, ImageComparison, fill_between, frames_to_draw
+from demorec.check.drawn import ImageComparison, fill_between, frames_to_draw
 from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import DrawnEpisode
 from demorec.core.geometry import Array
@@ -320,11 +320,11 @@ def drawn_in_part(good: Good, changed: Mapping[tuple[str, ImageKind], Rows], pos
     episode, whole = good.with_images(changed), good.episode._drawn
     assert isinstance(whole, DrawnEpisode)
     frames = frames_to_draw([episode.images(camera).cells for camera in episode.cameras], poses)
-    cells = {key: rows.copy() for key, rows in whole.images.cells.items() if key[1] == "color"}
+    cells = {key: rows.copy() for key, rows in whole.cells.items() if key[1] == "color"}
     for rows in cells.values():
         rows[np.setdiff1d(np.arange(len(rows)), frames)] = 0  # so that nothing but what is drawn counts
         fill_between(rows, frames)
-    episode.__dict__["_drawn"] = DrawnEpisode(images=DrawnImages(frames=frames, cells=cells), shift={})
+    episode.__dict__["_drawn"] = DrawnEpisode(frames=frames, cells=cells, shift={})
     episode._comparisons.clear()
     return episode
 
@@ -332,7 +332,7 @@ def drawn_in_part(good: Good, changed: Mapping[tuple[str, ImageKind], Rows], pos
 def test_the_good_one_passes_drawn_in_part(good: Good, poses: Array) -> None:
     episode = drawn_in_part(good, {}, poses)
     assert isinstance(episode._drawn, DrawnEpisode)
-    assert len(episode._drawn.images.frames) < 0.9 * episode.num_frames
+    assert len(episode._drawn.frames) < 0.9 * episode.num_frames
     for name in sorted({check for *_, check in COLOR} - {"image_lag"}):  # it also asks for depth and labels
         result = CHECKS.load(name).run(episode)
         assert result.level == "pass", (name, result.value, result.detail)
@@ -375,6 +375,5 @@ class RecordedStill:
         self.episode = good.with_images(first)
         drawn = good.episode._drawn
         assert isinstance(drawn, DrawnEpisode)
-        still = {key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.images.cells.items()}
-        images = DrawnImages(frames=drawn.images.frames, cells=still)
-        self.episode.__dict__["_drawn"] = DrawnEpisode(images=images, shift={})
+        still = {key: np.repeat(cells[:1], len(cells), axis=0) for key, cells in drawn.cells.items()}
+        self.episode.__dict__["_drawn"] = DrawnEpisode(frames=drawn.frames, cells=still, shift={})

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.check.fingers import Convex, depth_in
+from demorec.check.gripper import Convex, depth_in
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Shape, ShapeKind
 from demorec.sim.client import connect
