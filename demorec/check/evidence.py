@@ -187,6 +187,13 @@ def course_of(state: Array, names: Sequence[str]) -> Array:
     return course
 
 
+def _turn_nearest(action: Array, state: Array, names: Sequence[str]) -> None:
+    """Give the quaternions of actions (T, D) the sign of which they are as near as they can be to the state's."""
+    for place in quaternion_places(names):
+        turn = slice(place, place + 4)
+        action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+
+
 def quaternions(features: Mapping[str, NDArray[Any]], described: Mapping[str, Sequence[str] | None]) -> Iterator[Named]:
     """(what, (T, 4)) of all quaternions, by the names of their elements."""
     for feature, names in described.items():
@@ -351,11 +358,8 @@ def _motion(
         missing = np.full(len(state), np.nan)
         return np.stack([missing if column is None else values[:, column] for column in columns], axis=1)
 
-    action = alike(ACTION)
-    for place in [] if action is None else quaternion_places(elements):  # as near as they can be to the state's
-        assert action is not None
-        turn = slice(place, place + 4)
-        action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    if (action := alike(ACTION)) is not None:
+        _turn_nearest(action, state, elements)
     return Motion(
         where=where,
         fps=fps,

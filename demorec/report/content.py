@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,40 +91,32 @@ def count(into: Components, feature: str, names: Iterable[str], values: NDArray[
         into.setdefault((feature, name), Histogram()).add(column)
 
 
-@dataclass(kw_only=True)
-class CheckSummary:
-    """One check over everything that it looked at.
+class CheckSummaries:
+    """The checks over everything that they looked at, in the order of the first results.
 
     Attributes:
-        counts: Number of results of each level.
-        worst: The result shown: of the highest level, and of those the one with the largest value.
-        where: What that was found in.
+        worst: Name of a check -> the result shown, and what that was found in: of the highest level, and of those the
+            one with the largest value.
+        counts: Name of a check -> number of its results of each level.
+        num_subjects: How many recordings, runs and datasets there were.
     """
 
-    worst: Result
-    where: str
-    counts: dict[Level, int] = field(default_factory=dict)
-
-
-class CheckSummaries:
-    """Name of a check -> its summary, in the order of the first results."""
-
     def __init__(self) -> None:
-        self.by_name: dict[str, CheckSummary] = {}
+        self.worst: dict[str, tuple[Result, str]] = {}
+        self.counts: dict[str, Counter[Level]] = {}
         self.num_subjects = 0
 
     def add(self, results: Iterable[Result], where: str) -> None:
         """Count the results for one recording, run or dataset."""
         self.num_subjects += 1
         for result in results:
-            summary = self.by_name.setdefault(result.check, CheckSummary(worst=result, where=where))
-            summary.counts[result.level] = summary.counts.get(result.level, 0) + 1
-            if _rank(result) > _rank(summary.worst):
-                summary.worst, summary.where = result, where
+            self.counts.setdefault(result.check, Counter())[result.level] += 1
+            if result.check not in self.worst or _rank(result) > _rank(self.worst[result.check][0]):
+                self.worst[result.check] = result, where
 
-    def of(self, *levels: Level) -> list[tuple[str, CheckSummary]]:
-        """(name, summary) of the checks whose worst result has one of these levels, level by level."""
-        return [item for level in levels for item in self.by_name.items() if item[1].worst.level == level]
+    def of(self, *levels: Level) -> list[tuple[Result, str]]:
+        """The worst results that have one of these levels, level by level, and what each was found in."""
+        return [item for level in levels for item in self.worst.values() if item[0].level == level]
 
 
 def _rank(result: Result) -> tuple[int, float]:

@@ -79,7 +79,7 @@ def _stream(report: Report) -> TemplateStream:
         script=script,
         policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}",
         outcomes=_outcomes(report.episodes),
-        checks=report.checks if report.checks and report.checks.by_name else None,
+        checks=report.checks if report.checks and report.checks.worst else None,
         rate=success_rate(report.episodes),
         coverage=list(_coverage(report.episodes)),
         distributions=list(_distributions(report)),
