@@ -147,9 +147,8 @@ class Layout:
     def decode(self, messages: Sequence[bytes]) -> NDArray[Any]:
         """(N, K) values; ValueError unless every message has this layout in all its constant bytes."""
         length = len(self.constant)
-        if any(len(message) != length for message in messages):
-            found = next(len(message) for message in messages if len(message) != length)
-            raise ValueError(f"a message of {found} bytes where {length} were expected")
+        if found := [len(message) for message in messages if len(message) != length]:
+            raise ValueError(f"a message of {found[0]} bytes where {length} were expected")
         return self.decode_rows(np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), length))
 
     def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
@@ -284,16 +283,17 @@ class Readers:
 
         return read
 
+    def _count(self, count: int | None) -> Reader:
+        """Of an array: how many elements it has, which the message says where the type does not."""
+        return self._scalar("uint32") if count is None else lambda data, position: (count, position)
+
     def _numbers(self, kind: str, count: int | None) -> Reader:
         dtype = np.dtype(self._order + ("B" if kind == "bool" else _CODES[kind]))
-        size = dtype.itemsize
+        size, count_of = dtype.itemsize, self._count(count)
         mask = size - 1 if self._is_aligned else 0
-        length_of = self._scalar("uint32")
 
         def read(data: memoryview, position: int) -> tuple[Any, int]:
-            number = count
-            if number is None:
-                number, position = length_of(data, position)
+            number, position = count_of(data, position)
             if number == 0:
                 return np.empty(0, dtype), position
             position = (position + mask) & ~mask
@@ -305,12 +305,10 @@ class Readers:
         return read
 
     def _list(self, read_element: Reader, count: int | None) -> Reader:
-        length_of, take = self._scalar("uint32"), self._take
+        count_of, take = self._count(count), self._take
 
         def read(data: memoryview, position: int) -> tuple[list[Any], int]:
-            number = count
-            if number is None:
-                number, position = length_of(data, position)
+            number, position = count_of(data, position)
             if number > len(data) - position:  # each element takes a byte at least
                 raise ValueError("a list reaches beyond its end")
             take(number)
