@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from array import array
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple, cast
 
 import av
@@ -44,7 +45,6 @@ _PIXEL_BYTES = (
     | dict.fromkeys(_YUV, 2)
     | {encoding: np.dtype(kind).itemsize for encoding, kind in _DEPTH.items()}
 )
-RAW_ENCODINGS = tuple(_PIXEL_BYTES)
 
 
 def raw_image(values: Values) -> NDArray[Any]:
@@ -65,10 +65,12 @@ def raw_image(values: Values) -> NDArray[Any]:
     return _from_bayer(rows, *_BAYER[encoding]) if encoding in _BAYER else _from_yuv(rows, *_YUV[encoding])
 
 
-def check_raw(values: Values) -> tuple[int, int]:
+def _check_raw(values: Values) -> tuple[int, int]:
     """Bytes of a row, with and without what pads it; FieldError when a message's are not those of its size."""
     encoding, width, height = str(values["encoding"]), whole(values, "width"), whole(values, "height")
-    used = _bytes_of_row(encoding, width)
+    if encoding not in _PIXEL_BYTES or (encoding in _YUV and width % 2):
+        raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(_PIXEL_BYTES)} are")
+    used = width * _PIXEL_BYTES[encoding]
     step = whole(values, "step") if values.get("step") and height > 1 else used
     data = values["data"]
     count = len(data) if isinstance(data, bytes | np.ndarray) else len(image_bytes(values))
@@ -77,15 +79,9 @@ def check_raw(values: Values) -> tuple[int, int]:
     return step, used
 
 
-def _bytes_of_row(encoding: str, width: int) -> int:
-    if encoding in _PIXEL_BYTES and not (encoding in _YUV and width % 2):
-        return width * _PIXEL_BYTES[encoding]
-    raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
-
-
 def _rows(values: Values) -> NDArray[np.uint8]:
     """(H, B) bytes, without what pads each row."""
-    step, used = check_raw(values)
+    step, used = _check_raw(values)
     height, data = whole(values, "height"), np.frombuffer(image_bytes(values), np.uint8)
     if step == used:
         return data[: used * height].reshape(height, used)
@@ -139,7 +135,6 @@ _FREE_SETS, _FRAMES_OF_A_SET = 40, 20
 """Decoding an image takes up to a tenth of a second: cameras have one set of parameters, or a few."""
 _HEAD_BYTES = 12
 """ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
-_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class ImageHead(NamedTuple):
@@ -200,18 +195,23 @@ def image_head(values: Values) -> ImageHead:
     if "encoding" in values and "width" in values and "height" in values:
         size = whole(values, "width"), whole(values, "height")
         head = _checked(ImageHead("raw", str(values["encoding"]), *size, True))
-        check_raw(values)
+        _check_raw(values)
         return head
     if "format" not in values:
         raise FieldError("it holds no image")
     data = image_bytes(values)
     name = str(values["format"]).lower()
     if "compresseddepth" in name:
-        head = _checked(ImageHead("compressedDepth", *compressed_depth_head(str(values["format"]), data), True))
-        decode_compressed_depth(data)
-        return head
+        encoding = str(values["format"]).split(";")[0].strip()
+        if encoding != "16UC1":
+            raise FieldError(
+                f"its compressedDepth is of {encoding[:20]!r}, which does not keep what was measured; 16UC1, and 32FC1 "
+                "that is not compressed, are read"
+            )
+        height, width = _compressed_depth(data).shape
+        return ImageHead("compressedDepth", encoding, width, height, True)
     if data.startswith((_JPEG, _PNG)):
-        return file_head(data)
+        return _file_head(data)
     codec = _ALIASES.get(name, name)
     if codec not in VIDEO_FORMATS:
         raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
@@ -223,22 +223,29 @@ def image_head(values: Values) -> ImageHead:
 def _checked(head: ImageHead) -> ImageHead:
     if head.width < 1 or head.height < 1 or head.width * head.height > MAX_PIXELS:
         raise FieldError(f"its image has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
-    if head.format == "raw" and head.encoding not in RAW_ENCODINGS:
-        raise FieldError(f"its encoding {head.encoding[:40]!r} is not read; {', '.join(RAW_ENCODINGS)} are")
     return head
 
 
-def file_head(data: bytes) -> ImageHead:
+@contextmanager
+def _opened(data: bytes, formats: list[str], problem: str) -> Iterator[Image.Image]:
+    """An image file; FieldError, which begins with the problem, when it is damaged."""
+    try:
+        with Image.open(io.BytesIO(data), formats=formats) as image:
+            yield image
+    except UnidentifiedImageError as error:
+        raise FieldError(f"{problem} (no whole {' or '.join(formats)} file)") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"{problem} ({describe_error(error)})") from error
+
+
+def _file_head(data: bytes) -> ImageHead:
     """Of a JPEG or PNG file; FieldError when it is none, damaged, or too large."""
     kind = "jpeg" if data.startswith(_JPEG) else "png"
-    try:
-        with Image.open(io.BytesIO(data), formats=(kind.upper(),)) as image:
-            width, height = image.size
-            if kind == "png":  # what stays as it is, is not looked into; what will be decoded must be whole
-                _check_mode(image)
-                image.verify()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its image is damaged ({describe_error(error)})") from error
+    with _opened(data, [kind.upper()], "its image is damaged") as image:
+        width, height = image.size
+        if kind == "png":  # what stays as it is, is not looked into; what will be decoded must be whole
+            _check_mode(image)
+            image.verify()
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
     if end not in data[-64:]:  # some cameras pad their images
         raise FieldError("its image is cut off")
@@ -255,18 +262,10 @@ def decode_image(values: Values) -> NDArray[Any]:
     if "encoding" in values:
         return raw_image(values)
     if "compresseddepth" in str(values["format"]).lower():
-        return decode_compressed_depth(image_bytes(values))
-    return decode_file(image_bytes(values))
-
-
-def decode_file(data: bytes) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a JPEG or PNG file; FieldError when it cannot be decoded."""
-    try:
-        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
-            _check_mode(image)
-            return np.asarray(image.convert("RGB"))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FieldError(f"its image cannot be decoded ({describe_error(error)})") from error
+        return _compressed_depth(image_bytes(values))
+    with _opened(image_bytes(values), ["JPEG", "PNG"], "its image cannot be decoded") as image:
+        _check_mode(image)
+        return np.asarray(image.convert("RGB"))
 
 
 def _starts_by_itself(codec: str, data: bytes) -> bool:
@@ -326,31 +325,17 @@ def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
         raise FieldError(f"its {codec} video cannot be decoded") from error
 
 
-def compressed_depth_head(form: str, data: bytes) -> tuple[str, int, int]:
-    """Encoding, width and height of an image; FieldError when it is none, or does not hold whole millimetres."""
-    encoding = form.split(";")[0].strip()
-    if encoding != "16UC1":
-        raise FieldError(
-            f"its compressedDepth is of {encoding[:20]!r}, which does not keep what was measured; 16UC1, and 32FC1 "
-            "that is not compressed, are read"
-        )
+def _compressed_depth(data: bytes) -> NDArray[np.uint16]:
+    """(H, W) millimetres; FieldError when they are too many, or cannot be decoded."""
     width, height = _size(data)
-    return encoding, width, height
-
-
-def decode_compressed_depth(data: bytes) -> NDArray[np.uint16]:
-    """(H, W) millimetres; FieldError when they cannot be decoded."""
-    width, height = _size(data)
+    if data.startswith(_PNG, _HEAD_BYTES):
+        with _opened(data[_HEAD_BYTES:], ["PNG"], "its distances cannot be decoded") as image:
+            if image.mode not in ("I;16", "I"):
+                raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
+            return np.asarray(image).astype(np.uint16)
     try:
-        if data.startswith(_PNG, _HEAD_BYTES):
-            with Image.open(io.BytesIO(data[_HEAD_BYTES:]), formats=("PNG",)) as image:
-                if image.mode not in ("I;16", "I"):
-                    raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
-                return np.asarray(image).astype(np.uint16)
         return decode_millimetres(data, (height, width))
-    except UnidentifiedImageError as error:
-        raise FieldError("its distances cannot be decoded (they are no whole PNG file)") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except ValueError as error:
         raise FieldError(f"its distances cannot be decoded ({describe_error(error)})") from error
 
 
