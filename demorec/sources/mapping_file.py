@@ -141,23 +141,43 @@ def _feature_problems(mapping: SourceMapping) -> Iterator[str]:
         if not sources:
             yield f"the feature {name!r} has no source"
         for source in sources:
-            yield from _element_problems(f"the feature {name!r}", source)
-            yield from _next_problems(mapping, name, source)
-            yield from _place_problems(f"the feature {name!r}", source, mapping.kind)
+            yield from _source_problems(mapping, name, source)
 
 
-def _next_problems(mapping: SourceMapping, name: str, source: Source) -> Iterator[str]:
-    if not source.next:
-        return
+def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Iterator[str]:
+    place, is_bag = f"the feature {name!r}", mapping.kind == "bag"
+    for what, taken in (("an element", source.elements), (f"a joint of {source.topic}", source.joints)):
+        if len(set(taken)) != len(taken):
+            yield f"{place} names {what} twice"
+    if any(element < 0 for element in source.elements):
+        yield f"{place} names an element below 0"
+    pair = (source.unit, source.to or source.unit)
+    if pair not in CONVERSIONS and pair[0] != pair[1]:
+        yield f"{place} cannot turn {source.unit or 'no unit'} into {source.to}"
+    if "percent" in pair and pair[0] != pair[1] and not source.limits:
+        yield f"{place} needs limits, since -100..100 stands for each joint's own range"
+    if any(not low < high for low, high in source.limits):
+        yield f"{place} has limits that are not [lowest, highest]"
+    if source.next:
+        yield from _next_problems(mapping, name, source.next)
+    if bool(source.topic or source.dataset) == bool(source.next):
+        what, parts = ("topic", "sources") if is_bag else ("dataset", "parts")
+        yield f"{place} needs either a {what} or next in each of its {parts}"
+    if source.topic and not source.field:
+        yield f"{place} needs the field of {source.topic}"
+    if source.joints and source.elements:
+        yield f"{place} picks elements of {source.topic} both by joints and by elements"
+    yield from _age_problems(place, source.max_age_s)
+
+
+def _next_problems(mapping: SourceMapping, name: str, following: str) -> Iterator[str]:
     place, known = f"the feature {name!r}", [other for other in mapping.features if other != name]
     if len(mapping.features[name]) > 1:
         yield f"{place} has other sources beside next"
-    if source.next == STATE and STATE not in mapping.features:
-        return  # said already
-    if source.next not in known:
-        yield f"{place} follows {source.next!r}, which is no feature.{nearest_match(source.next, known)}".rstrip(".")
-    elif any(other.next for other in mapping.features[source.next]):
-        yield f"{place} follows {source.next!r}, which follows another feature itself"
+    if following not in known and (following in mapping.features or following != STATE):  # whose lack is said already
+        yield f"{place} follows {following!r}, which is no feature.{nearest_match(following, known)}".rstrip(".")
+    elif any(other.next for other in mapping.features.get(following, ())):
+        yield f"{place} follows {following!r}, which follows another feature itself"
 
 
 def _camera_problems(mapping: SourceMapping) -> Iterator[str]:
@@ -195,32 +215,3 @@ def _bag_problems(mapping: SourceMapping) -> Iterator[str]:
 def _age_problems(place: str, age: float | None) -> Iterator[str]:
     if age is not None and not 0 < age <= MAX_SECONDS:
         yield f"{place}.max_age_s is {age:g}, it must be above 0 and at most {MAX_SECONDS:g}"
-
-
-def _place_problems(place: str, source: Source, kind: SourceKind) -> Iterator[str]:
-    """What is impossible in where a source's numbers are."""
-    what = "topic" if kind == "bag" else "dataset"
-    if bool(source.topic or source.dataset) == bool(source.next):
-        yield f"{place} needs either a {what} or next in each of its {'sources' if kind == 'bag' else 'parts'}"
-    if source.topic and not source.field:
-        yield f"{place} needs the field of {source.topic}"
-    if source.joints and source.elements:
-        yield f"{place} picks elements of {source.topic} both by joints and by elements"
-    if len(set(source.joints)) != len(source.joints):
-        yield f"{place} names a joint of {source.topic} twice"
-    yield from _age_problems(place, source.max_age_s)
-
-
-def _element_problems(place: str, source: Source) -> Iterator[str]:
-    """What is impossible in which numbers are taken, and in their units."""
-    if len(set(source.elements)) != len(source.elements):
-        yield f"{place} names an element twice"
-    if any(element < 0 for element in source.elements):
-        yield f"{place} names an element below 0"
-    pair = (source.unit, source.to or source.unit)
-    if pair not in CONVERSIONS and pair[0] != pair[1]:
-        yield f"{place} cannot turn {source.unit or 'no unit'} into {source.to}"
-    if "percent" in pair and pair[0] != pair[1] and not source.limits:
-        yield f"{place} needs limits, since -100..100 stands for each joint's own range"
-    if any(not low < high for low, high in source.limits):
-        yield f"{place} has limits that are not [lowest, highest]"
