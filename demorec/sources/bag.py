@@ -44,7 +44,6 @@ class Bag:
     """A recording of somebody else's robot: a file, or a folder of rosbag2.
 
     Attributes:
-        path: Of the file or folder.
         files: That hold its messages, in order.
         messages_are_compressed: Whether each message is compressed by itself (rosbag2's compression mode MESSAGE).
     """
@@ -97,11 +96,7 @@ class Bag:
 
     def _unpack(self, message: ScannedMessage, tell: Any, unpacked: Unpacked) -> ScannedMessage:
         try:
-            blocks = []  # not at once: as much as the data claim would be reserved, whatever comes
-            for block in zstandard.ZstdDecompressor().read_to_iter(message.data, write_size=_COPY_BYTES):
-                unpacked.add(len(block))
-                blocks.append(block)
-            data = b"".join(blocks)
+            data = b"".join(_blocks(message.data, unpacked))
         except (zstandard.ZstdError, LimitError) as error:
             tell(f"a message of {message.channel.topic} cannot be unpacked: {error}")
             data = b""
@@ -265,6 +260,13 @@ def _plain_yaml(text: str) -> Any:
     return root[0] if root else None
 
 
+def _blocks(source: Any, unpacked: Unpacked) -> Iterator[bytes]:
+    """What is compressed, in parts: at once, as much as it claims to be would be reserved, whatever comes."""
+    for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
+        unpacked.add(len(block))
+        yield block
+
+
 @contextmanager
 def _unpacked(path: Path, unpacked: Unpacked) -> Iterator[tuple[Path, bytes]]:
     """A file and its kind; a compressed one is unpacked into a temporary file, within the limits of the bag."""
@@ -276,9 +278,7 @@ def _unpacked(path: Path, unpacked: Unpacked) -> Iterator[tuple[Path, bytes]]:
         plain = Path(folder) / path.stem
         try:
             with open_regular(path) as source, plain.open("wb") as file:
-                for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
-                    unpacked.add(len(block))
-                    file.write(block)
+                file.writelines(_blocks(source, unpacked))
             kind = _kind_of(plain)
         except (zstandard.ZstdError, ValueError) as error:
             raise BagError(f"The compressed bag cannot be unpacked ({error}): {path}") from error
