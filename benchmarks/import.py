@@ -125,10 +125,10 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
 
     from demorec.sources.bag import open_bag
     from demorec.sources.decoding import BagDecoder
-    from demorec.sources.episodes import windows
     from demorec.sources.fields import image_bytes
     from demorec.sources.image_messages import decode_image
     from demorec.sources.mapping_file import read_mapping
+    from demorec.sources.planning import windows
     from demorec.sources.rows import Timelines
     from demorec.sources.streams import read_streams
 
@@ -136,13 +136,14 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     opened = open_bag(bag)
     streams = read_streams(opened, known)
     lines = Timelines(streams, known)
-    rows = lines.rows(windows(opened, streams, list(lines.lines.values()), known)[0])
+    rows = lines.rows(windows(lines)[0])
     features: dict[str, object] = {
         f"observation.images.{name}": {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": list(AXES)}
         for name in rows.cameras
     }
-    for name, feature in rows.features.items():
-        features[name] = {"dtype": "float32", "shape": (len(feature.names),), "names": list(feature.names)}
+    for name in rows.features:
+        names = [element for line in lines.sources(name) for element in line.stream.names]
+        features[name] = {"dtype": "float32", "shape": (len(names),), "names": names}
     dataset = LeRobotDataset.create("local/x", fps=FPS, features=features, root=out / "dataset", use_videos=True)
     decoder, kept = BagDecoder(opened.num_bytes), {name: list[NDArray[np.uint8]]() for name in rows.cameras}
     packets: dict[str, list[bytes]] = {name: [] for name in rows.cameras}
@@ -159,7 +160,8 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
                 kept[name] += [frame.to_ndarray(format="rgb24").astype(np.uint8) for frame in file.decode(video=0)]
     for row in range(len(rows.times_ns)):
         frame: dict[str, object] = {
-            f"observation.images.{name}": kept[name][int(camera.numbers[row])] for name, camera in rows.cameras.items()
+            f"observation.images.{name}": kept[name][int(camera.taken[camera.positions[row]])]
+            for name, camera in rows.cameras.items()
         }
         frame |= {name: feature.values[row].astype(np.float32) for name, feature in rows.features.items()}
         dataset.add_frame({**frame, "task": "measure"})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -25,7 +25,7 @@ from demorec.sources.findings import (
     of_stream,
     stream_findings,
 )
-from demorec.sources.mapping import Source, SourceMapping
+from demorec.sources.mapping import SourceMapping
 from demorec.sources.rows import RATE, EpisodeRows, Timelines
 from demorec.sources.streams import BagStreams
 
@@ -44,25 +44,30 @@ _SLOW = 1.15
 def all_findings(lines: Timelines) -> tuple[Finding, ...]:
     """What is odd in a bag, each thing once."""
     once: dict[tuple[str, str], Finding] = {}
-    for finding in _findings(lines, list(lines.lines.values())):
+    for finding in _findings(lines):
         once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
     return tuple(once.values())
 
 
-def _findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+def _findings(bag: Timelines) -> Iterator[Finding]:
+    lines = list(bag.lines.values())
+    regular = [line for line in lines if line.is_regular]
     skews = _comparable_skews(lines)
     for line in lines:
         yield from stream_findings(line, skews[line])
     for problem in bag.streams.problems:
         yield Finding(kind="cut_off", stream="", text=problem)
-    yield from _joint_findings([line for line in lines if line.is_regular])
-    yield from _extent_findings([line for line in lines if line.is_regular])
+    yield from _joint_findings(regular)
+    yield from _extent_findings(regular)
     yield from _offset_findings(lines)
     yield from _mixed_findings(bag, lines)
     yield from _camera_findings(bag.streams)
     yield from _frozen_findings(lines)
-    yield from _slow_findings(lines, bag.mapping.clock.fps)
-    yield from _unit_findings(bag.streams)
+    yield from _slow_findings(regular, bag.mapping.clock.fps)
+    for line in lines:
+        largest = float(np.nanmax(np.abs(line.stream.values), initial=0.0)) if line.stream.unit == "rad" else 0.0
+        if largest > _FULL_TURNS:
+            yield of_stream(line.stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
     yield from _action_findings(bag.streams, bag.mapping)
 
 
@@ -169,8 +174,9 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
     """Whether all that is measured of the robot stands still in a time; False where nothing is."""
     moves = []
     for line in lines:
-        if (values := line.stream.values) is None or line.stream.label.partition(" (")[0] == ACTION:
+        if not line.stream.names or line.stream.label.partition(" (")[0] == ACTION:
             continue
+        values = line.stream.values
         within = values[line.order[(line.times_ns >= begin_ns) & (line.times_ns <= end_ns)]].astype(np.float64)
         if len(within) < 2:
             continue
@@ -200,31 +206,15 @@ def _claimed_by(name: str, streams: BagStreams) -> str:
 _COMMON = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "optical", "frame", "link", "rgb", "depth"}
 
 
-def _slow_findings(lines: Iterable[Timeline], fps: int) -> Iterator[Finding]:
+def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
     """Streams that are slower than the rows; cameras only where none has an image for each row."""
-    regular = [line for line in lines if line.is_regular]
     slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
     is_filmed = any(line.stream.heads and line not in slow for line in regular)
     for line in slow:
         rate = NS / line.period_ns
-        if not line.stream.heads:
-            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times")
-        elif not is_filmed:
-            advice = f"use fps = {max(1, round(rate))}"
-            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times: {advice}")
-
-
-def _unit_findings(streams: BagStreams) -> Iterator[Finding]:
-    for stream in streams.all.values():
-        if (
-            stream.values is None
-            or not isinstance(stream.part, Source)
-            or (stream.part.to or stream.part.unit) != "rad"
-        ):
-            continue
-        largest = float(np.nanmax(np.abs(stream.values), initial=0.0))
-        if largest > _FULL_TURNS:
-            yield of_stream(stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
+        if not line.stream.heads or not is_filmed:
+            advice = f": use fps = {max(1, round(rate))}" if line.stream.heads else ""
+            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times{advice}")
 
 
 def _action_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
@@ -232,8 +222,6 @@ def _action_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Fi
     if any(source.next for source in mapping.features[ACTION]):
         return
     state, action = streams.all[STATE, 0], streams.all[ACTION, 0]
-    assert state.values is not None
-    assert action.values is not None
     shared = [(state.names.index(name), column) for column, name in enumerate(action.names) if name in state.names]
     moving = [pair for pair in shared if _spread(action.values[:, pair[1]]) > 0.05]
     dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]

@@ -1,4 +1,4 @@
-"""Which numbers in a topic's messages may say what a robot does, or shall do.
+"""Which numbers in a topic's messages may say what a robot does, or shall do, and which of them a mapping takes.
 
 The words that people give topics, types and fields are what there is to go by: a follower, a puppet and a measured
 state are what the robot does, a leader, a master and a command what it shall do; `q` and `position` are positions.
@@ -15,13 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from demorec.mcap.cdr import Values
-from demorec.sources.fields import (
-    SourceReader,
-    follow,
-    numbers_in,
-    parse_path,
-    reader_of,
-)
+from demorec.sources.fields import SourceReader, follow, numbers_in, parse_path, reader_of
 from demorec.sources.mapping import MAX_ELEMENTS, Source
 from demorec.sources.words import first_numbers
 
@@ -53,6 +47,8 @@ _PARTS = _SIDES | {"state", "states", "arm", "robot", "gripper", "hand", "finger
 _GRIPPER_FIELD = _SIDES | {"gripper", "finger", "hand", "width", "opening"} | _LEADING | _MEASURED
 _ANY_COMMAND = {"cmd", "command", "commands", "action", "actions", "values", "joint", "velocity", "velocities"}
 """Words of a field that is a command though it holds no positions."""
+_QUANTITIES = {"joint", "joints", "position", "positions", "pos", "velocity", "velocities"}
+_QUANTITIES |= {"cartesian", "torque", "pose"}
 _TIMES = {"header", "timestamp", "stamp", "ts", "time"}
 _MAX_NESTED, _MAX_FIELDS = 4, 100
 _MAX_UNKNOWN = 3
@@ -64,8 +60,6 @@ class Vector:
     """Numbers of a topic that could be part of a feature.
 
     Attributes:
-        topic, type: Where they are.
-        field: As of a source.
         reader: Of its numbers.
         kind: Of what: joints of an arm, a gripper or a base (wheels, legs), a pose, a velocity in space, or others.
         role: state, action, or "" where no word says which.
@@ -108,12 +102,6 @@ class Vector:
         return [*self.words, *_split(self.field)]
 
     @property
-    def is_other(self) -> bool:
-        """Whether its topic is, for a vector of numbers, that of another quantity than joint positions."""
-        lower = self.topic.lower()
-        return bool(_CARTESIAN.search(lower) or _OTHER_NUMBERS.search(lower))
-
-    @property
     def is_leader(self) -> bool:
         """Whether its topic is that of an arm that a person moves."""
         return re.search(_LEADER, self.topic.lower()) is not None
@@ -122,16 +110,6 @@ class Vector:
     def is_robot(self) -> bool:
         """Whether its topic is, for a pose, that of the robot, and not that of a thing or a tag."""
         return _ROBOT_POSE.search(self.topic.lower()) is not None
-
-    @property
-    def has_wheels(self) -> bool:
-        """Whether all elements are called like wheels."""
-        return all(_WHEEL.search(label.lower()) for label in self.labels)
-
-    @property
-    def has_gripper(self) -> bool:
-        """Whether an element is called like a gripper's joint."""
-        return any(_GRIPPER.search(label.lower()) for label in self.labels)
 
     def of_joints(self, joints: Sequence[str], messages: Iterable[Values]) -> Vector:
         """A part of it, which some of the messages may hold."""
@@ -179,22 +157,22 @@ def transforms_of(topic: str, type_name: str, messages: Iterable[Values]) -> Ite
             seen.add(frame)
             inner = f"transforms[{key}={frame}]" + (".transform" if "transform" in item else "")
             empty = Vector(topic=topic, type=type_name, field="", reader=_NOTHING, kind="numbers", role="")
-            yield from (replace(made, prefix=f"{frame}.") for made in _made(empty, values, inner))
+            yield from _made(empty, values, inner, prefix=f"{frame}.")
 
 
 _NOTHING = SourceReader(source=Source())
 
 
-def _made(empty: Vector, values: Values, path: str) -> Iterator[Vector]:
-    """The vector of a path, if it is one."""
+def _made(empty: Vector, values: Values, path: str, **known: Any) -> Iterator[Vector]:
+    """The vector of a path, if it is one, with what is known of it."""
     try:
         reader = reader_of(Source(topic=empty.topic, field=path), values)
         parts = [np.ravel(item) for _, item in numbers_in(follow(values, reader.steps))]
     except ValueError:  # it has none, or one of another shape
         return
     count = len(reader.names)
-    names = tuple(f"joint_{number}" for number in range(count)) if len(set(reader.names)) < count else ()
-    yield replace(empty, field=path, reader=reader, names=names, first=first_numbers(np.concatenate(parts)))
+    known.setdefault("names", tuple(f"joint_{k}" for k in range(count)) if len(set(reader.names)) < count else ())
+    yield replace(empty, field=path, reader=reader, first=first_numbers(np.concatenate(parts)), **known)
 
 
 def _role(topic: str, type_name: str) -> str:
@@ -207,6 +185,8 @@ def _role(topic: str, type_name: str) -> str:
 
 
 def _kind_of(joints: Sequence[str]) -> Kind:
+    if not joints:
+        return "arm"
     if all(_GRIPPER.search(joint.lower()) for joint in joints):
         return "gripper"
     return "base" if all(_BASE.search(joint.lower()) for joint in joints) else "arm"
@@ -252,21 +232,18 @@ def _positions(empty: Vector, values: Values) -> Iterator[Vector]:
         called = values.get("name")
         text = f"{empty.topic} {empty.type} {path} {called if isinstance(called, str) else ''}".lower()
         for vector in _made(empty, values, path):
-            if vector.reader.joints:
-                vector = replace(vector, kind=_kind_of(vector.reader.joints))
-            elif _GRIPPER.search(text):
-                vector = replace(vector, kind="gripper", role=empty.role or "state")
-            elif size > 1:
-                vector = replace(vector, kind="arm")
-            else:
+            kind, role = _kind_of(vector.reader.joints), empty.role
+            if not vector.reader.joints and _GRIPPER.search(text):
+                kind, role = "gripper", empty.role or "state"
+            elif not vector.reader.joints and size == 1:
                 continue
             is_single = "[0]" not in path or len(follow(values, parse_path(path.partition("[0]")[0]))) == 1
             if (words | beside) & _MEASURED:
-                vector = replace(vector, role="state")
+                role = "state"
             elif (words | beside) & (_DESIRED | _LEADING) and empty.role != "action":
                 is_single = is_single and bool((words | beside) & _LEADING)
-                vector = replace(vector, role="action")
-            yield replace(vector, is_sure=is_single)
+                role = "action"
+            yield replace(vector, kind=kind, role=role, is_sure=is_single)
 
 
 def _doubt(vector: Vector) -> tuple[bool, ...]:
@@ -282,7 +259,7 @@ def _any_command(empty: Vector, values: Values) -> Iterator[Vector]:
     for path, size in _numbers(values):
         if _words(path) <= _ANY_COMMAND and (size > 1 or _GRIPPER.search(text)):
             kind: Kind = "gripper" if _GRIPPER.search(text) else "arm"
-            yield from (replace(vector, kind=kind) for vector in _made(empty, values, path))
+            yield from _made(empty, values, path, kind=kind)
 
 
 def _plain(empty: Vector, values: Values) -> Iterator[Vector]:
@@ -300,7 +277,7 @@ def _plain(empty: Vector, values: Values) -> Iterator[Vector]:
     kind: Kind = "gripper" if is_gripper else "arm" if are_joints else "numbers"
     role = empty.role or ("state" if is_gripper else "")
     names = () if is_vector else ("_".join(empty.words) or "data",)
-    yield from (replace(vector, kind=kind, role=role, names=names) for vector in _made(empty, values, "data"))
+    yield from _made(empty, values, "data", kind=kind, role=role, names=names)
 
 
 def _in_space(empty: Vector, values: Values) -> Iterator[Vector]:
@@ -311,8 +288,7 @@ def _in_space(empty: Vector, values: Values) -> Iterator[Vector]:
     for kind, (place, pair) in first.items():
         fields = [place] if place else pair
         for field in fields:
-            prefix = "" if place else f"{field}."
-            yield from (replace(made, kind=kind, prefix=prefix) for made in _made(empty, values, field))
+            yield from _made(empty, values, field, kind=kind, prefix="" if place else f"{field}.")
 
 
 def _pairs(values: Mapping[str, Any], place: str) -> Iterator[tuple[Kind, str, tuple[str, str]]]:
@@ -328,3 +304,95 @@ def _pairs(values: Mapping[str, Any], place: str) -> Iterator[tuple[Kind, str, t
     for key, item in values.items():
         if isinstance(item, Mapping) and key not in _TIMES and place.count(".") < 1 and re.fullmatch(r"\w+", key):
             yield from _pairs(item, f"{place}.{key}" if place else key)
+
+
+def choose_features(vectors: Sequence[Vector]) -> tuple[list[Vector], list[Vector], list[Vector], str]:
+    """The parts of the state and of the action: joints if there are any, otherwise poses and velocities in space.
+
+    Returns:
+        The state, the action (empty: it is the next state), all other vectors, and a warning that the robot's arm is
+        not among the parts, "" where it is.
+    """
+    usable = [vector for vector in vectors if vector.is_sure and vector.rate_hz and vector.kind != "numbers"]
+    measured = [vector for vector in usable if vector.role != "action"]
+    commands = [vector for vector in usable if vector.role == "action"]
+    state = _joints([vector for vector in measured if vector.role == "state"])
+    unsaid = [vector for vector in measured if vector.kind == "arm" and not vector.role]
+    robots = {tuple(word for word in vector.words if word not in _SIDES) for vector in unsaid}
+    if len(robots) == 1 and not _has(state, "arm"):
+        state = [*unsaid, *state]
+    has_arm = _has(state, "arm")
+    bodies = [vector for vector in state if vector.kind != "gripper"]
+    if all(_WHEEL.search(label.lower()) for vector in bodies for label in vector.labels):
+        state = sorted([*state, *_of_robot(measured)], key=lambda vector: vector.kind == "gripper")
+    action = _joints(commands)
+    if not has_arm and not _has(action, "arm"):
+        action = [*(vector for vector in commands if vector.kind in ("pose", "twist")), *action]
+    warning = ""
+    if all(vector.kind == "gripper" for vector in state):
+        warning = _lacking(state, vectors)
+        state = []
+    elif all(vector.kind == "gripper" for vector in action):
+        action = []  # the arm's command is missing, and the next state has the gripper's opening as well
+    taken = {id(vector) for vector in (*state, *action)}
+    return state, action, [vector for vector in vectors if id(vector) not in taken], warning
+
+
+def _lacking(grippers: Sequence[Vector], vectors: Sequence[Vector]) -> str:
+    found = "no topic is known to say what the robot does"
+    if grippers:
+        labels = [label for vector in grippers for label in vector.labels]
+        found = f"the only joints that are known to be measured are a gripper's ({', '.join(labels[:4])})"
+    advice = (
+        "take the topics that do from the lines that are commented out" if vectors else "the bag has none of numbers"
+    )
+    return f"The arm is left out: {found}. The import refuses this mapping as it is: {advice}."
+
+
+def _has(vectors: Iterable[Vector], kind: str) -> bool:
+    return any(vector.kind == kind for vector in vectors)
+
+
+def _joints(vectors: Sequence[Vector]) -> list[Vector]:
+    """The joints among them, none twice: those of arms and bases, then those of grippers."""
+    bodies = _distinct([vector for vector in vectors if vector.kind in ("arm", "base")])
+    grippers = [vector for vector in vectors if vector.kind == "gripper"]
+    if any(_GRIPPER.search(label.lower()) for vector in bodies for label in vector.labels):
+        known = {label for vector in bodies for label in vector.labels}
+        grippers = [vector for vector in grippers if vector.reader.joints and not known & set(vector.labels)]
+    return [*bodies, *_distinct(grippers)]
+
+
+def _distinct(vectors: Sequence[Vector]) -> list[Vector]:
+    """Those that say something else than the others, in the order given."""
+    chosen: list[Vector] = []
+    for vector in sorted(vectors, key=_rank):
+        if not any(_are_same(vector, other) for other in chosen):
+            chosen.append(vector)
+    return sorted(chosen, key=vectors.index)
+
+
+def _rank(vector: Vector) -> tuple[bool, bool, bool, int, int]:
+    is_other = any(words.search(vector.topic.lower()) for words in (_CARTESIAN, _OTHER_NUMBERS))
+    return not vector.is_leader, not vector.reader.joints, is_other, -len(vector.labels), len(vector.words)
+
+
+def _are_same(one: Vector, other: Vector) -> bool:
+    """Whether two vectors are likely the same joints sent twice: a relay, a merged topic, a driver's own message."""
+    if one.topic == other.topic:
+        return False
+    joints, others = set(one.reader.joints), set(other.reader.joints)
+    if joints and others and not joints & others:
+        return False
+    # Two arms have topics of the same kind that differ by a word each: left and right, 1 and 2; so do two quantities.
+    only, only_other = {*one.words} - {*other.words}, {*other.words} - {*one.words}
+    are_pair = bool(only and only_other) and not (only | only_other) & _QUANTITIES
+    are_alike = (one.type, one.field, one.is_leader, joints) == (other.type, other.field, other.is_leader, others)
+    return not (are_pair and are_alike)
+
+
+def _of_robot(measured: Sequence[Vector]) -> list[Vector]:
+    """Poses and velocities of a robot, or the only ones that there are."""
+    found = [vector for vector in measured if vector.kind in ("pose", "twist")]
+    named = [vector for vector in found if vector.is_robot]
+    return named or (found if len({vector.topic for vector in found}) == 1 else [])

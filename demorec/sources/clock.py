@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.sources.mapping import CameraSource, Clock, Sampling, Source
+from demorec.sources.mapping import CameraSource, Clock, Sampling
 from demorec.sources.streams import Stream
 
 NS = 1_000_000_000
@@ -91,10 +91,8 @@ class Timeline:
 
     def sampled(self, chosen: Chosen) -> Numbers:
         """(R, D) the numbers of these rows, of a source."""
-        part, values = self.stream.part, self.stream.values
-        assert isinstance(part, Source)
-        assert values is not None
-        return sampled(values, self.order, chosen, unit=part.to or part.unit, quaternions=self.stream.quaternions)
+        stream = self.stream
+        return sampled(stream.values, self.order, chosen, unit=stream.unit, quaternions=stream.quaternions)
 
     def within(self, begin_ns: int, end_ns: int) -> Int:
         """Its times from one moment to another."""
@@ -120,7 +118,10 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
         ordered = times[order]
         is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
         ordered, order = ordered[is_first], order[is_first]
-    period, is_regular = _period(ordered)
+    steps = np.diff(ordered)
+    period = int(np.median(steps)) if len(steps) else 0
+    # Most steps of a sensor are about a period, whatever is lost; those of commands on change are of any length.
+    is_regular = len(steps) >= 8 and bool(np.mean((steps > 0.3 * period) & (steps < 1.7 * period)) > 0.6)
     if stream.heads:
         keyframes = np.flatnonzero(stream.heads.are_keyframes[order])
         first = int(keyframes[0]) if len(keyframes) else len(order)
@@ -136,16 +137,6 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
         sample=sample,
         max_age_ns=MISSING - 1 if age_s >= 1e9 else round(age_s * NS),
     )
-
-
-def _period(times: Int) -> tuple[int, bool]:
-    steps = np.diff(times)
-    if not len(steps):
-        return 0, False
-    period = int(np.median(steps))
-    # Most steps of a sensor are about a period, whatever is lost; those of commands on change are of any length.
-    near = (steps > 0.3 * period) & (steps < 1.7 * period)
-    return period, len(steps) >= 8 and bool(np.mean(near) > 0.6)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -236,11 +227,8 @@ def _slerp(first: Numbers, second: Numbers, fraction: NDArray[np.float64]) -> Nu
     t, sine = fraction[:, np.newaxis], np.sin(angle)
     small = sine < 1e-6
     safe = np.where(small, 1.0, sine)
-    weights = (
-        np.where(small, 1 - t, np.sin((1 - t) * angle) / safe),
-        np.where(small, t, np.sin(t * angle) / safe),
-    )
-    mixed = weights[0] * a + weights[1] * b
+    of_a, of_b = (np.where(small, part, np.sin(part * angle) / safe) for part in (1 - t, t))
+    mixed = of_a * a + of_b * b
     length = (1 - t) * lengths[0] + t * lengths[1]
     return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300) * length)
 

@@ -6,7 +6,7 @@ The same command again goes on: episodes that are there are not written.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,6 @@ from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.datasets.lerobot.videos import why_transcoded
-from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.robots.motors import Motors
 from demorec.runs.external import open_external_run
@@ -27,12 +26,13 @@ from demorec.sources.frames_writer import FramesImport, Image, importing_version
 
 
 def import_lerobot(
-    root: Path, out: Path, *, video: VideoConfig | None = None, motors: Motors | None = None
+    roots: Sequence[Path], mapping: None, out: Path, *, video: VideoConfig | None = None, motors: Motors | None = None
 ) -> FramesImport:
     """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, whoever wrote it, into a run.
 
     Args:
-        root: The dataset's folder.
+        roots: The dataset's folder, the only one.
+        mapping: It needs none.
         out: The run's folder; one that the same dataset began is continued.
         video: How images are encoded whose packets cannot pass through.
         motors: The servos whose values LeRobot recorded as state and action.
@@ -43,6 +43,9 @@ def import_lerobot(
         ExportError: It is damaged, or not at its rate.
         RecordingError: A number is not finite, or the disk is full.
     """
+    if len(roots) != 1:
+        raise ConfigError(f"One dataset becomes one run, given are {len(roots)}: import them one by one.")
+    root = roots[0]
     expect(root, "dataset")
     dataset = LeRobotDataset(root, motors)
     if not dataset.places:
@@ -57,22 +60,16 @@ def import_lerobot(
         for number in range(len(dataset.places)):
             recording = DatasetRecording(dataset, number)
             info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
-            if not folder.has(info):
-                write_frames(
-                    folder,
-                    info,
-                    _vectors(recording),
-                    {camera.name: _images(recording, camera) for camera in info.cameras},
-                    outcome=recording.outcome,
-                    video=video or VideoConfig(),
-                    leads={
-                        camera.name: int(recording.columns().images[camera.name][0])
-                        for camera in info.cameras
-                        if camera.kept
-                    },
-                    subtasks=subtasks,
-                )
-                num_new += 1
+            if folder.has(info):
+                continue
+            columns = recording.columns()
+            rows = range(recording.num_frames)
+            frames = ({name: values[row] for name, values in columns.features.items()} for row in rows)
+            images = {camera.name: _images(recording, camera) for camera in info.cameras}
+            leads = {camera.name: int(columns.images[camera.name][0]) for camera in info.cameras if camera.kept}
+            outcome, encoding = recording.outcome, video or VideoConfig()
+            write_frames(folder, info, frames, images, outcome=outcome, video=encoding, leads=leads, subtasks=subtasks)
+            num_new += 1
     return FramesImport(
         num_episodes=len(dataset.places),
         num_frames=sum(place.length for place in dataset.places),
@@ -113,13 +110,6 @@ def _info(recording: DatasetRecording, cameras: dict[str, Camera], digest: Calla
         ),
         versions=importing_versions(),
     )
-
-
-def _vectors(recording: DatasetRecording) -> Iterator[dict[str, Vector]]:
-    """Feature -> its vector, of each frame."""
-    features = recording.columns().features
-    for row in range(recording.num_frames):
-        yield {name: values[row] for name, values in features.items()}
 
 
 def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Image]:

@@ -1,19 +1,31 @@
-"""Messages of any encoding as plain values: numbers, texts, NumPy arrays, lists and dictionaries of these."""
+"""Messages of any encoding as plain values: numbers, texts, NumPy arrays, lists and dictionaries of these.
+
+`rosbags` parses the definitions of ROS 1 and ROS 2; its own deserialisers, and those of others, are programs that are
+made of the definition's text and run. A definition from a foreign file is data here: it becomes a chain of ready-made
+readers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import partial
+from graphlib import TopologicalSorter
 from typing import Any
 
 import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.base import make_typesdict
+from rosbags.typesys.idl import IDLParser
+from rosbags.typesys.msg import MSGParser
+from rosbags.typesys.peg import Parser
 
 from demorec.core.errors import describe_error
 from demorec.core.plain import MAX_DEPTH, parse_json
-from demorec.mcap.cdr import Values
-from demorec.mcap.limits import Budget, SpentError
+from demorec.mcap.cdr import Readers, Values, lenient_text, read_whole
+from demorec.mcap.limits import Budget, Limits, SpentError
+from demorec.mcap.ros2 import FieldType, Types
 from demorec.mcap.scan import ScannedChannel, ScannedMessage
-from demorec.sources.ros_types import Budgets, ros_decoder
 
 _BYTES_OF_VALUE = 200
 """That are counted for each that is kept."""
@@ -31,24 +43,26 @@ class UnknownEncodingError(ValueError):
     """Messages in an encoding, or of a definition, that cannot be read; `str` is the reason."""
 
 
-def decoder_of(channel: ScannedChannel, budgets: Budgets | None = None) -> Decoder:
-    """What reads the messages of a channel, within the budgets; UnknownEncodingError says why nothing does."""
-    budgets = budgets or Budgets()
-    try:
-        match channel.encoding:
-            case "cdr" | "ros1":
-                is_cdr = channel.encoding == "cdr"
-                return ros_decoder(
-                    channel.type, channel.schema_encoding, channel.schema, is_cdr=is_cdr, budgets=budgets
-                )
-            case "protobuf":
-                return _protobuf_decoder(channel.type, channel.schema, budgets)
-            case "json":
-                return partial(_decode_json, budget=budgets.values)
-            case other:
-                raise ValueError(f"the encoding {other[:40]!r} is not read; cdr, ros1, protobuf and json are")
-    except ValueError as error:
-        raise UnknownEncodingError(str(error)) from error
+class Budgets:
+    """What may be made of a bag's definitions and messages, whatever they claim: counted while it is made.
+
+    Args:
+        num_bytes: Of the bag's files.
+
+    Attributes:
+        steps: Of parsing definitions, some 7 microseconds each. The largest definition of ROS, with all that it refers
+            to, takes 2,200 of them as .msg, and one of 300 fields 130,000 to 790,000 as .idl.
+        values: Fields and elements, 100 to 300 bytes each in memory. A message of joints has 30, a list of 100,000
+            points 400,000. Small files have a floor, 5 million, which are read in some seconds.
+        numbers: Bytes of what streams keep of the messages.
+    """
+
+    def __init__(self, num_bytes: int = 0) -> None:
+        floor = Limits.of_file(num_bytes).floor
+        self.steps = Budget(floor // 56, 800_000, "parts of definitions")
+        self.values = Budget(max(floor // 13, 12 * num_bytes), 500_000, "values")
+        numbers = max(floor, 100 * num_bytes)
+        self.numbers = Budget(numbers, numbers, "bytes of numbers")
 
 
 class BagDecoder:
@@ -63,7 +77,7 @@ class BagDecoder:
 
     def __init__(self, num_bytes: int = 0) -> None:
         self.budgets = Budgets(num_bytes)
-        self._decoders: dict[ScannedChannel, Decoder | UnknownEncodingError] = {}
+        self._decoders: dict[ScannedChannel, Decoder] = {}
 
     def values(self, message: ScannedMessage) -> Values:
         """Of a message.
@@ -75,13 +89,25 @@ class BagDecoder:
         decoder = self._decoders.get(message.channel)
         if decoder is None:
             try:
-                decoder = decoder_of(message.channel, self.budgets)
-            except UnknownEncodingError as error:
-                decoder = error
+                decoder = self._decoder_of(message.channel)
+            except ValueError as error:
+                decoder = partial(_refuse, str(error))
             self._decoders[message.channel] = decoder
-        if isinstance(decoder, UnknownEncodingError):
-            raise UnknownEncodingError(str(decoder))
         return decoder(message.data)
+
+    def _decoder_of(self, channel: ScannedChannel) -> Decoder:
+        match channel.encoding:
+            case "cdr" | "ros1":
+                is_cdr = channel.encoding == "cdr"
+                return _ros_decoder(
+                    channel.type, channel.schema_encoding, channel.schema, is_cdr=is_cdr, budgets=self.budgets
+                )
+            case "protobuf":
+                return _protobuf_decoder(channel.type, channel.schema, self.budgets)
+            case "json":
+                return partial(_decode_json, budget=self.budgets.values)
+            case other:
+                raise ValueError(f"the encoding {other[:40]!r} is not read; cdr, ros1, protobuf and json are")
 
     def may_keep(self, message: ScannedMessage) -> bool:
         """Whether the values that a message has just given are few enough to be kept beside those kept before."""
@@ -91,6 +117,10 @@ class BagDecoder:
         except SpentError:
             return False
         return True
+
+
+def _refuse(reason: str, data: bytes) -> Values:
+    raise UnknownEncodingError(reason)
 
 
 def _decode_json(data: bytes, budget: Budget) -> Values:
@@ -126,8 +156,10 @@ def _protobuf_decoder(type_name: str, schema: bytes, budgets: Budgets) -> Decode
     budgets.steps.take(len(schema) // _BYTES_PER_STEP)
     try:
         pool = DescriptorPool()
-        for file in _in_order(FileDescriptorSet.FromString(schema).file):
-            pool.Add(file)
+        files = {file.name: file for file in FileDescriptorSet.FromString(schema).file}
+        for name in TopologicalSorter({name: file.dependency for name, file in files.items()}).static_order():
+            if name in files:
+                pool.Add(files[name])
         descriptor = pool.FindMessageTypeByName(type_name)
         message_class = GetMessageClass(descriptor)
     except (DecodeError, TypeError, KeyError, RecursionError, ValueError) as error:
@@ -148,23 +180,6 @@ def _protobuf_decoder(type_name: str, schema: bytes, budgets: Budgets) -> Decode
     return decode
 
 
-def _in_order(files: Iterable[Any]) -> Iterator[Any]:
-    """Definitions behind those that they need."""
-    waiting = {file.name: file for file in files}
-    stack = list(waiting)
-    opened: set[str] = set()
-    while stack:
-        name = stack[-1]
-        needed = [other for other in waiting[name].dependency if other in waiting] if name in waiting else []
-        if name in waiting and needed and name not in opened:
-            opened.add(name)
-            stack += needed
-            continue
-        stack.pop()
-        if name in waiting:
-            yield waiting.pop(name)
-
-
 class _ProtobufSize:
     """Whether a message of a type takes little memory, found out before any is taken.
 
@@ -174,17 +189,15 @@ class _ProtobufSize:
     def __init__(self, descriptor: Any) -> None:
         self._descriptor = descriptor
         self._kinds: dict[str, tuple[int, dict[int, Any]]] = {"": (0, {})}
-        self._packed: set[tuple[str, int]] = set()
-        waiting, largest = [descriptor], 0
+        waiting = [descriptor]
         while waiting:
             kind = waiting.pop()
             if kind.full_name not in self._kinds:
-                within = {field.number: field.message_type for field in kind.fields if field.message_type is not None}
+                counted = [field for field in kind.fields if field.message_type is not None or _is_number_list(field)]
+                within = {field.number: field.message_type for field in counted}
                 self._kinds[kind.full_name] = (1 + len(kind.fields), within)
-                self._packed |= {(kind.full_name, field.number) for field in kind.fields if _is_number_list(field)}
-                largest = max(largest, 1 + len(kind.fields))
-                waiting += within.values()
-        self._most = largest
+                waiting += filter(None, within.values())
+        self._most = max(count for count, _ in self._kinds.values())
 
     def check(self, data: bytes) -> None:
         """Raise ValueError for a message of more fields than are read."""
@@ -212,7 +225,7 @@ class _ProtobufSize:
                         length, position = _varint(part, position)
                         if kind is not None:
                             waiting.append((kind.full_name, part[position : position + length]))
-                        elif (name, key >> 3) in self._packed:
+                        elif key >> 3 in self._kinds[name][1]:  # of numbers
                             total += length // _PACKED_BYTES
                         position += length
                     case 3:
@@ -255,7 +268,10 @@ def _protobuf_values(message: Any, descriptor: Any, methods: Any, budget: Budget
         if field.is_repeated:
             found = getattr(message, field.name)
             if kind is None:
-                values[field.name] = _array_of_protobuf(found, field, budget)
+                dtype = {field.TYPE_FLOAT: "f4", field.TYPE_BOOL: "u1"}.get(field.type, "f8")
+                is_list = _is_number_list(field)
+                budget.take(0 if is_list else len(found))
+                values[field.name] = np.fromiter(found, dtype, len(found)) if is_list else list(found)
             elif not kind.GetOptions().map_entry:  # maps hold no features
                 values[field.name] = [_protobuf_values(item, kind, methods, budget, depth + 1) for item in found]
         elif kind is None:
@@ -265,9 +281,118 @@ def _protobuf_values(message: Any, descriptor: Any, methods: Any, budget: Budget
     return values
 
 
-def _array_of_protobuf(found: Any, field: Any, budget: Budget) -> Any:
-    if not _is_number_list(field):
-        budget.take(len(found))
-        return list(found)
-    dtype = {field.TYPE_FLOAT: "f4", field.TYPE_BOOL: "u1"}.get(field.type, "f8")
-    return np.fromiter(found, dtype, len(found))
+_TIME = (FieldType("sec", "int32", False, None), FieldType("nanosec", "uint32", False, None))
+_BUILT_IN = {"builtin_interfaces/msg/Time": _TIME, "builtin_interfaces/msg/Duration": _TIME}
+_SEPARATOR = "=" * 80 + "\n"
+"""Between the definitions of types that are in one text."""
+
+
+def _ros_decoder(
+    type_name: str, schema_encoding: str, schema: bytes, *, is_cdr: bool, budgets: Budgets
+) -> Callable[[bytes], Values]:
+    """What makes values of the messages of a type.
+
+    Args:
+        type_name: "sensor_msgs/msg/JointState" (or as in ROS 1, without "msg").
+        schema_encoding: ros2msg, ros2idl, ros1msg; "" for a type of ROS itself that comes without a definition.
+        schema: The definition.
+        is_cdr: Whether messages are CDR (ROS 2), otherwise as ROS 1 serialises them.
+        budgets: What may be made of the bag.
+
+    Raises:
+        ValueError: The definition cannot be read; or, from the decoder, a message does not fit it, or holds too much.
+    """
+    parts = type_name.split("/")
+    name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
+    budgets.steps.begin()
+    types = _types(name, schema_encoding, schema, budgets.steps)
+    budget = budgets.values
+    readers = [
+        Readers(types, order=order, is_aligned=is_cdr, text=lenient_text, take=budget.take).of(name) for order in "><"
+    ]
+
+    def decode(data: bytes) -> Values:
+        budget.begin()
+        if not is_cdr:
+            return read_whole(readers[1], memoryview(data))[0]
+        if len(data) < 4 or data[0] != 0 or data[1] > 1:
+            raise ValueError("its first bytes are not those of a CDR message")
+        return read_whole(readers[data[1]], memoryview(data)[4:])[0]
+
+    return decode
+
+
+class _Counted(Parser):  # type: ignore[misc]
+    """Counts its steps: what takes long is no matter of a text's length alone."""
+
+    def __init__(self, text: str, steps: Budget) -> None:
+        super().__init__(text)
+        self._steps = steps
+
+    def regex(self, pos: int, pattern: str, flags: int = 0) -> Any:
+        self._steps.take()
+        return super().regex(pos, pattern, flags)
+
+
+class _CountedMsgParser(_Counted, MSGParser):  # type: ignore[misc]
+    pass
+
+
+class _CountedIdlParser(_Counted, IDLParser):  # type: ignore[misc]
+    def _binop(self, pos: int, left: Any, op: str, right: Any) -> Any:
+        found = super()._binop(pos, left, op, right)
+        if getattr(getattr(found, "value", None), "op", "") in ("*", "<<"):  # numbers without end
+            raise ValueError("its definition computes numbers, which is not read")
+        return found
+
+
+def _types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Types:
+    key = (name, schema_encoding, schema)
+    if key not in _parsed:
+        found = _parsed_types(name, schema_encoding, schema, steps)
+        if len(_parsed) >= _MAX_PARSED:
+            _parsed.clear()
+        _parsed[key] = found
+    return _parsed[key]
+
+
+_MAX_PARSED = 512
+_parsed: dict[tuple[str, str, bytes], Types] = {}
+"""(type, encoding, definition) -> its types: a bag is read twice, and the next one has the same definitions."""
+
+
+def _parsed_types(name: str, schema_encoding: str, schema: bytes, steps: Budget) -> Types:
+    try:
+        if schema_encoding in ("ros2msg", "ros1msg"):
+            parsed = make_typesdict(_CountedMsgParser(f"MSG: {name}\n{schema.decode()}", steps).specification())
+        elif schema_encoding == "ros2idl":
+            parsed = {}
+            text = schema.decode()
+            parts = [part.partition("\n")[2] for part in text.split(_SEPARATOR)[1:]] if _SEPARATOR in text else []
+            for part in parts or [text]:
+                parsed |= make_typesdict(_CountedIdlParser(part, steps).specification())
+        elif not schema_encoding:
+            parsed = dict(get_typestore(Stores.ROS2_HUMBLE).fielddefs)
+        else:
+            raise ValueError(f"its definition is in {schema_encoding[:40]!r}")
+    except RecursionError:
+        raise ValueError("its definition is nested too deeply") from None
+    except (ValueError, MemoryError, SpentError):
+        raise
+    except Exception as error:  # the parser's own errors, and what it does not foresee
+        raise ValueError("its definition cannot be read") from error
+    if name not in parsed:
+        raise ValueError("it comes without a definition, and is no type of ROS itself")
+    found = {kind: tuple(_field_type(*field) for field in fields) for kind, (_, fields) in parsed.items()}
+    return found | {kind: fields for kind, fields in _BUILT_IN.items() if not found.get(kind)}
+
+
+def _field_type(name: str, description: Any) -> FieldType:
+    """A field as the definitions of recordings have it; ValueError for lists of lists."""
+    kind, rest = description
+    if kind not in (Nodetype.SEQUENCE, Nodetype.ARRAY):
+        return FieldType(name, rest[0] if kind == Nodetype.BASE else rest, False, None)
+    (inner, of), length = rest
+    if inner not in (Nodetype.BASE, Nodetype.NAME):
+        raise ValueError("it has lists of lists, which are not read")
+    return FieldType(name, of[0] if inner == Nodetype.BASE else of, True, length if kind == Nodetype.ARRAY else None)

@@ -33,7 +33,7 @@ Step = str | int | tuple[str, str]
 
 
 class FieldError(ValueError):
-    """A message has no such field, or one of another kind; `str` says which, for the inside of a sentence."""
+    """A message or dataset is not what the mapping takes it for; `str` says why, for the inside of a sentence."""
 
 
 class OtherPublisherError(ValueError):
@@ -68,12 +68,15 @@ def follow(values: Any, steps: Sequence[Step]) -> Any:
                 values = [follow(item, (step,)) for item in values]
                 if values and all(isinstance(item, int | float) for item in values):
                     values = np.array(values, dtype=np.float64)
-            elif isinstance(values, Mapping) and step in values:
-                values = values[step]
             elif isinstance(values, Mapping):
-                raise FieldError(f"there is no field {step!r}.{nearest_match(step, values)}".rstrip("."))
+                if step not in values:
+                    raise FieldError(f"there is no field {step!r}.{nearest_match(step, values)}".rstrip("."))
+                values = values[step]
             else:
-                raise FieldError(f"there is no field {step!r} in {_kind_of(values)}")
+                kind = (
+                    "a list" if isinstance(values, np.ndarray) else "a text" if isinstance(values, str) else "a number"
+                )
+                raise FieldError(f"there is no field {step!r} in {kind}")
         elif isinstance(step, int):
             if not isinstance(values, list | np.ndarray) or not 0 <= step < len(values):
                 raise FieldError(f"there is no element {step}")
@@ -87,12 +90,6 @@ def follow(values: Any, steps: Sequence[Step]) -> Any:
     return values
 
 
-def _kind_of(value: Any) -> str:
-    if isinstance(value, np.ndarray | list):
-        return "a list"
-    return "a text" if isinstance(value, str) else "a number"
-
-
 def stamp_of(values: Values) -> int | None:
     """The time in a message's header, nanoseconds; None when it has no header."""
     for path in _STAMP_PATHS:
@@ -102,12 +99,8 @@ def stamp_of(values: Values) -> int | None:
                 found = found.get(step) if isinstance(found, Mapping) else None
             else:
                 found = found[step] if isinstance(found, list) and len(found) > step else None
-            if found is None:
-                break
-        else:
-            time_ns = _nanoseconds(found)
-            if time_ns is not None:
-                return time_ns
+        if (time_ns := _nanoseconds(found)) is not None:
+            return time_ns
     return None
 
 
@@ -247,7 +240,9 @@ def reader_of(source: Source, values: Values) -> SourceReader:
     count = sum(np.size(item) for _, item in parts)
     if count > MAX_ELEMENTS:
         raise FieldError(f"the field {source.field!r} holds {count:,} numbers, at most {MAX_ELEMENTS:,} are taken")
-    names_steps = _names_path(source, values, steps, found)
+    beside = _names_beside(values, steps)
+    names_steps = next((place for place, names in beside if len(names) == np.size(found)), None)
+    names_steps = parse_path(source.names_field) if source.names_field else names_steps
     named = _names_at(values, names_steps) if names_steps is not None else None
     if source.joints:
         if named is None:
@@ -260,18 +255,11 @@ def reader_of(source: Source, values: Values) -> SourceReader:
             raise OtherPublisherError(problem) if len(missing) == len(source.joints) else FieldError(problem)
         labels = list(source.joints)
     else:
-        labels = named if named is not None else _labels(source.field, parts)
-        if outside := [index for index in source.elements if index >= len(labels)]:
-            raise FieldError(f"there is no element {outside[0]} among the {len(labels)} of {source.field!r}")
-        labels = [labels[index] for index in source.elements] if source.elements else labels
+        labels = picked(source, named if named is not None else _labels(source.field, parts), repr(source.field))
     is_named = bool(source.joints) or (named is not None and len(set(named)) == len(named))
-    if source.names and len(source.names) != len(labels):
-        raise FieldError(f"names has {len(source.names)} names for the {len(labels)} elements of {source.field!r}")
-    if source.limits and len(source.limits) != len(labels):
-        raise FieldError(f"limits has {len(source.limits)} rows for the {len(labels)} elements of {source.field!r}")
     return SourceReader(
         source=source,
-        names=tuple(source.prefix + name for name in source.names or labels),
+        names=names_of(source, labels, repr(source.field)),
         joints=tuple(labels) if is_named else (),
         steps=steps,
         names_steps=names_steps,
@@ -279,13 +267,19 @@ def reader_of(source: Source, values: Values) -> SourceReader:
     )
 
 
-def _names_path(source: Source, values: Values, steps: tuple[Step, ...], found: Any) -> tuple[Step, ...] | None:
-    if source.names_field:
-        return parse_path(source.names_field)
-    for place, names in _names_beside(values, steps):
-        if len(names) == np.size(found):
-            return place
-    return None
+def picked[T](source: Source, elements: Sequence[T], place: str) -> list[T]:
+    """Those of all elements of a place that a source takes; FieldError when there are fewer."""
+    if outside := [index for index in source.elements if index >= len(elements)]:
+        raise FieldError(f"there is no element {outside[0]} among the {len(elements)} of {place}")
+    return [elements[index] for index in source.elements or range(len(elements))]
+
+
+def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ...]:
+    """What the elements that a source takes are called in the feature; FieldError when it speaks of more or fewer."""
+    for what, given in (("names", source.names), ("limits", source.limits)):
+        if given and len(given) != len(labels):
+            raise FieldError(f"{what} has {len(given)} entries for the {len(labels)} elements of {place}")
+    return tuple(source.prefix + name for name in source.names or labels)
 
 
 def _names_beside(values: Values, steps: tuple[Step, ...]) -> Iterator[tuple[tuple[Step, ...], list[str]]]:

@@ -6,7 +6,7 @@ Nothing is repaired: a finding tells what the rows hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,13 +48,7 @@ NOTE = "note"
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something odd.
-
-    Attributes:
-        kind: What, in one word of a fixed list.
-        stream: Which ("observation.state", "camera front"), "" for the bag as a whole.
-        text: What was found, with figures.
-    """
+    """Something odd: one word of a fixed list, the stream ("camera front", "" for the bag as a whole), and figures."""
 
     kind: str
     stream: str
@@ -155,20 +149,19 @@ def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
 
 def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     stream = line.stream
-    if stream.values is None or len(line.order) < 2:
+    if not stream.names or len(line.order) < 2:
         return
-    elements, names = _Elements(stream.values, line.order), stream.names
-    yield from _number_findings(elements, names)
+    yield from _number_findings(line)
     for start in stream.quaternions:
-        off = float(np.abs(np.linalg.norm(elements.quaternion(start), axis=1) - 1).max())
+        off = float(np.abs(np.linalg.norm(_quaternion(line, start), axis=1) - 1).max())
         if off > 1e-3:
             yield "quaternion", f"the length of a quaternion is off by {off:.3g}"
-    if len(names) > 1 and not any(np.any(element) for element in elements):
+    if len(stream.names) > 1 and not any(_finite(line, column).any() for column in range(len(stream.names))):
         yield "zeros", "all numbers are 0"
         return
     # What is sent may hold until the bag ends.
-    yield from _still_findings(elements, names, line, may_rest=stream.label == ACTION)
-    for name, change in _changes(elements, names, stream.quaternions):
+    yield from _still_findings(line, may_rest=stream.label == ACTION)
+    for name, change in _changes(line):
         steps = np.linalg.norm(change, axis=1)
         usual = float(np.percentile(steps, 90))
         # What begins to move after a long rest goes on, as an opening gripper does. At a low rate a shorter way takes
@@ -187,57 +180,47 @@ def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
             break
 
 
-def _changes(
-    elements: _Elements, names: tuple[str, ...], quaternions: Sequence[int]
-) -> Iterator[tuple[str, NDArray[np.float64]]]:
+def _changes(line: Timeline) -> Iterator[tuple[str, NDArray[np.float64]]]:
     """(T - 1, n) from each message to the next, of every element and of every rotation as a whole."""
+    quaternions = line.stream.quaternions
     turns = {start + part for start in quaternions for part in range(4)}
-    for column, (name, element) in enumerate(zip(names, elements, strict=True)):
+    for column, name in enumerate(line.stream.names):
         if column in quaternions:
-            quaternion = elements.quaternion(column)
+            quaternion = _quaternion(line, column)
             yield name, np.diff(quaternion * signs_of_course(quaternion)[:, None], axis=0)
         elif column not in turns:
-            yield name, np.diff(element)[:, None]
+            yield name, np.diff(_finite(line, column))[:, None]
 
 
-class _Elements:
-    """A stream's numbers, one element of the vector at a time: all at once take several times the stream's memory.
+def _finite(line: Timeline, columns: int | slice) -> NDArray[np.float64]:
+    """(T,) of an element, or (T, n) of some, in the order of the times; 0 in place of what is no finite number.
 
-    What is no finite number is 0 in them.
+    One at a time: all at once take several times the stream's memory.
     """
-
-    def __init__(self, values: Numbers, order: Int) -> None:
-        self.values, self.order = values, order
-
-    def __iter__(self) -> Iterator[NDArray[np.float64]]:
-        """(T,) of each element, in the order of the times."""
-        for column in range(self.values.shape[1]):
-            yield self._finite(self.values[self.order, column])
-
-    def quaternion(self, start: int) -> NDArray[np.float64]:
-        """(T, 4) of four elements."""
-        return self._finite(self.values[self.order, start : start + 4])
-
-    def _finite(self, part: Numbers) -> NDArray[np.float64]:
-        return np.nan_to_num(part.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    part = line.stream.values[line.order, columns].astype(np.float64)
+    return np.nan_to_num(part, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _number_findings(elements: _Elements, names: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+def _quaternion(line: Timeline, start: int) -> NDArray[np.float64]:
+    """(T, 4) of the elements from one on."""
+    return _finite(line, slice(start, start + 4))
+
+
+def _number_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     """Numbers that are none."""
-    are_finite = np.asarray(np.isfinite(elements.values).all(axis=1))
-    rows = elements.values[elements.order[~are_finite[elements.order]]]
+    are_finite = np.asarray(np.isfinite(line.stream.values).all(axis=1))
+    rows = line.stream.values[line.order[~are_finite[line.order]]]
     if len(rows):
         column = int(np.flatnonzero(~np.isfinite(rows[0]))[0])
         kind = "nan" if np.isnan(rows).any() else "infinite"
-        yield kind, f"{len(rows)} messages hold no finite number, the first in {names[column]!r}"
+        yield kind, f"{len(rows)} messages hold no finite number, the first in {line.stream.names[column]!r}"
 
 
-def _still_findings(
-    elements: _Elements, names: tuple[str, ...], line: Timeline, *, may_rest: bool
-) -> Iterator[tuple[str, str]]:
+def _still_findings(line: Timeline, *, may_rest: bool) -> Iterator[tuple[str, str]]:
     """Elements with noise that suddenly have none; those that `may_rest` do so in the end, and at a joint's limit."""
     stuck = []
-    for name, element in zip(names, elements, strict=True):
+    for column, name in enumerate(line.stream.names):
+        element = _finite(line, column)
         begin, end = _longest_run(element)
         seconds = (line.times_ns[end] - line.times_ns[begin]) / NS
         others = np.concatenate((element[:begin], element[end + 1 :]))
@@ -246,7 +229,7 @@ def _still_findings(
             continue
         if np.mean(np.diff(others) != 0) > 0.8:
             stuck.append((name, seconds, (line.times_ns[begin] - line.times_ns[0]) / NS))
-    waits = may_rest and len(stuck) >= max(len(names) - 1, 2)  # an arm, while its gripper moves
+    waits = may_rest and len(stuck) >= max(len(line.stream.names) - 1, 2)  # an arm, while its gripper moves
     if stuck and not waits:
         name, seconds, at = stuck[0]
         more = f" and {len(stuck) - 1} more elements" if len(stuck) > 1 else ""

@@ -6,19 +6,22 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.files import read_text_limited
 from demorec.episode.episode import Outcome, Sample, SampledFrame, Vector, frame_time_ns
 from demorec.episode.features import STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFile
 from demorec.mcap import EpisodeWriter
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import ExternalFolder, episode_path
-from demorec.sources.mapping import SourceMapping, recorded_unit
+from demorec.sources.mapping import SourceMapping
 
 Image = bytes | NDArray[Any]
 """A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `EpisodeWriter.image` takes them."""
@@ -54,26 +57,17 @@ def importing_versions() -> Mapping[str, str]:
     return {name: version(name) for name in ("demorec", "av")}
 
 
-def joints_of(urdf: str) -> frozenset[str]:
-    """Of a robot's model; ValueError, for the inside of a sentence, when it is none."""
-    try:
-        return frozenset(joint.name for joint in Urdf.parse(urdf).joints)
-    except ValueError as error:
-        raise ValueError(f"the robot's model cannot be used ({error})") from error
-
-
 def imported_feature(
-    name: str, dtype: DTypeLike, names: tuple[str, ...], units: Iterable[str], moved: Iterable[str], source: str
+    name: str, dtype: DTypeLike, names: tuple[str, ...], units: Iterable[str], *, called: Iterable[str], source: str
 ) -> Feature:
-    """A feature as recordings know it, given the units of its elements and the joints that they are said to be of."""
-    units = tuple(map(recorded_unit, units))
-    joints = tuple(moved) if name == STATE else ()
+    """A feature as recordings know it; `called` is how the joints are called that its elements may be of."""
+    units = tuple("deg" if unit == "degree" else unit for unit in units)
     return Feature(
         name=name,
         dtype="float32" if dtype == np.float32 else "float64",
         names=names,
         units=units if any(units) else (),
-        joints=joints if any(joints) else (),
+        joints=tuple(called) if name == STATE else (),
         source=source,
     )
 
@@ -83,24 +77,54 @@ def imported_info(
     *,
     episode_index: int,
     instruction: str,
-    urdf: str,
+    urdf: str | None,
     fps: int,
     features: Iterable[Feature],
     cameras: Iterable[Camera],
     files: Iterable[SourceFile],
 ) -> EpisodeInfo:
-    """What is known of an episode that was imported by a mapping."""
+    """What is known of an episode that was imported by a mapping.
+
+    Args:
+        urdf: The robot's model; None where there is none.
+
+    Raises:
+        ValueError: The model is none; `str` says so for the inside of a sentence.
+    """
+    try:
+        joints = set() if urdf is None else {joint.name for joint in Urdf.parse(urdf).joints}
+    except ValueError as error:
+        raise ValueError(f"the robot's model cannot be used ({error})") from error
+
+    def moved(feature: Feature) -> Feature:
+        names = tuple(name if name in joints else "" for name in feature.joints)
+        return replace(feature, joints=names if any(names) else ())
+
     return EpisodeInfo(
         episode_index=episode_index,
         instruction=" ".join(instruction.split()),
         robot_name=mapping.robot.name,
-        urdf=urdf,
+        urdf=urdf or "",
         fps=fps,
-        features=tuple(features),
+        features=tuple(map(moved, features)),
         cameras=tuple(cameras),
         origin=Origin(kind="import", files=tuple(files), mapping_digest=mapping.digest),
         versions=importing_versions(),
     )
+
+
+_MAX_URDF_BYTES = 4 << 20
+
+
+def urdf_text(mapping: SourceMapping, mapping_path: Path) -> str | None:
+    """The URDF that a mapping names a file for; None when it names none. ConfigError when it cannot be read."""
+    if not mapping.robot.urdf:
+        return None
+    path = mapping_path.parent / mapping.robot.urdf
+    try:
+        return read_text_limited(path, _MAX_URDF_BYTES) or None
+    except (OSError, ValueError) as error:  # no text, or NUL in the name
+        raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
 
 
 def write_frames(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,18 +15,14 @@ from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
 from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, Feature, Kept
 from demorec.mcap.cdr import Values
-from demorec.sources.fields import FieldError, converted
+from demorec.sources.fields import FieldError, converted, names_of, picked
 from demorec.sources.frames_writer import Image, imported_feature
-from demorec.sources.image_messages import ImageHead, decode_image, image_head
+from demorec.sources.image_messages import decode_image, image_head
 from demorec.sources.mapping import MAX_ELEMENTS, CameraSource, Source, conversion_factor
 
 _BLOCK_ROWS = 1024
 _EXACT = 2**53
 """Up to which float64 holds every whole number."""
-
-
-class Hdf5FitError(ValueError):
-    """A dataset is not what the mapping takes it for; `str` says why, for the inside of a sentence."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,10 +41,9 @@ class _Column:
 
     def block(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
         rows: NDArray[Any] = self.array.read(begin, end).reshape(end - begin, -1)
-        if self.part.elements:
-            rows = rows[:, list(self.part.elements)]
+        rows = rows[:, list(self.part.elements)] if self.part.elements else rows
         if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
-            raise Hdf5FitError(f"{self.array.place} has whole numbers that float64 cannot hold")
+            raise FieldError(f"{self.array.place} has whole numbers that float64 cannot hold")
         is_small = rows.dtype.kind == "f" and rows.dtype.itemsize <= 4
         return converted(self.part, rows.astype(np.float32 if is_small else np.float64))
 
@@ -56,42 +51,34 @@ class _Column:
 class StoredFeature:
     """A feature of an episode.
 
-    Attributes:
-        columns: Of each part the dataset.
-
     Args:
         name: Of it.
         parts, arrays: What it is made of, and where each is.
         shift: By how many rows the frames are behind the datasets' rows: 1 for what another feature is next.
 
     Raises:
-        Hdf5FitError: They are no vectors.
+        FieldError: They are no vectors.
     """
 
     def __init__(self, name: str, parts: Sequence[Source], arrays: Sequence[StoredArray], *, shift: int) -> None:
         self.name, self.shift = name, shift
         pairs = zip(parts, arrays, strict=True)
         self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
+        self._dtype = np.float32 if all(column.is_single for column in self.columns) else np.float64
 
-    @property
-    def dtype(self) -> type[np.float32] | type[np.float64]:
-        """float32 where that holds all numbers as they are."""
-        return np.float32 if all(column.is_single for column in self.columns) else np.float64
-
-    def described(self, joints: Container[str]) -> Feature:
-        """The feature as recordings know it, given the joints of the robot's model."""
+    def described(self) -> Feature:
+        """The feature as recordings know it."""
         names = tuple(name for column in self.columns for name in column.names)
         units = (column.part.to or column.part.unit for column in self.columns for _ in column.names)
         called = (name.removesuffix(".pos") for name in names)  # as LeRobot calls the position of a joint
-        moved = (name if name in joints else "" for name in called)
         source = "; ".join(column.part.dataset for column in self.columns) + (" of the next row" if self.shift else "")
-        return imported_feature(self.name, self.dtype, names, units, moved, source)
+        return imported_feature(self.name, self._dtype, names, units, called=called, source=source)
 
     def vectors(self, count: int) -> Iterator[Vector]:
         """(D,) of each of the first `count` frames.
 
         Raises:
-            Hdf5FitError: A number is not finite, or not to be held.
+            FieldError: A number is not finite, or not to be held.
             Hdf5Error: They cannot be read.
         """
         for begin in range(0, count, _BLOCK_ROWS):
@@ -100,29 +87,22 @@ class StoredFeature:
             for column, part in zip(self.columns, parts, strict=True):
                 if len(wrong := np.argwhere(~np.isfinite(part))):
                     row, element = wrong[0].tolist()
-                    raise Hdf5FitError(
+                    raise FieldError(
                         f"{column.array.place} is {part[row, element]} in row {first + row} ({column.names[element]}), "
                         "numbers must be finite"
                     )
-            yield from np.concatenate(parts, axis=1).astype(self.dtype)
+            yield from np.concatenate(parts, axis=1).astype(self._dtype)
 
 
 def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
     """Of the elements that are taken."""
     if len(array.shape) > 2:
         shape = "x".join(map(str, array.shape))
-        raise Hdf5FitError(f"{array.place} is an array of {shape}, a feature takes rows of numbers")
+        raise FieldError(f"{array.place} is an array of {shape}, a feature takes rows of numbers")
     count = array.shape[1] if len(array.shape) == 2 else 1
     if not 1 <= count <= MAX_ELEMENTS:
-        raise Hdf5FitError(f"{array.place} has {count:,} numbers a row, allowed are 1 to {MAX_ELEMENTS:,}")
-    if outside := [element for element in part.elements if element >= count]:
-        raise Hdf5FitError(f"there is no element {outside[0]} among the {count} of {array.place}")
-    labels = _labels(array, count)
-    labels = [labels[element] for element in part.elements] if part.elements else labels
-    for what, given in (("names", part.names), ("limits", part.limits)):
-        if given and len(given) != len(labels):
-            raise Hdf5FitError(f"{what} has {len(given)} entries for the {len(labels)} elements of {array.place}")
-    return tuple(part.prefix + name for name in part.names or labels)
+        raise FieldError(f"{array.place} has {count:,} numbers a row, allowed are 1 to {MAX_ELEMENTS:,}")
+    return names_of(part, picked(part, _labels(array, count), array.place), array.place)
 
 
 def _labels(array: StoredArray, count: int) -> list[str]:
@@ -160,7 +140,7 @@ class StoredCamera:
             has none.
 
     Raises:
-        Hdf5FitError: They are no images.
+        FieldError: They are no images.
         Hdf5Error: They cannot be read.
     """
 
@@ -175,14 +155,13 @@ class StoredCamera:
         form = image_form(array)
         if form is None:
             found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
-            raise Hdf5FitError(
+            raise FieldError(
                 f"{array.place} is {found}, images are uint8 or floats of rows, height, width and 3 colours, or of "
                 "rows, 3 colours, height and width, or rows of JPEG, distances uint16 or float32 of rows, height, width"
             )
         self._form = form
         if form == "jpeg":
-            head = self._head(array.read(0, 1)[0], 0)[1]
-            self.width, self.height = head.width, head.height
+            _, self.width, self.height = self._file(array.read(0, 1)[0], 0)
             self.kept = "jpeg" if camera.colors == "rgb" else ""
             self.description = (
                 "jpeg passed through as it is" if self.kept else "jpeg with red and blue exchanged, encoded once"
@@ -195,20 +174,21 @@ class StoredCamera:
             self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
             self.description = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
         if not 1 <= self.width * self.height <= MAX_PIXELS:
-            raise Hdf5FitError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
+            raise FieldError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
         if form == "pixels" and array.dtype.kind == "f":
             self._scale = _float_scale(array)
             self.description = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.description}"
 
     def described(self) -> Camera:
         """The camera as recordings know it."""
-        return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=self._camera.dataset)
+        place = self._camera.dataset
+        return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=place)
 
     def images(self) -> Iterator[Image]:
         """One a row.
 
         Raises:
-            Hdf5FitError: A JPEG file is cut off, or of another size.
+            FieldError: A JPEG file is cut off, or of another size.
             Hdf5Error: They cannot be read.
         """
         for number, row in enumerate(self._array.rows()):
@@ -220,49 +200,47 @@ class StoredCamera:
                 scaled = np.rint(image.astype(np.float64) * self._scale) if self._scale else image
                 yield self._ordered(np.ascontiguousarray(scaled, dtype=np.uint8))
                 continue
-            data, head = self._head(row, number)
-            if (head.width, head.height) != (self.width, self.height):
-                raise Hdf5FitError(
-                    f"{self._array.place} changes its size to {head.width}x{head.height} in row {number}"
-                )
+            data, width, height = self._file(row, number)
+            if (width, height) != (self.width, self.height):
+                raise FieldError(f"{self._array.place} changes its size to {width}x{height} in row {number}")
             yield data if self.kept else self._ordered(self._used(decode_image, data, number))
 
     def _ordered(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return image if self._camera.colors == "rgb" else np.ascontiguousarray(image[:, :, ::-1])
 
-    def _head(self, row: NDArray[np.generic], number: int) -> tuple[bytes, ImageHead]:
-        """The JPEG file of a row and its head, without what pads it: it ends with its own mark, never with a zero."""
+    def _file(self, row: NDArray[np.generic], number: int) -> tuple[bytes, int, int]:
+        """The JPEG file of a row, without what pads it (it ends with its own mark, never with a zero), and its size."""
         data = row.tobytes().rstrip(b"\0")
         if not data.endswith(_JPEG_END):
-            raise Hdf5FitError(f"{self._array.place} holds no whole JPEG file in row {number}")
+            raise FieldError(f"{self._array.place} holds no whole JPEG file in row {number}")
         if self._lengths is not None and len(data) not in self._lengths[:, number].tolist():
-            raise Hdf5FitError(
+            raise FieldError(
                 f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
                 "that compress_len tells"
             )
         head = self._used(image_head, data, number)
         if head.format != "jpeg":
-            raise Hdf5FitError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
-        return data, head
+            raise FieldError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
+        return data, head.width, head.height
 
     def _used[T](self, read: Callable[[Values], T], data: bytes, number: int) -> T:
         """What is read of the JPEG file in a row."""
         try:
             return read({"format": "jpeg", "data": data})
         except FieldError as error:
-            raise Hdf5FitError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
+            raise FieldError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
 
 
 def _float_scale(array: StoredArray) -> float:
-    """What pixels that are floats are multiplied with: 255 where none is above 1; Hdf5FitError for other numbers."""
+    """What pixels that are floats are multiplied with: 255 where none is above 1; FieldError for other numbers."""
     lowest, highest = 0.0, 0.0
     for number, row in enumerate(array.rows()):
         values = row.astype(np.float64)
         if not np.isfinite(values).all():
-            raise Hdf5FitError(f"{array.place} has pixels that are not finite in row {number}")
+            raise FieldError(f"{array.place} has pixels that are not finite in row {number}")
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
     if lowest < 0 or highest > 255:
-        raise Hdf5FitError(
+        raise FieldError(
             f"{array.place} has pixels from {lowest:g} to {highest:g}, floats are read from 0 to 1 or from 0 to 255"
         )
     return 255.0 if highest <= 1 else 1.0
@@ -293,10 +271,3 @@ def image_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
         return "pixels"
     is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
     return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None
-
-
-def image_lengths(array: StoredArray, num_rows: int) -> NDArray[np.generic]:
-    """(C, T) of ALOHA's `compress_len`; Hdf5FitError when it is of another shape."""
-    if len(array.shape) != 2 or array.shape[1] != num_rows:
-        raise Hdf5FitError(f"{array.place} has the shape {array.shape}, it must have {num_rows} columns")
-    return array.read(0, len(array))

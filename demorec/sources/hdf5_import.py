@@ -28,9 +28,9 @@ from demorec.episode.info import EpisodeInfo, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
-from demorec.sources.episode_writer import urdf_text
-from demorec.sources.frames_writer import FramesImport, imported_info, joints_of, write_frames
-from demorec.sources.hdf5_arrays import Hdf5FitError, StoredCamera, StoredFeature, image_lengths, is_camera
+from demorec.sources.fields import FieldError
+from demorec.sources.frames_writer import FramesImport, imported_info, urdf_text, write_frames
+from demorec.sources.hdf5_arrays import StoredCamera, StoredFeature, is_camera
 from demorec.sources.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.sources.mapping_file import read_mapping
 from demorec.sources.words import in_natural_order, quoted, task_in_name
@@ -40,7 +40,7 @@ _LENGTHS = "compress_len"
 
 
 def import_hdf5(
-    paths: Sequence[Path], mapping_path: Path, out: Path, *, video: VideoConfig | None = None
+    paths: Sequence[Path], mapping_path: Path, out: Path, *, video: VideoConfig | None = None, motors: None = None
 ) -> FramesImport:
     """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
 
@@ -49,6 +49,7 @@ def import_hdf5(
         mapping_path: Of the mapping.
         out: The run's folder; one that the same files and mapping began is continued.
         video: How images are encoded that come as pixels.
+        motors: The mapping says what the numbers are.
 
     Raises:
         ConfigError: The mapping is impossible, the files differ, or the folder holds something else.
@@ -56,7 +57,7 @@ def import_hdf5(
         RecordingError: The disk is full or gone.
     """
     mapping = read_mapping(mapping_path, "hdf5")
-    urdf = urdf_text(mapping.robot.urdf, mapping_path)
+    urdf = urdf_text(mapping, mapping_path)
     for path in paths:
         expect(path, "hdf5")
     if len({path.resolve() for path in paths}) < len(paths):
@@ -99,7 +100,7 @@ def import_hdf5(
 
 
 class _Stored:
-    """An episode in an opened file; Hdf5FitError when its datasets do not fit the mapping."""
+    """An episode in an opened file; FieldError when its datasets do not fit the mapping."""
 
     def __init__(self, file: ForeignFile, place: str, mapping: SourceMapping) -> None:
         self._file, self._place, self._mapping = file, place, mapping
@@ -113,30 +114,37 @@ class _Stored:
             used = mapping.features[following] if following else parts
             arrays = [array(part.dataset) for part in used]
             self.features.append(StoredFeature(name, used, arrays, shift=1 if following else 0))
-        cameras = {
-            name: (camera, array(camera.dataset, may_be_ragged=True)) for name, camera in mapping.cameras.items()
-        }
-        observed = [images for _, images in cameras.values()]
+        cameras = {name: array(camera.dataset, may_be_ragged=True) for name, camera in mapping.cameras.items()}
+        observed = list(cameras.values())
         others: list[StoredArray] = []
         for feature in self.features:
             arrays = others if not feature.name.startswith("observation.") else observed
             arrays += [] if feature.shift else [column.array for column in feature.columns]
-        self.num_rows = num_rows = _num_rows(observed, others)
-        self.has_last = len(observed[0]) > num_rows
+        # Observations may have one row more than actions, what the last action led to.
+        self.num_rows = num_rows = len((others or observed)[0])
+        self.has_last = len(observed[0]) == num_rows + 1
+        for arrays, wanted in ((others, num_rows), (observed, num_rows + self.has_last)):
+            for one in arrays:
+                if len(one) != wanted:
+                    raise FieldError(f"{one.place} has {len(one)} rows, other datasets of the episode have {wanted}")
         stated = file.attribute(place, "num_samples")
         if stated is not None and stated != num_rows:
-            raise Hdf5FitError(
+            raise FieldError(
                 f"{place or 'the episode'} has {num_rows} rows, but its num_samples says {reprlib.repr(stated)}"
             )
-        files = [images for _, images in cameras.values() if len(images.shape) == 2]
-        has_lengths = files and file.has(f"{place}/{_LENGTHS}")
-        lengths = image_lengths(array(_LENGTHS), len(files[0])) if has_lengths else None
+        files = [images for images in cameras.values() if len(images.shape) == 2]
+        lengths = None
+        if files and file.has(f"{place}/{_LENGTHS}"):
+            found = array(_LENGTHS)
+            if len(found.shape) != 2 or found.shape[1] != len(files[0]):
+                raise FieldError(f"{found.place} has the shape {found.shape}, it must have {len(files[0])} columns")
+            lengths = found.read(0, len(found))
         self.num_frames = min(num_rows, len(observed[0]) - max(feature.shift for feature in self.features))
         if self.num_frames < 1:
-            raise Hdf5FitError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
+            raise FieldError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
         self.cameras = [
-            StoredCamera(name, camera, images, lengths if len(images.shape) == 2 else None)
-            for name, (camera, images) in cameras.items()
+            StoredCamera(name, mapping.cameras[name], images, lengths if len(images.shape) == 2 else None)
+            for name, images in cameras.items()
         ]
 
     def frames(self) -> Iterator[dict[str, Vector]]:
@@ -145,7 +153,7 @@ class _Stored:
         for vectors in zip(*columns, strict=True):
             yield {feature.name: vector for feature, vector in zip(self.features, vectors, strict=True)}
 
-    def described(self, urdf: str, source: SourceFile, episode_index: int) -> EpisodeInfo:
+    def described(self, urdf: str | None, source: SourceFile, episode_index: int) -> EpisodeInfo:
         """What the recording shall say of it; every number is looked at."""
         file, place, mapping = self._file, self._place, self._mapping
         for _ in self.frames():
@@ -153,42 +161,81 @@ class _Stored:
         if attribute := mapping.robot.urdf_attribute:
             urdf = str(found_attribute(file, place, attribute) or "")
         try:
-            joints = joints_of(urdf) if urdf or attribute else frozenset()
+            info = imported_info(
+                mapping,
+                episode_index=episode_index,
+                instruction=self._task(),
+                urdf=urdf,
+                fps=self._rate(),
+                features=(feature.described() for feature in self.features),
+                cameras=(camera.described() for camera in self.cameras),
+                files=[source],
+            )
         except ValueError as error:
-            raise Hdf5FitError(str(error)) from error
-        info = imported_info(
-            mapping,
-            episode_index=episode_index,
-            instruction=task_of(file, place, mapping),
-            urdf=urdf,
-            fps=rate_of(file, place, mapping),
-            features=(feature.described(joints) for feature in self.features),
-            cameras=(camera.described() for camera in self.cameras),
-            files=[source],
-        )
+            raise FieldError(str(error)) from error
         if wrong := find_problems(info):
-            raise Hdf5FitError("; ".join(wrong))
+            raise FieldError("; ".join(wrong))
         return info
 
+    def _rate(self) -> int:
+        """Rows a second; Hdf5Error when neither the mapping nor the file says it, or no whole number."""
+        if self._mapping.clock.fps:
+            return self._mapping.clock.fps
+        found, path = stated_rate(self._file, self._place), self._file.path
+        if found is None:
+            raise Hdf5Error(
+                f"Nothing in the file says how many rows a second has: give clock.fps in the mapping: {path}"
+            )
+        if not 1 <= found <= MAX_FPS or found != int(found):
+            raise Hdf5Error(
+                f"The file says that it has {found:g} rows a second, allowed are whole numbers from 1 to {MAX_FPS}: "
+                f"give clock.fps in the mapping: {path}"
+            )
+        return int(found)
+
+    def _task(self) -> str:
+        """What the robot was asked to do; Hdf5Error when the file does not say."""
+        task, path = self._mapping.task, self._file.path
+        if task.text:
+            return task.text
+        if task.file_name:
+            if text := task_in_name(path.stem):
+                return text
+            raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {path}")
+        found = found_attribute(self._file, self._place, task.attribute)
+        if not isinstance(found, str) or not found.strip():
+            raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {self._place or 'the episode'}: {path}")
+        return found
+
     def outcome(self) -> Outcome:
-        """How it ended; Hdf5Error when the file does not say."""
-        success = success_of(self._file, self._place, self._mapping, self.num_rows)
-        return Outcome(success=success, num_frames=self.num_frames)
+        """How it ended, which is unknown where the mapping does not ask, or other episodes of the file alone say it.
 
+        Raises:
+            Hdf5Error: No episode says it, or this one says something else.
+        """
+        name = self._mapping.episodes.success.strip("/")
+        return Outcome(success=self._success(name) if name else None, num_frames=self.num_frames)
 
-def _num_rows(observed: Sequence[StoredArray], others: Sequence[StoredArray]) -> int:
-    """Of an episode: observations may have one more than actions, what the last action led to.
-
-    Raises:
-        Hdf5FitError: They have other numbers of rows.
-    """
-    num_rows = len((others or observed)[0])
-    has_last = len(observed[0]) == num_rows + 1
-    for arrays, wanted in ((others, num_rows), (observed, num_rows + has_last)):
-        for array in arrays:
-            if len(array) != wanted:
-                raise Hdf5FitError(f"{array.place} has {len(array)} rows, other datasets of the episode have {wanted}")
-    return num_rows
+    def _success(self, name: str) -> bool | None:
+        file, place = self._file, self._place
+        found = file.attribute(place, name)
+        if isinstance(found, str) or (isinstance(found, float) and not math.isfinite(found)):
+            raise Hdf5Error(
+                f"{place or 'The episode'} says {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
+                f"{file.path}"
+            )
+        if found is not None:
+            return bool(found)
+        if not file.has(f"{place}/{name}"):
+            if any(file.attribute(other, name) is not None for other in episode_places(file, self._mapping.episodes)):
+                return None
+            near = nearest_match(name, list(file.children(place)))
+            told = f"{place or 'The episode'} has no attribute or dataset {name!r} that says how it ended.{near}"
+            raise Hdf5Error(f"{told.rstrip('.?')}: {file.path}")
+        array = file.array(f"{place}/{name}".lstrip("/"))
+        if len(array) != self.num_rows:
+            raise Hdf5Error(f"{array.place} has {len(array)} rows, the episode has {self.num_rows}: {file.path}")
+        return bool((array.read(self.num_rows - 1, self.num_rows).astype(np.float64) > 0).all())
 
 
 def _alike(info: EpisodeInfo, first: EpisodeInfo, file: ForeignFile, place: str) -> EpisodeInfo:
@@ -231,7 +278,7 @@ def _named(path: Path) -> Iterator[None]:
     """Errors about what does not fit name the file."""
     try:
         yield
-    except Hdf5FitError as error:
+    except FieldError as error:
         raise Hdf5Error(f"The mapping does not fit the file: {error}: {path}") from error
 
 
@@ -302,23 +349,6 @@ def _parsed(text: str) -> Any:
         return None
 
 
-def rate_of(file: ForeignFile, place: str, mapping: SourceMapping) -> int:
-    """Rows a second; Hdf5Error when neither the mapping nor the file says it, or no whole number."""
-    if mapping.clock.fps:
-        return mapping.clock.fps
-    found = stated_rate(file, place)
-    if found is None:
-        raise Hdf5Error(
-            f"Nothing in the file says how many rows a second has: give clock.fps in the mapping: {file.path}"
-        )
-    if not 1 <= found <= MAX_FPS or found != int(found):
-        raise Hdf5Error(
-            f"The file says that it has {found:g} rows a second, allowed are whole numbers from 1 to {MAX_FPS}: give "
-            f"clock.fps in the mapping: {file.path}"
-        )
-    return int(found)
-
-
 def stated_rate(file: ForeignFile, place: str) -> float | None:
     """What the file's attributes say of the rate; None when they say nothing."""
     for name in _RATES:
@@ -326,49 +356,3 @@ def stated_rate(file: ForeignFile, place: str) -> float | None:
         if isinstance(found, int | float) and not isinstance(found, bool):
             return float(found) if abs(found) <= sys.float_info.max else math.inf
     return None
-
-
-def task_of(file: ForeignFile, place: str, mapping: SourceMapping) -> str:
-    """What the robot was asked to do; Hdf5Error when the file does not say."""
-    task = mapping.task
-    if task.text:
-        return task.text
-    if task.file_name:
-        if text := task_in_name(file.path.stem):
-            return text
-        raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {file.path}")
-    found = found_attribute(file, place, task.attribute)
-    if not isinstance(found, str) or not found.strip():
-        raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {place or 'the episode'}: {file.path}")
-    return found
-
-
-def success_of(file: ForeignFile, place: str, mapping: SourceMapping, num_rows: int) -> bool | None:
-    """How an episode ended; None where the mapping does not ask, or other episodes of the file alone say it.
-
-    Raises:
-        Hdf5Error: No episode says it, or this one says something else.
-    """
-    name = mapping.episodes.success.strip("/")
-    if not name:
-        return None
-    found = file.attribute(place, name)
-    if isinstance(found, str) or (isinstance(found, float) and not math.isfinite(found)):
-        raise Hdf5Error(
-            f"{place or 'The episode'} says {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
-            f"{file.path}"
-        )
-    if found is not None:
-        return bool(found)
-    if not file.has(f"{place}/{name}"):
-        if any(file.attribute(other, name) is not None for other in episode_places(file, mapping.episodes)):
-            return None
-        near = nearest_match(name, list(file.children(place)))
-        raise Hdf5Error(
-            f"{place or 'The episode'} has no attribute or dataset {name!r} that says how it ended.{near}".rstrip(".?")
-            + f": {file.path}"
-        )
-    array = file.array(f"{place}/{name}".lstrip("/"))
-    if len(array) != num_rows:
-        raise Hdf5Error(f"{array.place} has {len(array)} rows, the episode has {num_rows}: {file.path}")
-    return bool((array.read(num_rows - 1, num_rows).astype(np.float64) > 0).all())

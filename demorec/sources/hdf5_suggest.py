@@ -101,7 +101,10 @@ def _listed(contents: _Contents, count: int) -> Iterator[str]:
         length = " of variable length" if array.is_ragged else ""
         yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}{length}"
         if contents.is_vector(name) and array.shape[0]:
-            yield f"#     {_first_row(contents, array)}"
+            try:
+                yield f"#     {first_numbers(np.ravel(array.read(0, 1)))}"
+            except Hdf5Error as error:
+                yield f"#     {without_path(error, contents.file.path)}"
     for reason in contents.unusable:
         yield f"#   {reason}"
 
@@ -120,14 +123,6 @@ def _left_out(contents: _Contents) -> Iterator[str]:
     if others:
         yield f"leave_out = [{', '.join(map(quoted, others))}]  # has cameras that are not imported"
         yield ""
-
-
-def _first_row(contents: _Contents, array: StoredArray) -> str:
-    """Its numbers; why they cannot be read, where that is so."""
-    try:
-        return first_numbers(np.ravel(array.read(0, 1)))
-    except Hdf5Error as error:
-        return without_path(error, contents.file.path)
 
 
 def _robot(contents: _Contents, is_aloha: bool) -> str:
@@ -182,7 +177,9 @@ def _features(contents: _Contents, is_aloha: bool) -> Iterator[str]:
     vectors = [name for name in contents.arrays if contents.is_vector(name)]
     observed: dict[str, list[str]] = {}
     for name in (name for name in vectors if name.startswith(folder)):
-        observed.setdefault(_feature_of(name.removeprefix(folder)), []).append(name)
+        last = name.removeprefix(folder)
+        known = (feature for end, feature in _PARTS.items() if last == end or last.endswith(f"_{end}"))
+        observed.setdefault(next(known, f"observation.{_word(last)}"), []).append(name)
     if STATE not in observed and EE_POSE in observed:
         observed[STATE] = observed.pop(EE_POSE)
     if STATE not in observed:
@@ -192,12 +189,6 @@ def _features(contents: _Contents, is_aloha: bool) -> Iterator[str]:
     yield from _parts("action", [name for name in actions if name in vectors], contents)
     if "states" in vectors:
         yield from (f"# {line}" if line else "" for line in _parts("observation.simulator", ["states"], contents))
-
-
-def _feature_of(name: str) -> str:
-    """The feature that an observation is a part of."""
-    known = next((feature for end, feature in _PARTS.items() if name == end or name.endswith(f"_{end}")), "")
-    return known or f"observation.{_word(name)}"
 
 
 def _order(name: str) -> tuple[str, int]:
@@ -225,9 +216,7 @@ def _parts(feature: str, names: Sequence[str], contents: _Contents) -> Iterator[
 
 def _cameras(contents: _Contents) -> Iterator[str]:
     taken: list[str] = []
-    for name in contents.cameras:
-        if not name.startswith(_FOLDERS):
-            continue
+    for name in (name for name in contents.cameras if name.startswith(_FOLDERS)):
         camera = unique_name(_word(name.rpartition("/")[2].removesuffix("_image")), taken)
         taken.append(camera)
         yield from ("", f"[cameras.{camera}]", f"dataset = {quoted(name)}")

@@ -86,13 +86,8 @@ class EpisodeReport:
 
 @dataclass(frozen=True, kw_only=True)
 class BagReport:
-    """All that is said about a bag.
-
-    Attributes:
-        name: Of the file or folder, without its place.
-        files: Name and SHA-256 of each of its files.
-        num_bytes: Of them.
-        streams, findings, episodes: As described there.
+    """All that is said about a bag: the name of the file or folder, without its place; name and SHA-256 of each of its
+    files, and their bytes; what came of it.
     """
 
     name: str
@@ -143,13 +138,8 @@ def report_lines(report: BagReport) -> list[str]:
     """The report as text: a table of the streams, the findings, the episodes."""
     rows = [_HEAD, *(_row(stream) for stream in report.streams)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
-    lines = [f"{report.name} ({report.num_bytes / 1e6:,.1f} MB)"]
-    for row in rows:
-        cells = [
-            cell.ljust(width) if column in (0, 1, 4) else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  " + "  ".join(cells).rstrip())
+    cells = "  ".join(f"{{:{'<' if column in (0, 1, 4) else '>'}{width}}}" for column, width in enumerate(widths))
+    lines = [f"{report.name} ({report.num_bytes / 1e6:,.1f} MB)", *(f"  {cells.format(*row)}".rstrip() for row in rows)]
     for finding in report.findings:
         place = f"{finding.stream}: " if finding.stream else ""
         lines.append(f"  {finding.kind}: {place}{finding.text}")
@@ -203,12 +193,7 @@ _MAX_BYTES = 256 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class SkippedBag:
-    """A bag that an import left out.
-
-    Attributes:
-        name: Of the file or folder, without its place.
-        reason: Why, in words.
-    """
+    """A bag that an import left out: the name of the file or folder, without its place, and why, in words."""
 
     name: str
     reason: str

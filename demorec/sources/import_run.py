@@ -6,51 +6,28 @@ Several processes may read and write; bags are numbered and taken into the run i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import os
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import ExitStack
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
 from demorec.core.plain import to_plain
-from demorec.episode.info import SourceFile
-from demorec.episode.validity import find_problems
-from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
-from demorec.mcap.limits import LimitError, Limits
-from demorec.mcap.video import size_problem
-from demorec.runs.external import (
-    differences,
-    episode_path,
-    external_line,
-    open_external_run,
-)
+from demorec.core.processes import process_pool
+from demorec.episode.info import EpisodeInfo
+from demorec.runs.external import ExternalFolder, differences, open_external_run
 from demorec.runs.run_file import Attempt
-from demorec.sources.bag import Bag, Files, bags_in
-from demorec.sources.bag_files import BagError
-from demorec.sources.bag_findings import all_findings, row_findings
-from demorec.sources.batch import Batch, PlannedBag, processes
-from demorec.sources.clock import NS, Int
-from demorec.sources.decoding import BagDecoder
-from demorec.sources.episode_writer import (
-    ImportedEpisodeWriter,
-    PlannedEpisode,
-    described_camera,
-    described_feature,
-    urdf_in_bag,
-    urdf_text,
-)
-from demorec.sources.episodes import Window, subtask_rows, task_text, windows
-from demorec.sources.fields import FieldError
-from demorec.sources.frames_writer import imported_info, joints_of
-from demorec.sources.import_file import BagReport, EpisodeReport, ImportFile, load_import_file, stream_reports
-from demorec.sources.mapping import SourceMapping
+from demorec.sources.bag import Bag, Files, bags_in, open_bag
+from demorec.sources.episode_writer import write_bag
+from demorec.sources.frames_writer import urdf_text
+from demorec.sources.import_file import BagReport, ImportFile, SkippedBag, load_import_file, save_import_file
 from demorec.sources.mapping_file import read_mapping
-from demorec.sources.rows import EpisodeRows, NoRowsError, Timelines
-from demorec.sources.streams import read_streams
+from demorec.sources.planning import PlannedBag, plan_bag
 
 
 def import_bags(
@@ -87,7 +64,7 @@ def import_bags(
         GenerationError: A process of the import was killed.
     """
     mapping = read_mapping(mapping_path)
-    importer = _Importer(mapping, urdf_text(mapping.robot.urdf, mapping_path), video or VideoConfig())
+    urdf, video = urdf_text(mapping, mapping_path), video or VideoConfig()
     known = load_import_file(out)
     if known is None or not known.bags:
         known = ImportFile(mapping=to_plain(mapping), mapping_digest=mapping.digest)
@@ -95,214 +72,189 @@ def import_bags(
         raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
     given = list(dict.fromkeys(bag for path in paths for bag in bags_in(path)))
     batch = Batch(given, known, skips=skip_bad, progress=progress)
-    with processes(workers) as pool:
-        new = batch.look(pool)
+    with ExitStack() as stack:
+        submit: Callable[..., Future[Any]]
+        submit = _at_once if workers == 1 else stack.enter_context(process_pool(workers)).submit
+        new = batch.look(lambda bag: submit(Bag.sha256s, bag))
         if new or (known.bags and batch.skipped_bags() != known.skipped):
             with open_external_run(out, recovers=False) as folder:
-                ahead = 1 if workers == 1 else 2 * workers
-                write = partial(importer.write, folder=folder.path)
-                batch.run(new, folder, pool, ahead=ahead, read=importer.plan, write=write, tell=tell)
+
+                def read(bag: Bag) -> Future[PlannedBag]:
+                    return submit(plan_bag, bag, mapping, urdf, video)
+
+                def write(planned: PlannedBag) -> Future[_Written]:
+                    return submit(write_bag, planned, folder.path, video)
+
+                batch.run(new, folder, read, write, ahead=1 if workers == 1 else 2 * workers, tell=tell)
     return batch
 
 
-@dataclass(frozen=True)
-class _Importer:
-    """Reads, judges and writes bags, in any process.
+def _at_once[R](function: Callable[..., R], *args: Any) -> Future[R]:
+    """What an executor's `submit` gives, done in this process; Ctrl-C is not kept for later."""
+    future: Future[R] = Future()
+    try:
+        future.set_result(function(*args))
+    except Exception as error:
+        future.set_exception(error)
+    return future
+
+
+_Written = tuple[BagReport, list[Attempt]]
+"""The report of a bag whose episodes are in the run's folder, and their lines of run.json."""
+_MAX_REASON = 1000
+"""Characters: an error may quote what a bag holds."""
+
+
+class Batch:
+    """The bags of one call: numbered and taken into the run in their order, whoever reads and writes them when.
+
+    So what is in the run depends neither on how many processes there are nor on when they were interrupted.
 
     Attributes:
-        mapping: Of all bags.
-        urdf: The robot's model, "" where the mapping names no file.
-        video: How pixels are encoded.
+        num_new: Bags that were read now; the others were there.
     """
 
-    mapping: SourceMapping
-    urdf: str
-    video: VideoConfig
+    def __init__(
+        self, paths: Sequence[Path], known: ImportFile, *, skips: bool, progress: Callable[[int, int], None]
+    ) -> None:
+        self._paths, self._known, self._skips, self._progress = paths, known, skips, progress
+        self._files: dict[Path, Files] = {}  # of bags that are in the run, or will be
+        self._skipped: dict[Path, str] = {}
+        self.num_new = self._num_done = 0
+        self._next_index = known.num_episodes
+        self._kind: EpisodeInfo | None = None
+        self._progress(0, len(paths))
 
-    def plan(self, bag: Bag) -> PlannedBag:
-        """Read and judge a bag."""
-        files = bag.sha256s()
-        streams = read_streams(bag, self.mapping)
-        lines = Timelines(streams, self.mapping)
-        found = windows(bag, streams, list(lines.lines.values()), self.mapping)
-        findings = all_findings(lines)
-        begin = min(int(line.times_ns[0]) for line in lines.lines.values() if len(line.times_ns))
-        episodes: list[PlannedEpisode] = []
-        reports: list[EpisodeReport] = []
-        for window in found:
-            if window.discarded:
-                reports.append(_report(window, begin, None, f"its marker says {window.discarded!r}"))
-                continue
+    def look(self, digest: Callable[[Bag], Future[Files]]) -> list[Bag]:
+        """Open all bags, and begin to digest those that may be in the run; those that are not in it yet."""
+        bags = []
+        for path in self._paths:
             try:
-                rows = lines.rows(window)
-            except NoRowsError as error:
-                if self.mapping.clock.when_old == "error":
-                    kinds = {finding.kind: finding.kind for finding in findings}
-                    offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]
-                    kinds |= {"clock_offset": f"clock_offset, {offsets[0]}"} if offsets else {}
-                    reported = f" (the bag's report: {'; '.join(sorted(kinds.values()))})" if kinds else ""
-                    raise BagError(f"The bag gives no whole episode: {error}{reported}: {bag.path}") from error
-                reports.append(_report(window, begin, None, str(error)))
-                continue
-            episode = self._episode(bag, files, lines, rows, len(episodes))
-            episodes.append(episode)
-            reports.append(_report(window, begin, episode))
-        _check_alike(bag, episodes)
-        _check_images(bag, episodes)
-        report = BagReport(
-            name=bag.path.name,
-            files=files,
-            num_bytes=bag.num_bytes,
-            streams=tuple(stream_reports(lines, [episode.rows for episode in episodes])),
-            findings=(*findings, *row_findings(lines, [episode.rows for episode in episodes])),
-            episodes=tuple(reports),
-        )
-        return PlannedBag(bag=bag, report=report, episodes=tuple(episodes))
+                bags.append(open_bag(path))
+            except DemorecError as error:
+                if not os.path.lexists(path):  # a name that was mistyped is no bad bag
+                    raise
+                self._refuse(path, error)
+        known = {report.files for report in self._known.bags}
+        sizes = {(report.num_bytes, *(name for name, _ in report.files)) for report in self._known.bags}
+        likely = [bag for bag in bags if (bag.num_bytes, *(file.name for file in bag.files)) in sizes]
+        for bag, found in [(bag, digest(bag)) for bag in likely]:
+            if (files := found.result()) in known:
+                self._files[bag.path] = files
+                self._advance()
+        return [bag for bag in bags if bag.path not in self._files]
 
-    def _episode(self, bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, index: int) -> PlannedEpisode:
-        topic = self.mapping.robot.urdf_topic
-        urdf = urdf_in_bag(bag, lines.streams, topic) if topic else self.urdf
+    def run(
+        self,
+        bags: Sequence[Bag],
+        folder: ExternalFolder,
+        read: Callable[[Bag], Future[PlannedBag]],
+        write: Callable[[PlannedBag], Future[_Written]],
+        *,
+        ahead: int,
+        tell: Callable[[BagReport], None],
+    ) -> None:
+        """Take new bags into a run; what a bag raises is raised after all bags before it are there.
+
+        Args:
+            bags: Those that are not there yet.
+            folder: Of the run.
+            read: Begins to read and judge a bag.
+            write: Begins to write its episodes.
+            ahead: How many bags are under way at a time: bounds the memory.
+            tell: Called with the report of each bag that is in the run now.
+        """
+        self._kind = folder.kind()
+        waiting, failure = deque(bags), None
+        reading: deque[tuple[Bag, Future[PlannedBag]]] = deque()
+        writing: deque[Future[_Written]] = deque()
+        while waiting or reading or writing:
+            while waiting and len(reading) + len(writing) < ahead:
+                bag = waiting.popleft()
+                reading.append((bag, read(bag)))
+            if writing and writing[0].done():
+                report, lines = writing.popleft().result()
+                self._take(folder, report, lines)
+                tell(report)
+            elif reading and reading[0][1].done():
+                try:
+                    planned = self._accept(folder, *reading.popleft())
+                except Exception as error:
+                    failure = error
+                    waiting.clear()
+                    reading.clear()
+                    continue
+                if planned is not None:
+                    writing.append(write(planned))
+            else:
+                first: list[Future[Any]] = [*list(writing)[:1], *(future for _, future in list(reading)[:1])]
+                wait(first, return_when=FIRST_COMPLETED)
+        if failure is not None:
+            raise failure
+        if self._known.bags:
+            save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
+
+    def _take(self, folder: ExternalFolder, report: BagReport, lines: Sequence[Attempt]) -> None:
+        """A bag whose episodes are written into the run."""
+        folder.extend(lines)
+        self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())
+        save_import_file(self._known, folder.path)
+        self.num_new += 1
+        self._advance()
+
+    def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> PlannedBag | None:
+        """What is to be written of a bag, with its episodes' numbers; None for one that is left out or there."""
         try:
-            joints = joints_of(urdf) if urdf else frozenset()
-        except ValueError as error:
-            raise BagError(f"The episode cannot be recorded: {error}: {bag.path}") from error
-        info = imported_info(
-            self.mapping,
-            episode_index=index,
-            instruction=task_text(bag, lines.streams, rows.window, self.mapping),
-            urdf=urdf,
-            fps=self.mapping.clock.fps,
-            features=(described_feature(name, feature, lines, joints) for name, feature in rows.features.items()),
-            cameras=(described_camera(name, plan, lines) for name, plan in rows.cameras.items()),
-            files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
+            planned = read.result()
+            for info in [episode.info for episode in planned.episodes[:1]]:
+                self._kind = self._kind or info
+                if different := differences(self._kind, info):
+                    raise ConfigError(
+                        f"The run holds episodes of another kind ({'; '.join(different)}): import the bag into another "
+                        f"folder: {bag.path}"
+                    )
+        except Exception as error:
+            self._refuse(bag.path, error)
+            return None
+        is_there = planned.report.files in self._files.values()
+        self._files[bag.path] = planned.report.files
+        if is_there:  # another one with the same bytes
+            self._advance()
+            return None
+        planned = planned.numbered(self._next_index)
+        self._next_index += len(planned.episodes)
+        return replace(planned, episodes=tuple(one for one in planned.episodes if not folder.has(one.info)))
+
+    def _refuse(self, path: Path, error: Exception) -> None:
+        """Leave a bag out, or raise: where that was not asked for, or is the machine's fault."""
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        if not self._skips or isinstance(error, BrokenExecutor):
+            raise error
+        known = isinstance(error, DemorecError)
+        self._skipped[path] = (
+            without_path(error, path)[:_MAX_REASON] if known else f"unexpected {type(error).__name__}, please report it"
         )
-        subtasks = subtask_rows(bag, lines.streams, rows.window, rows.times_ns, self.mapping)
-        episode = PlannedEpisode(info=info, rows=rows, subtasks=subtasks)
-        if wrong := list(self._problems(episode)):
-            raise BagError(f"The episode cannot be recorded: {'; '.join(wrong)}: {bag.path}")
-        return episode
+        self._advance()
 
-    def _problems(self, episode: PlannedEpisode) -> Iterator[str]:
-        """What no recording can hold, found before anything of the bag is written."""
-        yield from find_problems(episode.info)
-        for name, plan in episode.rows.cameras.items():
-            if not plan.kept and (problem := size_problem(self.video, plan.head.width, plan.head.height)):
-                yield f"camera {name}: {problem}"
-        if any(len(text) > MAX_SUBTASK or not text.isprintable() for text in episode.subtasks.values()):
-            yield f"a subtask is no single line of at most {MAX_SUBTASK} characters"
-        times, features = episode.rows.times_ns, episode.rows.features.values()
-        cameras = episode.rows.cameras.values()
-        for stamps in (times, *(times - one.ages_ns for one in features), *(one.stamps_ns for one in cameras)):
-            if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
-                yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
-                return
+    def _advance(self) -> None:
+        self._num_done += 1
+        self._progress(self._num_done, len(self._paths))
 
-    def write(self, planned: PlannedBag, folder: Path) -> tuple[BagReport, list[Attempt]]:
-        """Write a bag's episodes into a run; its report, and their lines of run.json."""
-        self._write(planned.bag, planned.episodes, folder)
-        paths = [episode_path(folder, episode.info.episode_index) for episode in planned.episodes]
-        return planned.report, [external_line(path) for path in paths]
+    def skipped_bags(self) -> tuple[SkippedBag, ...]:
+        """Those of this call, in order, behind those of earlier calls that are not given now."""
+        given = {path.name for path in self._paths}
+        before = [bag for bag in self._known.skipped if bag.name not in given]
+        return (*before, *(SkippedBag(name=path.name, reason=reason) for path, reason in self.skipped.items()))
 
-    def _write(self, bag: Bag, episodes: Sequence[PlannedEpisode], folder: Path) -> None:
-        """Read the bag's images once more, and write each episode while they pass."""
-        waiting = sorted(episodes, key=lambda episode: int(episode.rows.times_ns[0]))
-        for episode in (episode for episode in waiting if not episode.rows.cameras):
-            with self._writer(episode, folder) as writer:
-                writer.finish()
-        filmed = [episode for episode in waiting if episode.rows.cameras]
-        if not filmed:
-            return
-        beginning = _first_images(filmed)
-        begun: set[int] = set()
-        with ExitStack() as stack:
-            under_way: list[tuple[PlannedEpisode, ImportedEpisodeWriter]] = []
-            for topic, number, values in _images(bag, filmed):
-                for episode in beginning.get((topic, number), []):
-                    if episode.info.episode_index not in begun:
-                        begun.add(episode.info.episode_index)
-                        under_way.append((episode, stack.enter_context(self._writer(episode, folder))))
-                for pair in list(under_way):
-                    episode, writer = pair
-                    try:
-                        writer.add(topic, number, values)
-                    except FieldError as error:
-                        raise _unusable(bag, topic, error) from error
-                    if writer.is_complete:
-                        writer.finish()
-                        under_way.remove(pair)
-            for _, writer in under_way:
-                writer.finish()
+    @property
+    def reports(self) -> tuple[BagReport, ...]:
+        """Of every bag that is in the run, in the order in which they were given."""
+        reports = {report.files: report for report in self._known.bags}
+        files = dict.fromkeys(self._files[path] for path in self._paths if path in self._files)
+        return tuple(reports[key] for key in files)
 
-    def _writer(self, episode: PlannedEpisode, folder: Path) -> ImportedEpisodeWriter:
-        path = episode_path(folder, episode.info.episode_index)
-        return ImportedEpisodeWriter(path, episode, video=self.video)
-
-
-def _check_images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> None:
-    """BagError when the images unpack to more than a bag of its size holds: a PNG file of zeros is small."""
-    limits = Limits.of_file(bag.num_bytes)
-    plans = [plan for episode in episodes for plan in episode.rows.cameras.values()]
-    try:
-        limits.check_total(sum(len(plan.taken) * plan.num_bytes for plan in plans))
-    except LimitError as error:
-        raise BagError(f"The images of the bag cannot be used, since {error}: {bag.path}") from error
-
-
-def _check_alike(bag: Bag, episodes: Sequence[PlannedEpisode]) -> None:
-    """ConfigError unless the episodes are of one kind."""
-    for episode in episodes[1:]:
-        if different := differences(episodes[0].info, episode.info):
-            raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {bag.path}")
-
-
-def _images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str, int, dict[str, object]]]:
-    """(topic, number, values) of the images that any episode takes."""
-    taken: dict[str, list[Int]] = {}
-    for episode in episodes:
-        for plan in episode.rows.cameras.values():
-            taken.setdefault(plan.topic, []).append(plan.taken)
-    wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
-    decoder, counts = BagDecoder(bag.num_bytes), dict.fromkeys(wanted, 0)
-    for message in bag.messages([], wanted.keys()):
-        topic = message.channel.topic
-        number, counts[topic] = counts[topic], counts[topic] + 1
-        if number < len(wanted[topic]) and wanted[topic][number]:
-            try:
-                values = decoder.values(message)
-            except ValueError as error:
-                raise _unusable(bag, topic, error) from error
-            yield topic, number, values
-
-
-def _unusable(bag: Bag, topic: str, error: ValueError) -> BagError:
-    return BagError(f"An image of {topic} cannot be used, since {error}: {bag.path}")
-
-
-def _first_images(episodes: Iterable[PlannedEpisode]) -> dict[tuple[str, int], list[PlannedEpisode]]:
-    """(topic, number) -> the episodes whose first image of that topic it is; a topic's messages come in order."""
-    found: dict[tuple[str, int], list[PlannedEpisode]] = {}
-    for episode in episodes:
-        for plan in episode.rows.cameras.values():
-            found.setdefault((plan.topic, int(plan.taken.min())), []).append(episode)
-    return found
-
-
-def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str = "") -> EpisodeReport:
-    """Of a window of a bag that begins at `zero_ns`, and the episode that comes of it, or why none does."""
-    begin_ns, end_ns, count, trimmed_ns, follows = window.begin_ns, window.end_ns, 0, (0, 0), ""
-    if episode is not None:
-        times = episode.rows.times_ns
-        begin_ns, end_ns, count, trimmed_ns = int(times[0]), int(times[-1]), len(times), episode.rows.trimmed_ns
-        follows = episode.rows.follows
-    return EpisodeReport(
-        episode_index=None if episode is None else episode.info.episode_index,
-        begin_s=(begin_ns - zero_ns) / NS,
-        end_s=(end_ns - zero_ns) / NS,
-        num_frames=count,
-        success=window.success,
-        trimmed_s=(trimmed_ns[0] / NS, trimmed_ns[1] / NS),
-        pictures={} if episode is None else {name: plan.description for name, plan in episode.rows.cameras.items()},
-        reason=reason,
-        discarded=window.discarded,
-        follows=follows,
-    )
+    @property
+    def skipped(self) -> dict[Path, str]:
+        """Bags that were left out -> why."""
+        return {path: self._skipped[path] for path in self._paths if path in self._skipped}

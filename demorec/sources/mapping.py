@@ -310,8 +310,3 @@ CONVERSIONS: Mapping[tuple[str, str], float] = {
 def conversion_factor(unit: str, to: str) -> float | None:
     """What numbers are multiplied with; None for not at all, NaN where `Source.limits` say it for each element."""
     return CONVERSIONS.get((unit, to or unit))
-
-
-def recorded_unit(unit: str) -> str:
-    """What recordings call a unit."""
-    return "deg" if unit == "degree" else unit

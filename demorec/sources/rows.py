@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.episode.info import DEPTH_UNITS, Kept
 from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.bag_files import BagError
-from demorec.sources.clock import MISSING, NS, Chosen, Int, Timeline, followed, grid, timeline
-from demorec.sources.episodes import Window
+from demorec.sources.clock import MISSING, NS, Chosen, Int, Numbers, Timeline, followed, grid, timeline
 from demorec.sources.image_messages import KEPT_FORMATS, VIDEO_FORMATS, ImageHead
 from demorec.sources.mapping import ROWS, SourceMapping
 from demorec.sources.streams import BagStreams, Key
@@ -32,20 +30,32 @@ _ROWS_OF_EPISODE = 300
 """That count for an episode in addition to its own: millions of empty ones would take hours."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Where an episode is in its bag.
+
+    Attributes:
+        begin_ns, end_ns: Its first and last moment, by the mapping's clock.
+        success: How it ended; None where the bag does not say.
+        discarded: The marker that says that it is no episode; "" for those that are.
+    """
+
+    begin_ns: int
+    end_ns: int
+    success: bool | None = None
+    discarded: str = ""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureRows:
     """A feature of an episode.
 
     Attributes:
         values: (R, D), float32 where all its sources are, otherwise float64.
-        names: (D,) of the elements.
-        units: (D,) of the elements, "" where the mapping does not say.
         ages_ns: (R,) of the oldest of its sources, signed as in `Chosen`.
     """
 
-    values: NDArray[np.floating[Any]]
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    values: Numbers
     ages_ns: Int
 
 
@@ -69,11 +79,6 @@ class CameraRows:
     taken: Int
     stamps_ns: Int
     positions: Int
-
-    @property
-    def numbers(self) -> Int:
-        """(R,) which of the topic's messages each row shows."""
-        return self.taken[self.positions]
 
     @property
     def num_bytes(self) -> int:
@@ -138,6 +143,13 @@ class Timelines:
         if empty := [line for line in self.lines.values() if not len(line.times_ns)]:
             raise BagError(f"No message of {empty[0].label} has a time at which it could be used")
 
+    def sources(self, feature: str) -> list[Timeline]:
+        """Those that a feature is made of, or the one that it is next."""
+        sources = self.mapping.features[feature]
+        if sources[0].next:
+            return self.sources(sources[0].next)
+        return [self.lines[feature, index] for index in range(len(sources))]
+
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
         self._reserve(_ROWS_OF_EPISODE)
@@ -160,7 +172,7 @@ class Timelines:
             part = slice(later, later + count)
             # The age of what a feature is next counts from the row that has it, and so is below 0.
             ages = feature.ages_ns[part] - (times[part] - times[:count])
-            features[name] = replace(feature, values=feature.values[part], ages_ns=ages)
+            features[name] = FeatureRows(values=feature.values[part], ages_ns=ages)
         return EpisodeRows(
             window=window,
             times_ns=times[:count],
@@ -171,16 +183,10 @@ class Timelines:
         )
 
     def _feature(self, name: str, chosen: Mapping[Key, Chosen]) -> FeatureRows:
-        lines = {key: line for key, line in self.lines.items() if key[0] == name and not isinstance(key, str)}
-        units: list[str] = []
-        for (_, index), line in lines.items():
-            source = self.mapping.features[name][index]
-            units += [source.to or source.unit] * len(line.stream.names)
+        rows = [(line, chosen[name, index]) for index, line in enumerate(self.sources(name))]
         return FeatureRows(
-            values=np.concatenate([line.sampled(chosen[key]) for key, line in lines.items()], axis=1),
-            names=tuple(element for line in lines.values() for element in line.stream.names),
-            units=tuple(units),
-            ages_ns=np.max(np.stack([chosen[key].age_ns for key in lines]), axis=0),
+            values=np.concatenate([line.sampled(of_line) for line, of_line in rows], axis=1),
+            ages_ns=np.max(np.stack([of_line.age_ns for _, of_line in rows]), axis=0),
         )
 
     def _extent(self, window: Window) -> tuple[int, int]:
@@ -291,7 +297,7 @@ def _too_old(line: Timeline, chosen: Chosen, times: Int) -> str:
 def _unfit(line: Timeline, chosen: Chosen, times: Int) -> str:
     """Why what the rows take cannot be recorded; "" when it can."""
     stream = line.stream
-    if stream.values is not None:
+    if stream.names:
         used = stream.values[line.order[chosen.index]]
         if chosen.fraction is not None:
             after = np.minimum(chosen.index + 1, len(line.order) - 1)

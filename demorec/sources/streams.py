@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import zlib
 from array import array
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from demorec.mcap.limits import SpentError
 from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.decoding import BagDecoder, UnknownEncodingError
+from demorec.sources.decoding import BagDecoder, Budgets, UnknownEncodingError
 from demorec.sources.fields import (
     OtherPublisherError,
     SourceReader,
@@ -37,8 +38,7 @@ from demorec.sources.fields import (
     stamp_of,
 )
 from demorec.sources.image_messages import ImageHeads, image_head
-from demorec.sources.mapping import CameraSource, Source, SourceMapping
-from demorec.sources.ros_types import Budgets
+from demorec.sources.mapping import CameraSource, Source, SourceMapping, Unit
 from demorec.sources.words import quoted
 
 NO_STAMP = -(2**63)
@@ -168,27 +168,29 @@ class Stream:
         """First element of each x, y, z, w among them."""
         return self.reader.quaternions if self.reader else ()
 
+    @property
+    def unit(self) -> Unit:
+        """Of the feature; "" for cameras."""
+        return (self.part.to or self.part.unit) if isinstance(self.part, Source) else ""
+
     @cached_property
-    def values(self) -> NDArray[np.floating[Any]] | None:
-        """(N, D) in the unit of the feature, of the whole stream; None for cameras."""
-        if isinstance(self.part, CameraSource):
-            return None
+    def values(self) -> NDArray[np.floating[Any]]:
+        """(N, D) in the unit of the feature, of the whole stream of a source."""
+        assert isinstance(self.part, Source)
         return converted(self.part, np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Text:
-    """A text of a topic (task, marker, robot description).
+class Text(NamedTuple):
+    """A text, number or boolean of a topic (task, marker, robot description), and when it was said.
 
     Attributes:
         time_ns: Of its message, as the mapping's clock takes it.
-        value: The text, number or boolean.
-        is_header: Whether the time is that of a header.
+        is_header: Whether that is the time of a header.
     """
 
     time_ns: int
     value: Any
-    is_header: bool = False
+    is_header: bool
 
 
 def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
@@ -252,7 +254,7 @@ class BagStreams:
         self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
         self._wanted = mapping.topics
         self._counts: dict[str, int] = {}
-        self._types: dict[str, set[str]] = {}
+        self._types: defaultdict[str, set[str]] = defaultdict(set)
         self._refused: dict[str, str] = {}
 
     @property
@@ -265,8 +267,7 @@ class BagStreams:
         topic = message.channel.topic
         number = self._counts.get(topic, 0)
         self._counts[topic] = number + 1
-        if number == 0 or message.channel.type not in self._types[topic]:
-            self._types.setdefault(topic, set()).add(message.channel.type)
+        self._types[topic].add(message.channel.type)
         if topic not in self._wanted or topic in self._refused:
             return
         streams = self._of_topic.get(topic, ())
@@ -299,8 +300,7 @@ class BagStreams:
         except ValueError as error:
             self._refused[topic] = str(error)
             return
-        if isinstance(value, np.generic):
-            value = value.item()
+        value = value.item() if isinstance(value, np.generic) else value
         if not isinstance(value, str | bool | int | float):
             self._refused[topic] = f"the field {self._fields[topic]!r} is no text, number or boolean"
             return
@@ -309,8 +309,7 @@ class BagStreams:
             self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are read"
             return
         stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
-        time_ns = message.log_ns if stamp is None else stamp
-        self.texts[topic].append(Text(time_ns=time_ns, value=value, is_header=stamp is not None))
+        self.texts[topic].append(Text(message.log_ns if stamp is None else stamp, value, stamp is not None))
 
     def check(self, bag: Bag) -> None:
         """Raise BagError for all that the mapping names and the bag lacks."""

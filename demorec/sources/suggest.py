@@ -1,6 +1,6 @@
 """A mapping from what is in a bag: the likely choices made, the doubtful ones commented out, everything listed.
 
-What a topic's words say of its numbers is in `candidates`, what is taken of them in `choice`. A topic whose words say
+What a topic's words say of its numbers, and what is taken of them, is in `candidates`. A topic whose words say
 neither what the robot does nor what it shall do is not guessed at, unless it is the only one.
 """
 
@@ -23,8 +23,7 @@ from demorec.mcap.limits import SpentError
 from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.candidates import Vector, transforms_of, vectors_of
-from demorec.sources.choice import choose_features
+from demorec.sources.candidates import Vector, choose_features, transforms_of, vectors_of
 from demorec.sources.clock import NS, SKEW_S
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import FieldError, follow, stamp_of
@@ -42,6 +41,7 @@ _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
 _LOG = 'stamp = "log"  # its headers have no time'
+_TIMES = ("header", "ts", "timestamp", "stamp")
 _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 
 
@@ -50,8 +50,7 @@ class _Topic:
     """What a topic has shown.
 
     Attributes:
-        type: Of its messages.
-        count: Of them.
+        count: Of its messages.
         first_ns, last_ns: When they were recorded.
         values: Of the first ones.
         vectors: Numbers in them that a feature may be made of.
@@ -73,6 +72,11 @@ class _Topic:
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     skew_ns: int = 0
     problem: str = ""
+
+    @property
+    def head(self) -> ImageHead | None:
+        """Of its first image; None where its messages are none."""
+        return _head(self.values[0]) if self.values else None
 
     @property
     def rate_hz(self) -> float:
@@ -127,7 +131,9 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action])]
     lines += [*_subtasks(topics), *_features(state, action, others)]
     for camera, topic in cameras.items():
-        lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}", *_info_topic(topic, topics)]
+        lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}"]
+        info = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0] + "/camera_info"
+        lines += [f"info_topic = {quoted(info)}"] if info in topics else []
         lines += [] if topics[topic].has_stamp else [_LOG]
     return lines
 
@@ -199,15 +205,9 @@ def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
         rate = f"{topic.rate_hz:.1f} Hz, " if topic.rate_hz else ""
         stamp = "" if topic.has_stamp else ", no times in its headers"
         yield f"#   {name}  {topic.type}, {rate}{topic.count} messages{stamp}"
-        shown = topic.problem or (_examples(topic.values[0]) if topic.values else "none of its messages can be read")
-        yield f"#     {shown}"
-
-
-def _examples(values: Values) -> str:
-    times = ("header", "ts", "timestamp", "stamp")
-    return (
-        "; ".join(f"{key}: {_short(value)}" for key, value in values.items() if key not in times)[:160] or "no fields"
-    )
+        fields = [f"{key}: {_short(value)}" for key, value in (topic.values or [{}])[0].items() if key not in _TIMES]
+        shown = "; ".join(fields)[:160] or ("no fields" if topic.values else "none of its messages can be read")
+        yield f"#     {topic.problem or shown}"
 
 
 def _short(value: Any) -> str:
@@ -219,9 +219,9 @@ def _short(value: Any) -> str:
         return f"[{', '.join(_short(item) for item in value[:SHOWN])}{', ...' if len(value) > SHOWN else ''}]"
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {_short(item)}" for key, item in list(value.items())[:SHOWN]) + "}"
-    return (
-        json.dumps(value[:40]) if isinstance(value, str) else f"{value:.6g}" if isinstance(value, float) else str(value)
-    )
+    if isinstance(value, str):
+        return json.dumps(value[:40])
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _vectors(name: str, topic: _Topic) -> Iterator[Vector]:
@@ -254,26 +254,18 @@ def _timed(vector: Vector, parts: Sequence[Sequence[int]]) -> Vector:
 
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
     """Name of each camera -> topic: of several topics of the same one, the encoded one."""
-    heads = {name: _head(topic.values[0]) for name, topic in topics.items() if topic.values}
-    images = [name for name, head in heads.items() if head is not None]
+    heads = {name: head for name, topic in sorted(topics.items()) if (head := topic.head) is not None}
     cameras: dict[str, str] = {}
-    for name in sorted(images):
-        if any(other != name and other.startswith(f"{name}/") for other in images):
+    for name, head in heads.items():
+        if any(other != name and other.startswith(f"{name}/") for other in heads):
             continue  # image_raw beside image_raw/compressed: the same images
-        head = heads[name]
-        is_depth = head is not None and head.encoding in DEPTH_UNITS
+        is_depth = head.encoding in DEPTH_UNITS
         ignored = _STOP_WORDS | _DEPTH_WORDS if is_depth else _STOP_WORDS
         words = [word for word in _CAMERA_WORD.split(name.lower()) if word and word not in ignored]
         camera = "_".join([*dict.fromkeys(words[-2:])] or ["camera"]) + ("_depth" if is_depth else "")
         camera = camera if camera[0].isalpha() else f"camera_{camera}"
         cameras[unique_name(camera, cameras)] = name
     return cameras
-
-
-def _info_topic(topic: str, topics: Mapping[str, _Topic]) -> list[str]:
-    base = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0]
-    name = f"{base}/camera_info"
-    return [f"info_topic = {quoted(name)}"] if name in topics else []
 
 
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
@@ -307,7 +299,11 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Se
     is_mixed = 0 < len(skews) < len(mapped) and abs(float(np.median(skews))) > SKEW_S * NS
     stamp = "log" if is_mixed or not skews else "header"
     rates = {topic: topics[topic].rate_by(stamp) for topic in cameras.values() if topics[topic].rate_hz}
-    colour = {topic: rate for topic, rate in rates.items() if not _is_depth(topics[topic])} or rates
+    heads = {topic: topics[topic].head for topic in rates}
+    colour = {
+        topic: rate for topic, rate in rates.items() if (head := heads[topic]) and head.encoding not in DEPTH_UNITS
+    }
+    colour = colour or rates
     slowest = min(colour, key=lambda topic: colour[topic], default="")
     rate = colour.get(slowest, min([30.0, *(vector.rate_hz for vector in vectors if vector.rate_hz)]))
     lines = [f"fps = {max(1, round(rate))}"]
@@ -316,11 +312,6 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Se
     if is_mixed:
         lines += ['stamp = "log"  # not all headers have a time, and those that do are of another clock']
     return [*lines, 'when_old = "error"  # or "drop_episode"']
-
-
-def _is_depth(topic: _Topic) -> bool:
-    head = _head(topic.values[0]) if topic.values else None
-    return head is not None and head.encoding in DEPTH_UNITS
 
 
 def _features(state: Sequence[Vector], action: Sequence[Vector], others: Sequence[Vector]) -> Iterator[str]:

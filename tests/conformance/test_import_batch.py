@@ -27,7 +27,7 @@ from demorec.core.tables import CHECKS
 from demorec.episode.info import Origin
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-from demorec.sources import import_run
+from demorec.sources import planning
 from demorec.sources.bag_files import BagError
 from demorec.sources.import_file import BagReport
 from demorec.sources.import_run import import_bags
@@ -218,7 +218,7 @@ def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.Mo
         import_bags([bag, tmp_path / "b.mcap"], mapping, run, skip_bad=True)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     for place, name, error, words in (
-        (import_run, "read_streams", MemoryError(), "too little memory"),
+        (planning, "read_streams", MemoryError(), "too little memory"),
         (os, "fsync", full, "No space left"),
     ):
 

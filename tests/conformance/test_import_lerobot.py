@@ -40,7 +40,7 @@ def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     if kind == "long_gops":
         arguments["rgb_encoder"] = RGBEncoderConfig(vcodec="h264", g=12, extra_options={"bf": "2"})
     write_by_lerobot(folder / "dataset", LENGTHS, **arguments)
-    import_lerobot(folder / "dataset", folder / "run")
+    import_lerobot([folder / "dataset"], None, folder / "run")
     return kind, folder / "dataset", folder / "run"
 
 
@@ -136,7 +136,7 @@ def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
 
     write_by_lerobot(tmp_path / "d", LENGTHS, depth=True)
     codes = codes_of(tmp_path / "d", DEPTH)
-    result = import_lerobot(tmp_path / "d", tmp_path / "run")
+    result = import_lerobot([tmp_path / "d"], None, tmp_path / "run")
     name = DEPTH.removeprefix("observation.images.")
     assert DEPTH not in result.left_out
     assert name in result.cameras
@@ -159,13 +159,13 @@ def test_depth_of_another_scale_is_read_by_it_and_without_one_left_out(tmp_path:
     key = next(name for name in described["features"] if name.endswith("_depth"))
     described["features"][key]["info"] |= {"video.depth_min": 0.0, "video.depth_max": 4.095, "video.use_log": False}
     path.write_text(json.dumps(described))
-    import_lerobot(tmp_path / "d", tmp_path / "run")
+    import_lerobot([tmp_path / "d"], None, tmp_path / "run")
     with Recording(recordings(tmp_path / "run")[0]) as recording:
         found = list(recording.distances(key.removeprefix("observation.images.")))
     np.testing.assert_allclose(found, np.array(codes_of(tmp_path / "d", key)) / 1000, atol=1e-6)
     del described["features"][key]["info"]["video.shift"]
     path.write_text(json.dumps(described))
-    assert "scale of depth" in import_lerobot(tmp_path / "d", tmp_path / "other").left_out[key]
+    assert "scale of depth" in import_lerobot([tmp_path / "d"], None, tmp_path / "other").left_out[key]
 
 
 def test_whole_numbers_that_no_recording_holds_are_left_out(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_whole_numbers_that_no_recording_holds_are_left_out(imported: tuple[str,
     rows[-1][0] = 2**53 + 1
     kind = table.schema.field(place)
     pq.write_table(table.set_column(place, kind, pa.array(rows, type=kind.type)), file)
-    told = import_lerobot(tmp_path / "d", tmp_path / "run").left_out
+    told = import_lerobot([tmp_path / "d"], None, tmp_path / "run").left_out
     assert told["observation.counts"] == "it has whole numbers that float64 cannot hold"
     assert "observation.touch" not in told
 
@@ -225,7 +225,7 @@ def test_what_cannot_be_imported_is_one_sentence(fault: str, imported: tuple[str
     change, words = FAULTS[fault]
     change(tmp_path / "d")
     with pytest.raises(DemorecError, match=words) as refused:
-        import_lerobot(tmp_path / "d", tmp_path / "run")
+        import_lerobot([tmp_path / "d"], None, tmp_path / "run")
     assert "\n" not in str(refused.value)
     assert not recordings(tmp_path / "run") or fault in ("times", "video")
 

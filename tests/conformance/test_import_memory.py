@@ -66,7 +66,7 @@ def test_what_is_kept_of_messages(tmp_path: Path) -> None:
         gc.collect()
         kept.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
-        assert len(streams.sources["observation.state", 0]) == 100 * seconds
+        assert len(streams.all["observation.state", 0]) == 100 * seconds
     # Arrays grow by an eighth more than is needed; what other tests leave behind is little beside 30 s of messages.
     assert kept[2] - kept[1] < 30 * 100 * (2 * PER_JOINT_MESSAGE + PER_IMAGE) * 1.2
 

@@ -13,10 +13,10 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from support import bags
 
-from demorec.mcap.scan import ScannedChannel
+from demorec.mcap.scan import ScannedChannel, ScannedMessage
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.decoding import BagDecoder, UnknownEncodingError, decoder_of
+from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import stamp_of
 
 
@@ -162,16 +162,14 @@ def test_definitions_are_data(name: str) -> None:
         topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=HOSTILE[name]
     )
     with pytest.raises(UnknownEncodingError):
-        decoder_of(channel)
+        BagDecoder().values(ScannedMessage(channel, 0, b""))
     assert not Path("/tmp/ran").exists()
 
 
 def test_no_message_fills_the_memory() -> None:
     schema = b"float64[] values\nstring[] names\nb/E[] items\n" + b"=" * 80 + b"\nMSG: b/E\n"
-    decode = decoder_of(
-        ScannedChannel(topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=schema)
-    )
+    channel = ScannedChannel(topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=schema)
     many = (2**32 - 1).to_bytes(4, "little")
     for data in (many, bytes(4) + many, bytes(8) + many, b""):
         with pytest.raises(ValueError, match="end"):
-            decode(b"\x00\x01\x00\x00" + data)
+            BagDecoder().values(ScannedMessage(channel, 0, b"\x00\x01\x00\x00" + data))

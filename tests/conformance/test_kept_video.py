@@ -152,7 +152,7 @@ def test_appended_they_stay(expected: list[Images], run: Path, tmp_path: Path) -
 
 
 def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path, tmp_path: Path) -> None:
-    result = import_lerobot(dataset, tmp_path / "run")
+    result = import_lerobot([dataset], None, tmp_path / "run")
     assert result.cameras["high"] == "h264, passed through as it is"
     for path in sorted((run / "episodes").glob("*.mcap")):
         with Recording(path) as given, Recording(tmp_path / "run/episodes" / path.name) as found:

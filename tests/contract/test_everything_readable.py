@@ -25,7 +25,7 @@ from support.commands import ON_A_PATH, ON_EVERYTHING, exit_code
 from support.export import without_verification
 from support.foreign_dataset import write_foreign
 
-from demorec.sources import opening
+from demorec.sources import import_run
 
 pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 COMMANDS = {name: ON_A_PATH[name] for name in ON_EVERYTHING} | {"export": "export hdf5 PATH --out NEW.hdf5"}
@@ -217,7 +217,7 @@ def test_nothing_stays_where_reading_is_cut_off(
         assert list(scratch.iterdir())
         raise error
 
-    monkeypatch.setattr(opening, "import_bags", cut_off)
+    monkeypatch.setattr(import_run, "import_bags", cut_off)
     assert exit_code("check", *places["mcap"]) == (130 if isinstance(error, KeyboardInterrupt) else 1)
     assert not [path for path in scratch.iterdir() if path.is_dir()]
 

@@ -269,14 +269,14 @@ def test_a_small_bag_never_becomes_large(
 def test_too_little_memory_is_no_fault_of_a_definition(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from demorec.sources import ros_types
+    from demorec.sources import decoding
 
     def lack(_: object) -> None:
         raise MemoryError
 
     bag = _joints(tmp_path)
-    monkeypatch.setattr(ros_types, "_parsed", {})
-    monkeypatch.setattr(ros_types._CountedMsgParser, "specification", lack)
+    monkeypatch.setattr(decoding, "_parsed", {})
+    monkeypatch.setattr(decoding._CountedMsgParser, "specification", lack)
     assert exit_code("import", "--suggest", bag) == 1
     assert "This machine has too little memory for this" in capsys.readouterr().err
 

@@ -279,7 +279,7 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
     assert names[3] is None
     assert len(list((tmp_path / "d" / "demorec" / "robots").iterdir())) == 4
     assert 'xyz="0.4 0 0"' in read_robot(tmp_path / "d", names[1]).urdf
-    imported = import_lerobot(tmp_path / "d", tmp_path / "run")
+    imported = import_lerobot([tmp_path / "d"], None, tmp_path / "run")
     assert (imported.num_new, "demorec/robots" in imported.left_out) == (4, True)
     with open_dataset_episode(tmp_path / "d", 1) as played:
         assert played.info.simulation is None

@@ -23,6 +23,7 @@ from demorec.sources.fields import (
 from demorec.sources.mapping import Source
 from demorec.sources.mapping_file import read_mapping
 from demorec.sources.streams import read_streams
+from demorec.sources.words import task_in_name
 
 WRONG = [
     ('fps = 30', 'fpss = 30', r"unknown key 'fpss' in clock. Did you mean 'fps'\?"),
@@ -44,7 +45,7 @@ WRONG = [
     ('field = "position"', 'field = "header.frame_id"', r"holds no numbers"),
     ('field = "position"', 'field = "position"\njoints = ["shoulder_pam"]', r"Did you mean 'shoulder_pan'\?"),
     ('field = "position"', 'field = "position"\nelements = [9]', r"no element 9 among the 6"),
-    ('field = "position"', 'field = "position"\nnames = ["a"]', r"names has 1 names for the 6 elements"),
+    ('field = "position"', 'field = "position"\nnames = ["a"]', r"names has 1 entries for the 6 elements"),
     ("/follower/cam_front/image_raw/compressed", "/follower/joint_states", r"camera front .* it holds no image"),
 ]  # fmt: skip
 
@@ -108,6 +109,12 @@ def test_a_source_without_a_list_is_refused_where_publishers_differ(tmp_path: Pa
         read_streams(bag, mapping)
     assert '"wheel_left", "wheel_right"' in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.timeout(60)
+def test_long_numbers_in_a_name_do_not_hold_it_up() -> None:
+    name = "1" * 200 + "a"
+    assert task_in_name(name) == name
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from demorec.core.replacing import use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
-from demorec.sources.formats import FORMATS, IMPORTED
+from demorec.sources.formats import FORMATS, import_kind, opened
 
 WHAT_IS_READ = (
     f"recordings, runs, {', '.join(form.name for form in FORMATS.values())}, bags, folders of recordings or bags"
@@ -103,8 +103,8 @@ def reading(
 ) -> Iterator[tuple[Path, ...]]:
     """What to read in the place of each path; until the context is left, all output names the user's paths.
 
-    What is imported (`demorec.sources.formats`) is read through a temporary run (`demorec.sources.opening`). No line
-    that is written names it: its episodes are called "demo.hdf5: episode 3".
+    What is imported (`demorec.sources.formats`) is read through a temporary run. No line that is written names it: its
+    episodes are called "demo.hdf5: episode 3".
 
     Args:
         paths: As the user named them.
@@ -115,12 +115,9 @@ def reading(
         ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
         DemorecError: A path cannot be read.
     """
-    imported = {*IMPORTED, *(["dataset"] if imports_datasets else [])}
-    if mapping is None and not imported & {find(path).kind for path in paths}:
-        yield tuple(paths)  # without loading what reads bags
+    if mapping is None and not any(import_kind(path, imports_datasets) for path in paths):
+        yield tuple(paths)
         return
-    from demorec.sources.opening import opened
-
     with terminate_as_interrupt(), opened(paths, mapping, imports_datasets=imports_datasets, tell=tell) as found:
         names = {str(run): str(path) for path, run in zip(paths, found, strict=True) if run != path}
         with renamed(names) as in_users_words:
