@@ -158,11 +158,9 @@ class Timelines:
         if len(times) < 2:
             raise NoRowsError(f"only {len(times)} rows have all streams")
         chosen = {key: line.chosen(times) for key, line in self.lines.items()}
-        problems = [text for key, rows in chosen.items() if (text := _too_old(self.lines[key], rows, times))]
-        if problems := problems or [
-            text for key, rows in chosen.items() if (text := _unfit(self.lines[key], rows, times))
-        ]:
-            raise NoRowsError("; ".join(problems))
+        for judge in (_too_old, _unfit):
+            if problems := [text for key, rows in chosen.items() if (text := judge(self.lines[key], rows, times))]:
+                raise NoRowsError("; ".join(problems))
         mapped = self.mapping.features
         taken = {name: self._feature(name, chosen) for name, sources in mapped.items() if not sources[0].next}
         count = len(times) - any(sources[0].next for sources in mapped.values())
