@@ -39,7 +39,7 @@ def test_the_same_command_keeps_what_is_drawn(
         if drawn:
             raise KeyboardInterrupt
         stats = write(writer, outcome)
-        drawn.append(stats.path)
+        drawn.append(stats)
         return stats
 
     with monkeypatch.context() as patch:
