@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
-from itertools import islice, repeat
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import NO_IMAGE, Action, CameraImages, Columns, Event, Frame, JointSample, Observation
+from demorec.episode.episode import NO_IMAGE, Action, Columns, Event, Frame, JointSample, Observation
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import channels, messages
 from demorec.mcap.container import Container, damage_as_recording_error
 from demorec.mcap.streams import FRAMES, FrameStream, frame_streams
-
-if TYPE_CHECKING:
-    from demorec.mcap.recording import Recording
 
 _TABLE_BYTES = 1 << 20
 """Of chunks whose numbers are taken out together: taking out takes several times as much memory as they have."""
@@ -155,20 +151,22 @@ def action_at(columns: Columns, frame: int, kind: Literal["action", "command"]) 
     )
 
 
-def frames_of(recording: Recording, columns: Columns | None = None) -> Iterator[Frame]:
+def frames_of(
+    columns: Columns, events: Iterable[tuple[int, Event]], joint_samples: Iterable[JointSample]
+) -> Iterator[Frame]:
     """Every frame without its images, bit-exact: numbers, phase, events, and the joint samples before it.
 
     Args:
-        recording: An open recording.
-        columns: Its columns, where the caller has read (or changed) them already.
+        columns: Of a recording.
+        events: Its events, each with its time_ns.
+        joint_samples: Its joint states, those of the frames too.
     """
-    columns = recording.columns() if columns is None else columns
     times = columns.time_ns.tolist()
-    events: dict[int, list[Event]] = {}
-    for time_ns, event in recording.events():
+    found: dict[int, list[Event]] = {}
+    for time_ns, event in events:
         frame = max(int(np.searchsorted(columns.time_ns, time_ns, side="right")) - 1, 0)
-        events.setdefault(frame, []).append(event)
-    samples = _samples_before_frames(recording, times)
+        found.setdefault(frame, []).append(event)
+    samples = _samples_before_frames(joint_samples, times)
     for index, time_ns in enumerate(times):
         yield Frame(
             frame_index=index,
@@ -177,17 +175,17 @@ def frames_of(recording: Recording, columns: Columns | None = None) -> Iterator[
             action=action_at(columns, index, "action"),
             command=action_at(columns, index, "command"),
             phase=columns.phase[index],
-            events=tuple(events.get(index, ())),
+            events=tuple(found.get(index, ())),
             joint_samples=samples.get(index, ()),
             is_deliberate_miss=bool(columns.is_deliberate_miss[index]),
         )
 
 
-def _samples_before_frames(recording: Recording, times: list[int]) -> dict[int, tuple[JointSample, ...]]:
+def _samples_before_frames(samples: Iterable[JointSample], times: list[int]) -> dict[int, tuple[JointSample, ...]]:
     number = {time_ns: index for index, time_ns in enumerate(times)}
     result: dict[int, tuple[JointSample, ...]] = {}
     waiting: list[JointSample] = []
-    for sample in recording.joint_samples():
+    for sample in samples:
         if sample.time_ns in number:
             if waiting:
                 result[number[sample.time_ns]] = tuple(waiting)
@@ -195,39 +193,3 @@ def _samples_before_frames(recording: Recording, times: list[int]) -> dict[int, 
         else:
             waiting.append(sample)
     return result
-
-
-def decoded_images(recording: Recording, columns: Columns) -> Iterator[Mapping[str, CameraImages]]:
-    """The recorded images of every frame, decoded (so not those that were encoded), with the recorded camera poses."""
-    return _images_from(recording, columns, 0, {name: recording.images(name) for name in recording.cameras})
-
-
-def images_at(recording: Recording, columns: Columns, frame: int) -> Mapping[str, CameraImages]:
-    """The images of one frame; only those from the keyframe before it on are decoded."""
-    colors = {name: recording.images_at(name, [frame]) for name in recording.cameras}
-    return next(_images_from(recording, columns, frame, colors))
-
-
-def _images_from(
-    recording: Recording, columns: Columns, first: int, colors: Mapping[str, Iterator[NDArray[np.uint8]]]
-) -> Iterator[Mapping[str, CameraImages]]:
-    """The images of a frame and of those after it, given the colours from that frame on."""
-    nothing: Iterator[None] = repeat(None)
-    streams = {
-        name: (
-            color,
-            islice(recording.depth(name), first, None) if recording.has_depth(name) else nothing,
-            islice(recording.segmentation(name), first, None) if recording.has_segmentation(name) else nothing,
-        )
-        for name, color in colors.items()
-    }
-    for index in range(first, columns.num_frames):
-        yield {
-            name: CameraImages(
-                color=next(color),
-                depth=next(depth),
-                segmentation=next(labels),
-                world_from_camera=pose_of(columns.world_from_camera[name][index]),
-            )
-            for name, (color, depth, labels) in streams.items()
-        }

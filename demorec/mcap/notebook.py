@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,29 +17,26 @@ from demorec.core.text import printable
 from demorec.episode.episode import Columns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import STREAMS
+from demorec.mcap.episode_file import EpisodeFile
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from demorec.mcap.recording import Recording
-
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_MOMENTS, _IMAGE_HEIGHT = 5, 120
+_IMAGE_HEIGHT = 120
 _OUTCOMES = {True: "success", None: "unknown"}
 
 
-def line_of(recording: Recording) -> str:
+def line_of(recording: EpisodeFile) -> str:
     """The facts about a recording in one line, without control characters."""
     return printable(", ".join(f"{name} {value}" if name else value for name, value in _facts(recording)))
 
 
-def page_of(recording: Recording) -> str:
-    """The facts, and images of every camera from the first to the last frame, as one piece of HTML."""
+def page_of(recording: EpisodeFile, images: Mapping[str, Iterable[NDArray[np.uint8]]]) -> str:
+    """The facts, and some images of cameras, as one piece of HTML."""
     facts = (("instruction", recording.info.instruction), *_facts(recording), ("file", str(recording.path)))
     rows = [(name or "length", html.escape(printable(value))) for name, value in facts]
-    moments = np.linspace(0, recording.num_frames - 1, _MOMENTS).round().astype(int).tolist()
-    for camera in (name for name in recording.cameras if recording.num_frames and recording.num_images(name)):
-        rows.append((camera, "".join(map(_image, recording.images_at(camera, moments)))))
+    rows += [(camera, "".join(map(_image, shown))) for camera, shown in images.items()]
     cells = (
         f"<tr><th>{html.escape(printable(name))}</th><td style='text-align: left'>{cell}</td></tr>"
         for name, cell in rows
@@ -47,7 +44,7 @@ def page_of(recording: Recording) -> str:
     return f"<table>{''.join(cells)}</table>"
 
 
-def _facts(recording: Recording) -> Iterator[tuple[str, str]]:
+def _facts(recording: EpisodeFile) -> Iterator[tuple[str, str]]:
     info, outcome = recording.info, recording.outcome
     yield "", f"{recording.num_frames} frames ({recording.num_frames / info.fps:.1f} s at {info.fps} Hz)"
     task = info.instruction if info.simulation is None else info.task

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
+from itertools import islice, repeat
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, overload
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import NotSimulatedError, RecordingError
 from demorec.core.plain import to_json
-from demorec.episode.episode import NO_IMAGE, Columns, Event, Frame, JointSample
+from demorec.episode.episode import NO_IMAGE, CameraImages, Columns, Event, Frame, JointSample
 from demorec.mcap import channels, messages, notebook
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.frames import Said, decoded_images, frame_times, frames_of, images_at, read_columns
+from demorec.mcap.frames import Said, frame_times, frames_of, pose_of, read_columns
 from demorec.mcap.lossless import LabelDecoder, from_labels
 from demorec.mcap.streams import SUBTASK, frame_streams
 from demorec.mcap.video import Rgb, is_keyframe
@@ -231,9 +232,9 @@ class Recording(EpisodeFile):
         return self.num_frames
 
     def __iter__(self) -> Iterator[Frame]:
-        columns = self.columns()
-        for frame, images in zip(frames_of(self, columns), decoded_images(self, columns), strict=True):
-            yield replace(frame, images=images)
+        images = self._images_from(0, {name: self.images(name) for name in self.cameras})
+        for frame in frames_of(self._columns, self.events(), self.joint_samples()):
+            yield replace(frame, images=next(images))
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...
@@ -245,18 +246,44 @@ class Recording(EpisodeFile):
         if isinstance(index, slice):
             return [self[number] for number in range(self.num_frames)[index]]
         frame = self._frames[index]
-        return replace(frame, images=images_at(self, self._columns, frame.frame_index))
+        first = frame.frame_index
+        colors = {name: self.images_at(name, [first]) for name in self.cameras}  # from the keyframe before it on
+        return replace(frame, images=next(self._images_from(first, colors)))
 
     @cached_property
     def _frames(self) -> list[Frame]:
         """All frames without images, kept from the first on that is asked for."""
-        return list(frames_of(self))
+        return list(frames_of(self._columns, self.events(), self.joint_samples()))
+
+    def _images_from(self, first: int, colors: Mapping[str, Iterator[Rgb]]) -> Iterator[Mapping[str, CameraImages]]:
+        """The decoded images of a frame and of those after it, given the colours from that frame on."""
+        nothing: Iterator[None] = repeat(None)
+        streams = {
+            name: (
+                color,
+                islice(self.depth(name), first, None) if self.has_depth(name) else nothing,
+                islice(self.segmentation(name), first, None) if self.has_segmentation(name) else nothing,
+            )
+            for name, color in colors.items()
+        }
+        for index in range(first, self.num_frames):
+            yield {
+                name: CameraImages(
+                    color=next(color),
+                    depth=next(depth),
+                    segmentation=next(labels),
+                    world_from_camera=pose_of(self._columns.world_from_camera[name][index]),
+                )
+                for name, (color, depth, labels) in streams.items()
+            }
 
     def __repr__(self) -> str:
         return f"Recording({str(self.path)!r}: {notebook.line_of(self)})"
 
     def _repr_html_(self) -> str:
-        return notebook.page_of(self)
+        moments = np.linspace(0, self.num_frames - 1, 5).round().astype(int).tolist()
+        filmed = [camera for camera in self.cameras if self.num_frames and self.num_images(camera)]
+        return notebook.page_of(self, {camera: self.images_at(camera, moments) for camera in filmed})
 
     def digest(self) -> str:
         """SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.

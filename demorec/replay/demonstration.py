@@ -162,7 +162,7 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         # Placing a body normalises its quaternion once more.
         tolerance=1e-9 if options.states else 0.0,
         digest=recording.digest(),
-        recorded=tuple(frames_of(recording, columns)) if stride == 1 else (),
+        recorded=() if stride > 1 else tuple(frames_of(columns, recording.events(), recording.joint_samples())),
         recorded_checks=() if outcome is None else outcome.checks,
         gave_up=outcome is not None and gave_up(outcome, [event for _, event in recording.events()], info),
     )

@@ -295,7 +295,7 @@ def _write_drawn(writer: EpisodeWriter, recording: Recording, columns: Columns, 
         recording.info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses
     )
     painter.setup(world)
-    for frame in frames_of(recording, columns):
+    for frame in frames_of(columns, recording.events(), recording.joint_samples()):
         world.frame = frame.frame_index
         writer.write(replace(frame, images=painter.images()))
     writer.finish(_outcome(recording))

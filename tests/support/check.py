@@ -25,7 +25,7 @@ from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepar
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container
 from demorec.mcap.frame_check import FrameCheck
-from demorec.mcap.frames import decoded_images, frames_of
+from demorec.mcap.frames import frames_of
 from demorec.mcap.part_file import PartFile
 from demorec.robots.motors import Motors
 from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
@@ -104,8 +104,9 @@ class Spoilt:
             self.info: EpisodeInfo = recording.info
             self.columns: Columns = recording.columns()
             self.outcome: Outcome | None = recording.outcome
-            self.images: Images = [dict(images) for images in decoded_images(recording, self.columns)]
-            self._frames = list(frames_of(recording, self.columns))
+            frames = list(recording)
+            self.images: Images = [dict(frame.images) for frame in frames]
+            self._frames = [replace(frame, images={}) for frame in frames]
             self.joint_samples = [frame.joint_samples for frame in self._frames]
         self._source = path
         self.events: dict[int, tuple[Event, ...]] = {}
@@ -141,7 +142,7 @@ class Spoilt:
     def write(self, path: Path) -> Path:
         """Record it."""
         with Recording(self._source) as recording:
-            frames = list(frames_of(recording, self.columns))
+            frames = list(frames_of(self.columns, recording.events(), recording.joint_samples()))
         outcome = self.outcome
         assert outcome is not None
         # As a program that checks nothing would write it: our own writer refuses some of the faults.
