@@ -46,11 +46,11 @@ def _triangle(x: Array) -> Array:
     return np.asarray(np.abs(2.0 * (x - np.floor(x)) - 1.0), dtype=np.float64)
 
 
-def _fractal(x: Array, y: Array, seed: int, octaves: int = 4) -> Array:
-    """Sum of value noise over octaves, 0..1."""
+def _fractal(x: Array, y: Array, seed: int) -> Array:
+    """Sum of value noise over four octaves, 0..1."""
     total = np.zeros_like(x)
     weight, weights = 1.0, 0.0
-    for octave in range(octaves):
+    for octave in range(4):
         total = total + weight * _value_noise(x * 2**octave, y * 2**octave, seed + 1013 * octave)
         weights += weight
         weight *= 0.5

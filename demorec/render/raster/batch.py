@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -27,15 +28,15 @@ def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *,
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     face_starts = np.concatenate([[0], np.cumsum(face_counts)]).astype(np.int64)
     total = int(starts[-1])
-    vertices = np.zeros(max(1, layout.blocks_for(total + spare)) * layout.BLOCK, dtype=np.float32)
+    blocks = max(1, math.ceil((total + spare) / layout.LANES))
+    vertices = np.zeros(blocks * layout.BLOCK, dtype=np.float32)
+    address = layout.addresses(max(1, total))
     if total:
-        place = layout.addresses(total)
         together = np.concatenate(attributes)
         for column in range(together.shape[1]):
-            vertices[place + column * layout.LANES] = together[:, column]
+            vertices[address + column * layout.LANES] = together[:, column]
     numbers = [f + start for f, start in zip(faces, starts, strict=False)]
     all_faces = np.concatenate(numbers) if numbers else np.zeros((0, 3), dtype=np.int64)
-    address = layout.addresses(max(1, total))
     return Geometry(
         vertex_start=starts[:-1].copy(),
         vertex_count=counts,
@@ -87,7 +88,8 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
         piece = instance.piece(level)
         n = len(piece.faces)
         attributes.append(piece.scaled_vertices(instance.scale))
-        faces.append(piece.oriented(piece.faces, instance.scale))
+        is_mirrored = float(np.prod(instance.scale)) < 0
+        faces.append(piece.faces[:, ::-1] if is_mirrored else piece.faces)  # they still look outward
         table = np.zeros((n, 4), dtype=np.int32)
         table[:, layout.FACE_FLAGS] = piece.flags
         table[:, layout.FACE_SEGMENT] = instance.segment

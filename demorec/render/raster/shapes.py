@@ -52,10 +52,6 @@ class Piece:
         result[:, 3:6] = unit(result[:, 3:6] / scale)
         return result
 
-    def oriented(self, faces: NDArray[np.int64], scale: Floats) -> NDArray[np.int64]:
-        """Faces that still look outward when the scale mirrors."""
-        return faces[:, ::-1] if float(np.prod(scale)) < 0 else faces
-
 
 def make_piece(mesh: RasterMesh, *, textured: bool) -> Piece:
     """Lay a mesh out."""

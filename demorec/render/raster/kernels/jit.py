@@ -39,7 +39,8 @@ def compiled_folder() -> Path:
     return cache_folder("compiled", digest.hexdigest()[:16])
 
 
-def _compile(function: Callable[..., Any], **options: Any) -> Any:
+def kernel(function: Callable[..., Any], **options: Any) -> Any:
+    """Compile a function on first use, cached on disk."""
     # numba reads the folder while decorating; its own setting is put back for other users of numba.
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(compiled_folder())
@@ -49,11 +50,6 @@ def _compile(function: Callable[..., Any], **options: Any) -> Any:
         numba.config.CACHE_DIR = before
 
 
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function on first use, cached on disk."""
-    return _compile(function)
-
-
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into each kernel that calls it."""
-    return _compile(function, forceinline=True)
+    return kernel(function, forceinline=True)

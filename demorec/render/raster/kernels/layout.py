@@ -131,12 +131,7 @@ class Images(NamedTuple):
     segments: NDArray[np.int32]
 
 
-def addresses(count: int, start: int = 0) -> NDArray[np.int64]:
-    """(count,) addresses of the vertices `start`, `start` + 1, ..."""
-    number = np.arange(start, start + count, dtype=np.int64)
+def addresses(count: int) -> NDArray[np.int64]:
+    """(count,) addresses of the first vertices."""
+    number = np.arange(count, dtype=np.int64)
     return number // LANES * BLOCK + number % LANES
-
-
-def blocks_for(count: int) -> int:
-    """How many blocks hold `count` vertices."""
-    return -(-count // LANES)
