@@ -131,12 +131,7 @@ class RunFolder:
 
     def result(self, *, interrupted: bool) -> RunResult:
         """What this session has come to."""
-        return RunResult(
-            folder=self.path,
-            run=self.run,
-            made=tuple(self._made),
-            interrupted=interrupted,
-        )
+        return RunResult(folder=self.path, run=self.run, made=tuple(self._made), interrupted=interrupted)
 
 
 @contextmanager

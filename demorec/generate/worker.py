@@ -47,7 +47,20 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
         except SceneError as error:
             for part in scratch.iterdir():
                 part.unlink()
-            return _without_scene(plan, str(error), _with_rest(seconds, began))
+            return Attempt(
+                episode_index=plan.episode_index,
+                attempt=plan.attempt,
+                seed=plan.config.seed,
+                success=False,
+                file="",
+                sha256="",
+                digest="",
+                num_frames=0,
+                num_bytes=0,
+                phase="scene",
+                reason=str(error),
+                seconds=_with_rest(seconds, began),
+            )
         with _counted(seconds, RECORDING):
             attempt, *_ = inspect_recording(path)
             file = f"{EPISODES if attempt.success else FAILED}/" + recording_name(
@@ -127,20 +140,3 @@ def _scratch_folder(folder: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             scratch.rmdir()
-
-
-def _without_scene(plan: EpisodePlan, reason: str, seconds: dict[str, float]) -> Attempt:
-    return Attempt(
-        episode_index=plan.episode_index,
-        attempt=plan.attempt,
-        seed=plan.config.seed,
-        success=False,
-        file="",
-        sha256="",
-        digest="",
-        num_frames=0,
-        num_bytes=0,
-        phase="scene",
-        reason=reason,
-        seconds=seconds,
-    )
