@@ -156,9 +156,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)
         self._sensed = tuple(check_choice("sensed", name, tuple(SENSED)) for name in sensed)
-        if render_mode not in (None, "rgb_array"):
-            raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
-        self.config, self.render_mode = config, render_mode
+        self.config, self.render_mode = config, _checked(render_mode)
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
@@ -350,6 +348,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 def _key(feature: str) -> str:
     """A dataset feature's key in the observation, as LeRobot's `preprocess_observation` maps it back."""
     return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
+
+
+def _checked(render_mode: str | None) -> str | None:
+    if render_mode not in (None, "rgb_array"):
+        raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
+    return render_mode
 
 
 def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
