@@ -313,11 +313,16 @@ def _ratio(sums: Array, different: Array, *, least: float) -> Array:
 
 
 def _error(off: Array, own: Array) -> float:
-    """Of the blocks (h, w) of one image: its worst, or nine tenths of them, against the encoder's around."""
-    from scipy.ndimage import maximum_filter
-
+    """Of the blocks (h, w) of one image: its worst, or nine tenths of them, against the largest of the encoder's there,
+    on both sides and below (of the last row: above)."""
+    around = own.copy()
+    around[1:] = np.maximum(own[1:], own[:-1])
+    around[:-1] = np.maximum(own[:-1], own[1:])
+    wide = around.copy()
+    wide[:, 1:] = np.maximum(wide[:, 1:], around[:, :-1])
+    wide[:, :-1] = np.maximum(wide[:, :-1], around[:, 1:])
     least = max(_WORST_SHARE * float(own.max(initial=0.0)), 0.5)
-    worst = float(((off - _LEVELS) / np.maximum(maximum_filter(own, size=3, mode="nearest"), least)).max(initial=0.0))
+    worst = float(((off - _LEVELS) / np.maximum(wide, least)).max(initial=0.0))
     usual = float(np.quantile(off / np.maximum(own, 1.0), 0.9)) if off.size else 0.0
     return max(worst, usual)
 
