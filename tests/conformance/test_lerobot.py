@@ -17,7 +17,7 @@ from support.docs import run_examples
 from support.export import data_table, episode_rows, export, make_run
 from support.recording import make_episode
 
-import demorec.datasets.lerobot.writer
+import demorec.datasets.lerobot.parquet
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot, verify
 from demorec.datasets.lerobot.depth import code_values, quantised
 from demorec.mcap import Recording
@@ -38,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("dataset") / "d"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demorec.datasets.lerobot.writer, "_EPISODES_PER_TABLE", 2)
+        patch.setattr(demorec.datasets.lerobot.parquet, "_ROWS_PER_TABLE", 2)
         export(run, out, privileged=True, video_files_mb=0.006, data_files_mb=0.03, files_per_chunk=2)
     for folder in ("data", "meta/episodes", "videos/observation.images.front", "videos/observation.images.wrist"):
         assert len(list((out / folder).rglob("file-*"))) > 1, folder
