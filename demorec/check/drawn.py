@@ -20,17 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Found, Measurement, NotMeasured
-from demorec.check.cells import (
-    CellGrid,
-    Cells,
-    ImageKind,
-    cell_side,
-    compare_steps,
-    moved,
-    normal_equations,
-    squares,
-    squares_between,
-)
+from demorec.check.cells import CellGrid, Cells, ImageKind, cell_side
 from demorec.check.rows import finest_lag
 from demorec.core.errors import RenderError, SceneError
 from demorec.core.geometry import Array
@@ -136,13 +126,16 @@ def _not_between(
     share: Array,
 ) -> NDArray[np.bool_]:
     """(T,) frames whose images or poses are not what lies between those of the frames before and after."""
+    from demorec.check import kernels
+
     weight = share[:, None, None]
     off = np.abs(poses - (1 - weight) * poses[before] - weight * poses[after]).max(axis=(1, 2)) > _POSE_BETWEEN
     for rows in seen:
         there = np.flatnonzero(after[: len(rows)] < len(rows))
         off[len(there) : len(rows)] = True
-        squared = squares_between(rows, before[there], after[there], share[there])
-        off[there] |= squared > _IMAGE_BETWEEN**2 * max(rows.shape[1], 1)
+        sums = np.zeros(len(there))
+        kernels.squares_between(rows, before, after, share, sums)
+        off[there] |= sums > _IMAGE_BETWEEN**2 * max(rows.shape[1], 1)
     return np.asarray(off)
 
 
@@ -231,10 +224,13 @@ _MIN_MOVING = 12
 
 def fit(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> Array:
     """(4,) by how much the recorded images are to the right, below (cells), larger (share) and turned (rad)."""
+    from demorec.check import kernels
+
     # Frames that are something else altogether must not decide how far the others are shifted.
     size = _rms(seen, drawn, frames)
     usual = frames[size <= 3 * np.median(size) + 1e-6]
-    gram, right = normal_equations(seen, drawn, usual)
+    gram, right = np.zeros((4, 4)), np.zeros(4)
+    kernels.normal_equations(seen, drawn, usual, gram, right)
     # Enough that a direction in which nothing can be measured gets nothing.
     gram += np.eye(4) * max(1e-3 * float(np.trace(gram)) / 4, 1e-9)
     return np.asarray(np.linalg.solve(gram, right))
@@ -248,18 +244,22 @@ def compare(seen: Cells, drawn: Cells, frames: NDArray[np.int64]) -> ImageCompar
         drawn: The same of at least T frames, as of `draw`.
         frames: Those that were drawn.
     """
+    from demorec.check import kernels
+
     drawn, frames = drawn[: len(seen)], frames[frames < len(seen)]
     found = fit(seen, drawn, frames)
-    fitted = moved(drawn, found)
-    step, shown = compare_steps(_flat(seen), _flat(drawn))
-    motion = np.sqrt(step / max(drawn[0].size, 1))
+    fitted = np.empty_like(drawn)
+    kernels.add_bases(drawn, found, fitted)
+    moved, shown = np.zeros(len(seen)), np.zeros(len(seen))
+    kernels.compare_steps(_flat(seen), _flat(drawn), moved, shown)
+    motion = np.sqrt(moved / max(drawn[0].size, 1))
     return ImageComparison(
         shift=found[:2] / drawn.shape[1],
         scale=float(found[2]),
         lag=_lag(seen, fitted, frames[motion[frames] > _MOVING]),
         unlike=_rms(seen, fitted, np.arange(len(seen))),
         motion=motion,
-        shown=shown / np.maximum(step, 1e-6),
+        shown=shown / np.maximum(moved, 1e-6),
     )
 
 
@@ -283,7 +283,11 @@ def strays(seen: Cells, drawn: Cells, kind: ImageKind, *, is_turned: bool = Fals
 
 def _rms(a: Cells, b: Cells, frames: NDArray[np.int64], late: int = 0) -> Array:
     """Root mean square difference over the cells, of some frames of b from those `late` frames later in a."""
-    return np.asarray(np.sqrt(squares(_flat(a), _flat(b), frames, late) / max(b[0].size, 1)))
+    from demorec.check import kernels
+
+    squares = np.zeros(len(frames))
+    kernels.squares(_flat(a), _flat(b), frames, late, squares)
+    return np.asarray(np.sqrt(squares / max(b[0].size, 1)), dtype=np.float64)
 
 
 def _flat(cells: Cells) -> Cells:

@@ -50,8 +50,6 @@ _ONE_STEP = 4.0
 """Levels by which a flat colour is off as a whole in an image of a little other quality."""
 _DOUBTS, _COMMON = 2.0, 16.0
 """Standard errors of a displacement that may be chance, and how many pixels have the same of the encoder's errors."""
-_CODED = 3.0
-"""Levels, of 255, by which coding moves a mix of two pixels."""
 _DEPTH_METRES = 0.004
 """Depth is stored in millimetres; another machine draws edges a little elsewhere."""
 
@@ -203,15 +201,22 @@ def _compared(
     seen: NDArray[np.uint8], expected: NDArray[np.uint8], drawn: NDArray[np.uint8], frames: NDArray[np.int64]
 ) -> FullSize:
     """Compare images (N, H, W, 3): recorded, encoded again, and drawn."""
-    height, width = drawn.shape[1:3]
+    from demorec.check import kernels
+
+    count, height, width, _ = drawn.shape
     reach = min(height, width) / 4
-    all_of, used = _equations(seen, expected, drawn)
+    all_of = np.zeros((8, 8))
+    used = kernels.full_size_equations(seen, expected, drawn, all_of)
     gram, right = all_of[:7, :7], all_of[:7, 7]
     covariance = np.linalg.inv(gram + np.eye(7) * max(1e-6 * float(np.trace(gram)) / 7, 1e-9))
     moved = covariance @ right
     left = max(float(all_of[7, 7] - moved @ right), 0.0) * _COMMON / max(used, 1)  # mean square of what is left
     doubt = np.sqrt(left * np.diag(covariance))
-    color, frame = _worst_color(np.stack([_colors_off(*images) for images in zip(seen, expected, drawn, strict=True)]))
+    colors = np.zeros((count, 64, 7))
+    kernels.sum_colors_off(seen, expected, drawn, colors)
+    off, own = np.zeros((count, height // BLOCK, width // BLOCK)), np.zeros((count, height // BLOCK, width // BLOCK))
+    kernels.block_errors(seen, expected, drawn, BLOCK, off, own)
+    color, frame = _worst_color(colors)
     grid = CellGrid(width, height)
     cells = [np.stack([grid.read("color", image).cells for image in images]) for images in (expected, drawn)]
     return FullSize(
@@ -220,64 +225,10 @@ def _compared(
         sharpness=float(moved[6]),
         color=color,
         color_frame=int(frames[frame]),
-        errors=np.array([_error(*_block_errors(*images)) for images in zip(seen, expected, drawn, strict=True)])
+        errors=np.array([_error(*pair) for pair in zip(off, own, strict=True)])
         * np.where(frames < frames[0] + _PAIR, 1.0, _LATER_WEIGHT),
         encoded=float(np.sqrt(np.mean((cells[0] - cells[1]) ** 2))),
     )
-
-
-def _equations(seen: NDArray[np.uint8], expected: NDArray[np.uint8], drawn: NDArray[np.uint8]) -> tuple[Array, int]:
-    """(8, 8) products of the bases of the least squares seen - expected = bases, and of seen - expected, over images
-    (N, H, W, 3); of how many pixels.
-
-    The bases are what the brightness of drawn changes by when it is shifted right and down (pixels), when x and y grow
-    with x and y (four shares), and when it is blurred (half the variance, pixels squared).
-    """
-    gram, used, (height, width) = np.zeros((8, 8)), 0, drawn.shape[1:3]
-    below, beside = np.arange(1, height - 1)[:, None] - (height - 1) / 2, np.arange(1, width - 1) - (width - 1) / 2
-    for images in zip(drawn, expected, seen, strict=True):
-        lines, made, shown = (image @ [0.299, 0.587, 0.114] for image in images)  # BT.601
-        before, after, above, under = lines[1:-1, :-2], lines[1:-1, 2:], lines[:-2, 1:-1], lines[2:, 1:-1]
-        across, down = (after - before) / 2, (under - above) / 2
-        around = after + before + under + above - 4 * lines[1:-1, 1:-1]
-        bases = [-across, -down, -beside * across, -below * across, -beside * down, -below * down, around]
-        rows = np.stack([*bases, (shown - made)[1:-1, 1:-1]])[:, (across != 0) | (down != 0)]
-        gram += np.einsum("ak,bk->ab", rows, rows)
-        used += rows.shape[1]
-    return gram, used
-
-
-def _colors_off(seen: NDArray[np.uint8], expected: NDArray[np.uint8], drawn: NDArray[np.uint8]) -> Array:
-    """(64, 7) of each drawn colour of images (H, W, 3), four steps a channel: its pixels, how far red, green and blue
-    of seen are from expected, and the squares of how far those of expected are from drawn."""
-    color = (drawn // 64 @ np.array([16, 4, 1])).reshape(-1)
-    off, own = (np.subtract(a, b, dtype=np.float64).reshape(-1, 3) for a, b in ((seen, expected), (expected, drawn)))
-    weights = (np.ones(len(color)), *off.T, *(own**2).T)
-    return np.stack([np.bincount(color, weights=each, minlength=64) for each in weights], axis=1)
-
-
-def _block_errors(
-    seen: NDArray[np.uint8], expected: NDArray[np.uint8], drawn: NDArray[np.uint8]
-) -> tuple[Array, Array]:
-    """(h, w) root mean square differences of seen and of expected from drawn (H, W, 3), block by block.
-
-    Smooth edges are drawn by 2x2 samples. Along an edge that lies on some of them, one sample of each pixel may fall to
-    the other side by the last bit of a pose: a quarter of what two pixels differ by is no error, give or take `_CODED`
-    levels.
-    """
-    true = drawn.astype(np.float64)
-    beside = np.pad(true, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    around = (beside[:-2, 1:-1], beside[2:, 1:-1], beside[1:-1, :-2], beside[1:-1, 2:])
-    quarter = np.max([np.abs(each - true) for each in around], axis=0) / 4
-    error = np.abs(seen - true)
-    error = np.where(error <= quarter + _CODED, np.maximum(error - quarter, 0.0), error)
-    rows, columns = (size // BLOCK for size in drawn.shape[:2])
-
-    def of_blocks(off: Array) -> Array:
-        blocks = off[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK, 3)
-        return np.asarray(np.sqrt((blocks**2).mean(axis=(1, 3, 4))))
-
-    return of_blocks(error), of_blocks(expected - true)
 
 
 def _displacement(moved: Array, reach: float) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.cells import CellGrid, Cells, ImageCells, ImageKind, amount_of_detail
+from demorec.check.cells import CellGrid, Cells, ImageCells, ImageKind
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.episode.scene import SceneCamera
@@ -45,6 +45,8 @@ class ImageSummary:
 
 def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind, keep: Collection[int] = ()) -> ImageSummary:
     """Decode all images of a camera once, and keep those of some frames."""
+    from demorec.check import kernels
+
     read: dict[ImageKind, Callable[[str], Iterator[NDArray[Any]]]] = {
         "color": recording.images,
         "depth": recording.depth,
@@ -58,7 +60,7 @@ def summarise(recording: Recording, camera: SceneCamera, kind: ImageKind, keep: 
     try:
         for frame, image in enumerate(read[kind](camera.name)):
             found.append(grid.read(kind, image))  # what came before the damage counts
-            detail.append(amount_of_detail(image) if kind == "color" else 0.0)
+            detail.append(kernels.amount_of_detail(image) if kind == "color" else 0.0)
             if frame in keep:
                 kept[frame] = image
     except RecordingError as problem:
