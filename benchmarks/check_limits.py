@@ -211,7 +211,7 @@ def write_limits(rows: Sequence[Row], options: argparse.Namespace) -> None:
 def written(calibration: Mapping[str, Any], checks: Mapping[str, Mapping[str, float]]) -> str:
     """The table as TOML."""
     lines = [
-        "# Written by benchmarks/check_limits.py but for the limits, set by hand (demorec/check/base.py).",
+        "# Written by benchmarks/check_limits.py but for warn and fail, set by hand (demorec/check/base.py).",
         "",
         "[calibration]",
         *(f"{key} = {json.dumps(value)}" for key, value in calibration.items()),

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, alignment_check, sidecar_check
+from demorec.check.base import Found, Measurement, NotMeasured, alignment_check, sidecar_check
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.rows import finest_lag
@@ -172,7 +172,7 @@ def dataset_action_lag(dataset: Dataset) -> Iterator[Found]:
         yield _course_lag(wishes, changes, allowed=max(2, round(_BLURRED_S * dataset.info.fps)))
 
 
-def _course_lag(wishes: list[Array], changes: list[Array], *, allowed: int, window: int = 9) -> Measurement:
+def _course_lag(wishes: list[Array], changes: list[Array], *, allowed: int, window: int = 9) -> Found:
     """By how many frames beyond those allowed changes run behind wishes, by the correlation of smoothed courses."""
     from scipy.ndimage import uniform_filter1d
 
@@ -183,6 +183,8 @@ def _course_lag(wishes: list[Array], changes: list[Array], *, allowed: int, wind
         core = slice(reach, len(x) - reach)
         sizes += (x[core] ** 2).sum(), (y[core] ** 2).sum()
         products += [float((x[core] * np.roll(y, -k, axis=0)[core]).sum()) for k in range(-reach, reach + 1)]
+    if not sizes.all():
+        return NotMeasured(why="no episode with noise is long enough to compare the courses")
     best = int(np.argmax(products))
     likeness = products[best] / max(math.sqrt(sizes[0] * sizes[1]), 1e-12)
     lag = best - reach

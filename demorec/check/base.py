@@ -49,8 +49,9 @@ SIDECAR = "what demorec keeps beside its datasets"
 def limit_table() -> dict[str, Any]:
     """The limits of checks whose values vary from one good recording to the next, with what they were calibrated on.
 
-    "checks" has by the name of a check "warn", "fail" and "largest", the largest value of good recordings, which
-    `benchmarks/check_limits.py` writes; the limits are set by hand, and a test holds them to the margin.
+    "calibration" says on what the largest values were measured, and "margin" how many times them a warning is at least.
+    "checks" has for each check "warn" and "fail", set by hand, and "largest", the largest value of good recordings,
+    which `benchmarks/check_limits.py` writes.
     """
     return tomllib.loads(LIMITS.read_text())
 

@@ -212,9 +212,11 @@ class Dataset:
         dataset of somebody else's."""
         found = []
         for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
-            needed = read_table(path, _NEEDED, schema=EPISODE_SCHEMA).to_pylist()
-            there = [name for name in EPISODE_SCHEMA.names if name in open_table(path).schema_arrow.names]
-            found += [row | kept for row, kept in zip(read_table(path, there).to_pylist(), needed, strict=True)]
+            there = set(open_table(path).schema_arrow.names)
+            needed = (*_NEEDED, *({"robot_digest"} & there))
+            others = [name for name in EPISODE_SCHEMA.names if name in there and name not in needed]
+            rows = read_table(path, needed, schema=EPISODE_SCHEMA).to_pylist()
+            found += [row | more for row, more in zip(rows, read_table(path, others).to_pylist(), strict=True)]
         return found
 
     @cached_property

@@ -6,7 +6,7 @@ adds its weight.
 
 From the frames around a frame its acceleration is known where nothing is hit and the motion is smooth. Where the servo
 is known, it tells the joints in the two physics steps before each frame, and by these the acceleration in that frame,
-however noise on the commands shakes the episode.
+however noise on the commands shakes the arm.
 """
 
 from __future__ import annotations

@@ -188,7 +188,7 @@ def course_of(state: Array, names: Sequence[str]) -> Array:
 
 
 def _turn_nearest(action: Array, state: Array, names: Sequence[str]) -> None:
-    """Give the quaternions of actions (T, D) the sign of which they are as near as they can be to the state's."""
+    """Give the quaternions of actions (T, D), in place, the sign that brings them nearest to the state's."""
     for place in quaternion_places(names):
         turn = slice(place, place + 4)
         action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
@@ -249,7 +249,8 @@ def motion_of_features(
     """Of arrays (T, D) by their names, each of which is described; None without a state.
 
     Args:
-        features, described: Name -> what was recorded of it, and what is known of each.
+        features: Name -> what was recorded of it, (T, D).
+        described: What is known of each of them.
         fps: Frames per second.
         urdf: Text of the robot's description; "" for the robot whose joints the state's names are.
         time_ns: (T,) of the frames, where they have times of their own.

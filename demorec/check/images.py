@@ -1,4 +1,6 @@
-"""Are the images worth looking at: they decode, change when something moves, and are neither black nor burnt."""
+"""Are the images worth looking at: they decode, change when something moves, and are neither black nor burnt.
+
+Also: do a dataset's first images show what its sidecar describes."""
 
 from __future__ import annotations
 

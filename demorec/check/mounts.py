@@ -93,10 +93,10 @@ def _links_and_poses(motion: Motion, count: int) -> tuple[Array, Array]:
     """(N, 4, 4) of the last link that moves, and of the hand, in N frames of an episode: so many at most, evenly."""
     assert motion.urdf is not None
     assert motion.ee_pose is not None
-    links = LinkMatrices(motion.urdf, motion.joint_position, len(motion.state))
-    last = [joint.child for joint in motion.urdf.depth_first() if joint.name in motion.joint_position][-1]
     rows = np.unique(np.linspace(0, len(motion.state) - 1, min(count, len(motion.state))).astype(int))
-    return links[last][rows], matrices(motion.ee_pose)[rows]
+    joints = {name: column[rows] for name, column in motion.joint_position.items()}
+    last = [joint.child for joint in motion.urdf.depth_first() if joint.name in joints][-1]
+    return LinkMatrices(motion.urdf, joints, len(rows))[last], matrices(motion.ee_pose[rows])
 
 
 def _fixed(numbers: Array) -> Array:

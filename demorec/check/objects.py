@@ -228,7 +228,7 @@ def penetration(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 def _rests(pose: Array) -> NDArray[np.bool_]:
-    """(T,) whether a body (T or 1, 4, 4) is where it was a frame before and is a frame later."""
+    """(T,) whether a body (T, 4, 4) is where it was a frame before and is a frame later."""
     still = np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1) < _STILL
     return np.asarray(np.append(still, True) & np.append(True, still))
 

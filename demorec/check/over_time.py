@@ -1,4 +1,7 @@
-"""Do a camera's images go together over time, and with what the robot does, in recordings and datasets of anybody's."""
+"""Do a camera's images show something, and go together over time and with what the robot does.
+
+In recordings and datasets of anybody's.
+"""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def run_dataset_content(run: CheckedRun) -> Measurement | None:
     if not is_dataset(path):
         return None
     dataset = Dataset(path)
-    if not dataset.sidecar:
+    if not all("source" in row for row in dataset.sidecar) or not dataset.sidecar:
         return Measurement(value=1, detail="the dataset does not say which recordings it comes from")
     dataset.check_simulated()
     options = export_options(path)

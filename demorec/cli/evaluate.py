@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -104,9 +104,20 @@ class RolloutFlags:
             )
 
     def _config(self) -> GenerateConfig:
-        """Its flags of the same names, as far as they are given."""
-        given = {part.name: getattr(self, part.name, None) for part in fields(GenerateConfig)}
-        return GenerateConfig(**{name: value for name, value in given.items() if value is not None})
+        plain: dict[str, Any] = {} if self.renderer is None else {"renderer": self.renderer}
+        return GenerateConfig(
+            task=self.task,
+            robot=self.robot,
+            objects=self.objects,
+            object_split=self.object_split,
+            split=self.split,
+            seed=self.seed,
+            fps=self.fps,
+            cameras=self.cameras,
+            variation=self.variation,
+            video=self.video,
+            **plain,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -237,7 +237,10 @@ def _tracked(tracking: Mapping[str, tuple[float, float]]) -> str:
 
 def _compared(reports: Sequence[ReplayReport]) -> str:
     """What "identical" means."""
-    names = [name for name in dict.fromkeys(name for r in reports for name in r.compared) if " pose of " not in name]
+    from demorec.replay.demonstration import POSE_OF
+
+    found = dict.fromkeys(name for report in reports for name in report.compared)
+    names = [name for name in found if not name.startswith(POSE_OF)]
     objects = ["poses of objects"] if any(report.compares_objects for report in reports) else []
     return (
         f"Compared: {', '.join([name.removeprefix('the ') for name in names] + objects)}; not labels, phases, images."

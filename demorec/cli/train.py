@@ -139,7 +139,6 @@ class Improve(Plan):
         """Go through the rounds and report."""
         self.validate()
         check_option("workers", self.workers, 1, 1024)
-        self.takeover.validate()
         refuse_inside([self.out])
         from demorec.core.processes import available_cores
         from demorec.learn.evaluate.improvement import Improvement

@@ -195,8 +195,10 @@ def as_reason(error: BaseException) -> str:
 def error_chain(error: BaseException) -> Iterator[BaseException]:
     """An error, what it was raised from, and so on."""
     cause: BaseException | None = error
-    while cause is not None:
+    seen: list[BaseException] = []
+    while cause is not None and cause not in seen:
         yield cause
+        seen.append(cause)
         cause = cause.__cause__ or cause.__context__
 
 

@@ -275,7 +275,9 @@ class Columns:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            raise (NotSimulatedError if name in self.__dataclass_fields__ else AttributeError)(name)
+            if name in self.__dataclass_fields__:
+                raise NotSimulatedError(name)
+            return super().__getattribute__(name)  # the usual error
 
     @property
     def num_frames(self) -> int:

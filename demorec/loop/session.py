@@ -170,7 +170,7 @@ class Session:
         self._arrive(0)
 
     def frame(self, step: Step) -> Frame:
-        """The present frame: what is seen now, and what is wanted then."""
+        """The present frame: what is seen now, and what the agent does about it."""
         return Frame(
             frame_index=self.frame_index,
             time_ns=frame_time_ns(self.frame_index, self.world.fps),

@@ -88,7 +88,7 @@ _VIDEO_STREAMS = {
     "16UC1": "depth",
     "32FC1": "depth",
 }
-IMAGE_STREAMS = ("h264", "video", "image/compressed", "depth", "segmentation", "histogram")
+IMAGE_STREAMS = (*(_VIDEO_STREAMS[codec] for codec in ("h264", "av1", "jpeg")), "depth", "segmentation", "histogram")
 """Streams of a camera that come from its images; H.265 is only kept, in external episodes."""
 
 

@@ -23,8 +23,9 @@ from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.scan import MAX_METADATA_BYTES, MESSAGE_HEAD, NO_SCHEMA, read_channel, read_record, read_schema
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
+_DAMAGE = (OSError, MemoryError, ValueError, KeyError, IndexError, OverflowError, EOFError)
 _PARSERS = ("builtins", "mcap", "struct", "zstandard", "zstd")
-"""Modules whose errors damaged bytes lead to; those of the parsers share no base class but Exception."""
+"""Modules whose errors damaged bytes lead to, too; they share no base class but Exception."""
 
 
 @contextmanager
@@ -37,7 +38,7 @@ def damage_as_recording_error(path: Path) -> Iterator[None]:
     except LimitError as error:
         raise RecordingError(f"The recording is not read, {error}: {path}") from error
     except Exception as error:
-        if not isinstance(error, (OSError, ValueError)) and type(error).__module__.split(".")[0] not in _PARSERS:
+        if not isinstance(error, _DAMAGE) and type(error).__module__.split(".")[0] not in _PARSERS:
             raise
         # zstandard has no error of its own for a lack of memory
         lacking = MemoryError() if "not enough memory" in str(error) else error

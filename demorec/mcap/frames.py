@@ -64,7 +64,7 @@ def read_columns(
         time_ns = due if is_simulated else np.concatenate(times[FRAMES])
         if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
             raise RecordingError(f"The frames of the recording are not in the order of their times: {container.path}")
-        columns = {"phase": ()} | _merged(streams, times, values, time_ns, container)
+        columns = _merged(streams, times, values, time_ns, container)
         if is_simulated:
             columns["phase"] = tuple(_held(said[channels.PHASE], messages.read_string, time_ns, ""))
             misses = _held(said[channels.DELIBERATE_MISS], messages.read_boolean, time_ns, False)

@@ -28,9 +28,14 @@ OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
 """Of a recording that a crash cut off."""
 _OUTCOME_KEYS: Mapping[str, Mapping[str, str]] = {
-    EPISODE: {field.name: field.name for field in dataclasses.fields(Outcome) if field.name != "drops"},
+    EPISODE: {
+        name: name
+        for name in (
+            "success", "checks", "failure_phase", "failure_reason", "num_frames", "num_retries", "final_state_digest"
+        )
+    },
     EXTERNAL: {"success": "success", "num_frames": "num_frames", "drops": "drops", "reason": "failure_reason"},
-}
+}  # fmt: skip
 """Record at the start -> key in that at the end -> field of `Outcome`."""
 _CHECKSUM = "crc32"
 

@@ -34,7 +34,8 @@ LEAST_FACING = math.cos(math.radians(25.0))
 TIP_CLEARANCE = 0.005
 """Air between the finger tips and the support, metres (of an arm of task_scale 1)."""
 LEAST_WIDTH = 0.015
-"""Of what is gripped, beyond the closed gripper's own, metres (of such an arm): the expert takes less for nothing."""
+"""Of what is gripped, beyond the closed gripper's own, metres (of such an arm): the expert takes anything narrower for
+an empty hand."""
 PLAY = 0.01
 """How much narrower than the opening what is gripped has to be, metres."""
 _STEEP = 0.5

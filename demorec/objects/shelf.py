@@ -74,7 +74,7 @@ class Kind:
 def drawn(
     material: str, *, count: int, colors: tuple[str, ...] = (), yaw_symmetry: int = 1
 ) -> Callable[[Callable[[np.random.Generator], SolidMesh]], Kind]:
-    """Makes a kind of a function that draws one shape, and whose name is the noun and seeds the shapes."""
+    """Make a kind from a function that draws one shape; the function's name is the noun and seeds the shapes."""
 
     def kind(draw: Callable[[np.random.Generator], SolidMesh]) -> Kind:
         noun = draw.__name__.strip("_")

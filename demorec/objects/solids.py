@@ -155,6 +155,6 @@ def _convex_runs(profile: Sequence[Point2]) -> list[tuple[int, int]]:
 
 
 def arc(centre: Point2, radius: float, start: float, end: float, count: int) -> list[Point2]:
-    """So many points of a circle's arc between two angles, rad, both ends among them."""
+    """`count` points on a circular arc between two angles, rad, both ends included."""
     angles = [start + (end - start) * k / (count - 1) for k in range(count)]
     return [(centre[0] + radius * math.cos(a), centre[1] + radius * math.sin(a)) for a in angles]

@@ -88,8 +88,8 @@ class Demonstration:
         commands: What to send, one a step; of a recording.
         actions: (T, D) what to send is decoded from these; of a dataset.
         action_kind: What `actions` mean; None where `commands` tell.
-        compared: Words for what is compared, as of `seen_in` -> (T, D) recorded before each command; of a dataset the
-            arm's joints and the opening alone.
+        compared: Words for what is compared, as of `seen_in` -> (T, D) recorded before each command; of a dataset
+            the opening and the joints of the arm alone.
         recorded_success: Whether the episode succeeded when it was recorded; None if that is not known.
         final_state_digest: Of the recording, or "".
         tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.

@@ -254,9 +254,10 @@ def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessChec
 
 def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Array]:
     """What was compared -> (T, D), what is seen now minus what was recorded."""
-    now = [seen_in(observation) for observation in seen]
+    width = d.compared[JOINTS].shape[1]  # of a dataset the arm's alone
+    now = [seen_in(observation) | {JOINTS: observation.joint_position[:width]} for observation in seen]
     return {
-        name: np.array([values[name][: recorded.shape[1]] for values in now]) - recorded[: len(seen)]
+        name: np.array([values[name] for values in now]) - recorded[: len(seen)]
         for name, recorded in d.compared.items()
     }
 

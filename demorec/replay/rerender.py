@@ -126,9 +126,10 @@ def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
             )
     cameras, errors = [], dict[str, Pose]()
     for camera in info.scene.cameras:
-        if (error := stated_error(camera.name, info.behaviour)) is not None:
-            errors[camera.name], camera = error, true_camera(camera, error)
-        cameras.append(camera)
+        error = stated_error(camera.name, info.behaviour)
+        if error is not None:
+            errors[camera.name] = error
+        cameras.append(camera if error is None else true_camera(camera, error))
     return SceneView(scene=info.scene, true_cameras=tuple(cameras), true_from_recorded=errors)
 
 
@@ -195,11 +196,11 @@ def _check_size(camera: SceneCamera) -> None:
 
 
 def config_as[T](config: object, kind: type[T]) -> T:
-    """A recorded config, or a part of it; ConfigError for what is none of this version."""
+    """A recorded config, or a part of it; ConfigError when this version cannot read it."""
     try:
         return from_plain(config, kind)
     except ValueError as error:
-        raise ConfigError(f"The recorded config is none of this version ({error}).") from error
+        raise ConfigError(f"The recorded config does not fit this version ({error}).") from error
 
 
 def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any]) -> Painter:
@@ -264,7 +265,11 @@ def rerender(
             raise RecordingError(f"The recording has no frames: {source}")
         view, config = new_view(info, options), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
-        video = config_as(config.get("video", {}), VideoConfig)
+        config_as(info.config.get("video", {}), VideoConfig)
+        try:
+            video = from_plain(config.get("video", {}), VideoConfig)
+        except ValueError as error:
+            raise ConfigError(f"The video options cannot be used ({error}).") from error
         new_info = replace(info, origin=f"render of {recording.digest()[:16]}").with_simulation(
             scene=view.scene, behaviour=view_behaviour(info, view), config=config, config_digest=digest(config)
         )

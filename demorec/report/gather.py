@@ -52,7 +52,7 @@ _KINDS: Mapping[PathKind, str] = {
 _Vectors = dict[str, tuple[Sequence[str], NDArray[Any]]]
 """Feature -> the names of its components, and its values (T, D)."""
 _Read = tuple[ReportedEpisode, _Vectors, SubjectReport | None]
-_AHEAD = 4
+_AHEAD = 2
 """Episodes that a process may have read before they are counted here."""
 
 

@@ -67,7 +67,8 @@ class ArmKinematics:
     ) -> None:
         joints = urdf.path_to(tcp_link)
         moving = [joint for joint in joints if joint.kind != "fixed"]
-        if [joint.name for joint in moving] != list(arm_joints) or any(j.kind == "prismatic" for j in moving):
+        names = [joint.name for joint in moving]
+        if not names or names != list(arm_joints) or any(j.kind == "prismatic" for j in moving):
             found = [f"{joint.name} ({joint.kind})" for joint in moving]
             raise ValueError(f"the way to {tcp_link} has the joints {found}, expected turning {list(arm_joints)}")
         origins, tool = [], Pose()

@@ -12,13 +12,14 @@ import importlib.util
 import subprocess
 import sys
 import tempfile
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from demorec.core.errors import RenderError
+from demorec.core.files import Closing
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import SceneCamera, Texture
@@ -33,7 +34,7 @@ _NOTHING_HIT = 1.0 - 1e-7
 """Depth buffer value of the background (TinyRenderer's is one float32 step below 1)."""
 
 
-class TinyRenderer:
+class TinyRenderer(Closing):
     """PyBullet's own CPU renderer, in a client without a window: slow, hard shadows, always there; a context manager.
 
     It samples half a pixel up and to the left of the pixels' centres, and its depth is about a millimetre too small at
@@ -53,12 +54,6 @@ class TinyRenderer:
     def _connect(self) -> Any:
         """A new client that can draw; RenderError when there can be none."""
         return connect()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free the client; harmless when called twice."""

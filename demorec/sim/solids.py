@@ -1,7 +1,7 @@
 """What a solid needs before it is in a scene: the convex parts that it collides as, and the pose in which it rests.
 
-Parts are its hull, or what V-HACD cuts it into, where nobody has said them. How it rests on a table is found by letting
-it.
+Parts are its hull, or what V-HACD cuts it into, where nobody has said them. How it rests on a table is found by
+dropping it in the simulator.
 """
 
 from __future__ import annotations
@@ -40,11 +40,12 @@ _UPRIGHT = math.radians(2.0)
 
 def with_parts(mesh: SolidMesh) -> SolidMesh:
     """The solid with convex parts, found once for each content and kept in the user's cache folder."""
-    return mesh if mesh.parts else decode_mesh(_cut(mesh))
+    return mesh if mesh.parts else decode_mesh(_text_with_parts(mesh))
 
 
 @functools.lru_cache(maxsize=1024)
-def _cut(mesh: SolidMesh) -> str:
+def _text_with_parts(mesh: SolidMesh) -> str:
+    """The same solid as text (`Shape.mesh`), its parts its hull or those of the cache folder."""
     from scipy.spatial import ConvexHull  # takes a while to load
 
     if ConvexHull(mesh.points).volume < HULL_IS_RIGHT * mesh.mass_properties()[0]:

@@ -67,8 +67,16 @@ def import_lerobot(
             frames = ({name: values[row] for name, values in columns.features.items()} for row in rows)
             images = {camera.name: _images(recording, camera) for camera in info.cameras}
             leads = {camera.name: int(columns.images[camera.name][0]) for camera in info.cameras if camera.kept}
-            outcome, encoding = recording.outcome, video or VideoConfig()
-            write_frames(folder, info, frames, images, outcome=outcome, video=encoding, leads=leads, subtasks=subtasks)
+            write_frames(
+                folder,
+                info,
+                frames,
+                images,
+                outcome=recording.outcome,
+                video=video or VideoConfig(),
+                leads=leads,
+                subtasks=subtasks,
+            )
             num_new += 1
     return FramesImport(
         num_episodes=len(dataset.places),

@@ -97,12 +97,12 @@ def _unusable(bag: Bag, topic: str, error: ValueError) -> BagError:
     return BagError(f"An image of {topic} cannot be used, since {error}: {bag.path}")
 
 
-class _Images:
+class _CameraImages:
     """A camera's images: which are still to come, and what has come but waits for earlier ones.
 
     Attributes:
         plan: Of the camera.
-        places: Number among the topic's messages -> which of the taken ones it is, of those that are to come.
+        num_missing: How many of the taken ones are still to come.
         waiting: Of the taken ones -> the image.
         num_bytes: Of those that wait.
         num_written: How many are written.
@@ -110,9 +110,17 @@ class _Images:
 
     def __init__(self, plan: CameraRows) -> None:
         self.plan = plan
-        self.places = {number: place for place, number in enumerate(plan.taken.tolist())}
+        self.num_missing = len(plan.taken)
         self.waiting: dict[int, Any] = {}
         self.num_bytes = self.num_written = 0
+        self._first = int(plan.taken.min()) if len(plan.taken) else 0
+        self._places = np.full(int(plan.taken.max(initial=self._first - 1)) - self._first + 1, -1)
+        self._places[plan.taken - self._first] = np.arange(len(plan.taken))
+
+    def place(self, number: int) -> int:
+        """Which of the taken ones a message of the topic is, -1 for none."""
+        number -= self._first
+        return int(self._places[number]) if 0 <= number < len(self._places) else -1
 
 
 class ImportedEpisodeWriter(Closing):
@@ -126,7 +134,7 @@ class ImportedEpisodeWriter(Closing):
 
     def __init__(self, folder: Path, episode: PlannedEpisode, video: VideoConfig) -> None:
         self._rows, self._subtasks, self._next_row = episode.rows, episode.subtasks, 0
-        self._cameras = {name: _Images(plan) for name, plan in episode.rows.cameras.items()}
+        self._cameras = {name: _CameraImages(plan) for name, plan in episode.rows.cameras.items()}
         path = episode_path(folder, episode.info.episode_index)
         self._writer = EpisodeWriter(path, episode.info, video=video, keeps_part=False)
 
@@ -137,7 +145,7 @@ class ImportedEpisodeWriter(Closing):
     @property
     def is_complete(self) -> bool:
         """Whether nothing more is needed of the bag."""
-        return not any(images.places for images in self._cameras.values())
+        return not any(images.num_missing for images in self._cameras.values())
 
     def add(self, topic: str, number: int, values: Values) -> None:
         """Take a message of a camera's topic, if the episode wants it.
@@ -147,11 +155,12 @@ class ImportedEpisodeWriter(Closing):
             RecordingError: It cannot be written.
         """
         for name, images in self._cameras.items():
-            if images.plan.topic == topic and number in images.places:
-                self._take(name, images, images.places.pop(number), values)
+            if images.plan.topic == topic and (place := images.place(number)) >= 0:
+                images.num_missing -= 1
+                self._take(name, images, place, values)
         self._write_rows()
 
-    def _take(self, name: str, images: _Images, place: int, values: Values) -> None:
+    def _take(self, name: str, images: _CameraImages, place: int, values: Values) -> None:
         is_coded = images.plan.kept and images.plan.kept not in DEPTH_UNITS
         data: Any = image_bytes(values) if is_coded else decode_image(values)
         images.waiting[place] = data
@@ -183,6 +192,6 @@ class ImportedEpisodeWriter(Closing):
         """Write what is left and give the recording its name; BagError when images have not come."""
         self._write_rows()
         if self._next_row < len(self._rows.times_ns):
-            missing = [images.plan.topic for images in self._cameras.values() if images.places]
+            missing = [images.plan.topic for images in self._cameras.values() if images.num_missing]
             raise BagError(f"The bag has changed while it was read: images of {missing[0]} are missing.")
         self._writer.finish(Outcome(success=self._rows.window.success, num_frames=self._next_row))

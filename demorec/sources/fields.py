@@ -240,9 +240,11 @@ def reader_of(source: Source, values: Values) -> SourceReader:
     count = sum(np.size(item) for _, item in parts)
     if count > MAX_ELEMENTS:
         raise FieldError(f"the field {source.field!r} holds {count:,} numbers, at most {MAX_ELEMENTS:,} are taken")
-    beside = _names_beside(values, steps)
-    names_steps = next((place for place, names in beside if len(names) == np.size(found)), None)
-    names_steps = parse_path(source.names_field) if source.names_field else names_steps
+    if source.names_field:
+        names_steps: tuple[Step, ...] | None = parse_path(source.names_field)
+    else:
+        beside = _names_beside(values, steps)
+        names_steps = next((place for place, names in beside if len(names) == np.size(found)), None)
     named = _names_at(values, names_steps) if names_steps is not None else None
     if source.joints:
         if named is None:
@@ -278,7 +280,7 @@ def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ..
     """What the elements that a source takes are called in the feature; FieldError when it speaks of more or fewer."""
     for what, given in (("names", source.names), ("limits", source.limits)):
         if given and len(given) != len(labels):
-            raise FieldError(f"{what} has {len(given)} entries for the {len(labels)} elements of {place}")
+            raise FieldError(f"{what} tells of {len(given)} of the {len(labels)} elements of {place}")
     return tuple(source.prefix + name for name in source.names or labels)
 
 

@@ -21,6 +21,7 @@ from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFil
 from demorec.mcap import EpisodeWriter
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import ExternalFolder, episode_path
+from demorec.sources.fields import FieldError
 from demorec.sources.mapping import SourceMapping
 
 Image = bytes | NDArray[Any]
@@ -89,12 +90,12 @@ def imported_info(
         urdf: The robot's model; None where there is none.
 
     Raises:
-        ValueError: The model is none; `str` says so for the inside of a sentence.
+        FieldError: The model is none.
     """
     try:
         joints = set() if urdf is None else {joint.name for joint in Urdf.parse(urdf).joints}
     except ValueError as error:
-        raise ValueError(f"the robot's model cannot be used ({error})") from error
+        raise FieldError(f"the robot's model cannot be used ({error})") from error
 
     def moved(feature: Feature) -> Feature:
         names = tuple(name if name in joints else "" for name in feature.joints)

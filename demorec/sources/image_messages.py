@@ -209,7 +209,7 @@ def image_head(values: Values) -> ImageHead:
                 "that is not compressed, are read"
             )
         height, width = _compressed_depth(data).shape
-        return ImageHead("compressedDepth", encoding, width, height, True)
+        return _checked(ImageHead("compressedDepth", encoding, width, height, True))
     if data.startswith((_JPEG, _PNG)):
         return _file_head(data)
     codec = _ALIASES.get(name, name)

@@ -132,14 +132,17 @@ def stream_reports(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterato
 
 
 _HEAD = ("stream", "topic", "messages", "rate Hz", "clock", "skew ms", "jitter ms", "longest ms", "lost", "age ms")
+_ALIGNMENT = "<<>><>>>>>"
 
 
 def report_lines(report: BagReport) -> list[str]:
     """The report as text: a table of the streams, the findings, the episodes."""
     rows = [_HEAD, *(_row(stream) for stream in report.streams)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
-    cells = "  ".join(f"{{:{'<' if column in (0, 1, 4) else '>'}{width}}}" for column, width in enumerate(widths))
-    lines = [f"{report.name} ({report.num_bytes / 1e6:,.1f} MB)", *(f"  {cells.format(*row)}".rstrip() for row in rows)]
+    lines = [f"{report.name} ({report.num_bytes / 1e6:,.1f} MB)"]
+    for row in rows:
+        cells = [f"{cell:{align}{width}}" for cell, align, width in zip(row, _ALIGNMENT, widths, strict=True)]
+        lines.append(f"  {'  '.join(cells)}".rstrip())
     for finding in report.findings:
         place = f"{finding.stream}: " if finding.stream else ""
         lines.append(f"  {finding.kind}: {place}{finding.text}")

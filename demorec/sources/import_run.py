@@ -206,7 +206,8 @@ class Batch:
         """What is to be written of a bag, with its episodes' numbers; None for one that is left out or there."""
         try:
             planned = read.result()
-            for info in [episode.info for episode in planned.episodes[:1]]:
+            if planned.episodes:
+                info = planned.episodes[0].info
                 self._kind = self._kind or info
                 if different := differences(self._kind, info):
                     raise ConfigError(

@@ -24,6 +24,7 @@ from demorec.sources.bag import Bag, Files
 from demorec.sources.bag_files import BagError
 from demorec.sources.bag_findings import all_findings, row_findings
 from demorec.sources.clock import NS
+from demorec.sources.fields import FieldError
 from demorec.sources.findings import Finding
 from demorec.sources.frames_writer import imported_feature, imported_info
 from demorec.sources.import_file import BagReport, EpisodeReport, stream_reports
@@ -88,11 +89,13 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
         episodes: list[PlannedEpisode] = []
         reports: list[EpisodeReport] = []
         for window in windows(lines):
-            episode, reason = None, f"its marker says {window.discarded!r}"
-            if not window.discarded:
+            episode, reason = None, ""
+            if window.discarded:
+                reason = f"its marker says {window.discarded!r}"
+            else:
                 try:
                     rows = lines.rows(window)
-                    episode, reason = _episode(bag, files, lines, rows, urdf, len(episodes)), ""
+                    episode = _episode(bag, files, lines, rows, urdf, len(episodes))
                     if wrong := list(_problems(episode, video)):
                         raise BagError(f"The episode cannot be recorded: {'; '.join(wrong)}")
                     episodes.append(episode)
@@ -146,7 +149,7 @@ def _episode(
             cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
             files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
         )
-    except ValueError as error:
+    except FieldError as error:
         raise BagError(f"The episode cannot be recorded: {error}") from error
     return PlannedEpisode(info=info, rows=rows, subtasks=_subtask_rows(lines, rows))
 

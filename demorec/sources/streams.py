@@ -220,7 +220,7 @@ class BagStreams:
         num_bytes: Of the bag's files.
 
     Attributes:
-        all: Every stream.
+        all: Key -> stream, the sources of features before cameras.
         cameras: Name of a camera -> its stream.
         infos: Name of a camera -> its first calibration message.
         texts: Topic -> its texts.
@@ -348,7 +348,9 @@ class BagStreams:
     def _double_names(self) -> Iterator[str]:
         seen: dict[tuple[str, str], str] = {}
         for key, stream in self.all.items():
-            feature = key[0]
+            if isinstance(key, str):
+                continue
+            feature, _ = key
             for label in stream.names:
                 if (feature, label) in seen:
                     yield (

@@ -166,7 +166,14 @@ def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
 def start_and_target(
     sampler: Sampler, what: str, *, apart: float = 0.14, region: Region = WORKSPACE
 ) -> tuple[tuple[float, float], float, tuple[float, float], float]:
-    """Point and yaw of where a thing is, and of where it shall go, so many metres away or more."""
+    """Point and yaw at which a thing lies, and those of its target, at least `apart` metres away.
+
+    Args:
+        sampler: Draws them.
+        what: The thing, in words for an error.
+        apart: Metres.
+        region: Where it lies; its target is anywhere in the workspace.
+    """
     start, yaw = sampler.point(region, what=what), sampler.yaw()
     place = sampler.point(WORKSPACE, away_from=[start], min_distance=apart, what="the target")
     return start, yaw, place, sampler.yaw()

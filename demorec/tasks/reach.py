@@ -8,6 +8,7 @@ import numpy as np
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Goal, Scene
+from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.motion import MotionLimits, plan_joints, plan_straight
 from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import arm_kinematics
@@ -33,6 +34,7 @@ class Reach:
     Args:
         scene: As it is at the start.
         robot: At the scene's scale.
+        arm: Its kinematics, where they are there already.
 
     Attributes:
         arm: Its kinematics.
@@ -41,8 +43,8 @@ class Reach:
         limits: What its motions keep to: less than its joints' own limits, with which noise on the way stays in them.
     """
 
-    def __init__(self, scene: Scene, robot: RobotSpec) -> None:
-        self.arm = arm_kinematics(robot, scale=scene.robot.scale)
+    def __init__(self, scene: Scene, robot: RobotSpec, arm: ArmKinematics | None = None) -> None:
+        self.arm = arm or arm_kinematics(robot, scale=scene.robot.scale)
         self.home, self.start = np.array(robot.home_q), np.array(scene.robot.joint_position)
         self.limits = MotionLimits(
             joint_velocity=0.6 * np.array(robot.velocity_limit),
@@ -125,7 +127,7 @@ class Reach:
 
 def within(reaches: Callable[[Pose], bool], poses: Iterable[Pose], *, up_to: float) -> Iterator[Pose]:
     """Those of the poses that are reached as they are and so many metres higher."""
-    return (pose for pose in poses if reaches(pose) and reaches(raised(pose, up_to)))
+    return (pose for pose in poses if reaches(pose) and (not up_to or reaches(raised(pose, up_to))))
 
 
 def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Behaviour) -> bool:

@@ -48,10 +48,10 @@ class Behaviour:
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """What is wanted in one control step, of a script or of any other agent; recorded in the `Frame` of that step.
+    """What an agent, the script or any other, wants in one control step; recorded in the `Frame` of that step.
 
     Attributes:
-        action: The label, what a policy shall learn to say.
+        action: The label, what a policy is to learn.
         command: What is sent to the motors; None: the action.
         phase: "approach", "lift", ...
         noise_allowed: Whether exploration noise does no harm now (free motion, away from objects).

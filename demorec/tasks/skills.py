@@ -74,10 +74,14 @@ class Expert:
     """
 
     def __init__(self, world: World, behaviour: Behaviour | None = None) -> None:
-        self.world, self.behaviour, robot = world, behaviour or Behaviour(), world.robot
-        self.reach = Reach(world.scene, robot)
+        self.world = world
+        self.behaviour = behaviour or Behaviour()
+        robot = world.robot
+        self.reach = Reach(world.scene, robot, world.arm.kinematics)
         self.joint_target, self.gripper_target = world.arm.target.copy(), world.arm.gripper_target
-        self.phase, self.num_retries, self.trouble = "start", 0, ("", "")
+        self.phase = "start"
+        self.num_retries = 0
+        self.trouble = ("", "")
         self._events: list[Event] = []
         self._free, self._clear_height = False, -math.inf
         self._missing = self._has_missed = False
@@ -135,14 +139,15 @@ class Expert:
 
         From where it is, or failing that at all.
         """
-        for grasp in self._nearest(grasps, up_to=above_by):
+        for grasp in self._reachable(grasps, up_to=above_by):
             descends = self.reach.descends(grasp, by=above_by, start=self.joint_target)
             if descends and self.reach.at_all(raised(grasp, lift_by)):
                 return grasp
         return None
 
-    def _nearest(self, poses: Sequence[Pose], *, up_to: float, others: Sequence[Pose] = ()) -> Iterator[Pose]:
-        """Poses that are reached from where the arm is, so many metres higher too; then those, and others, at all."""
+    def _reachable(self, poses: Sequence[Pose], *, up_to: float, others: Sequence[Pose] = ()) -> Iterator[Pose]:
+        """Poses that are reached from where the arm is, `up_to` metres higher too; then those, and `others`, that are
+        reached at all."""
         yield from within(self.reaches, poses, up_to=up_to)
         yield from within(self.reach.at_all, (*poses, *others), up_to=up_to)
 
@@ -259,7 +264,7 @@ class Expert:
         """
         now = hand_yaw(self.tcp())
         places = [hand_down(position, yaw) for yaw in nearest_first(symmetric_yaws(now, 24), now)]
-        found = self._nearest(places, up_to=0.0)
+        found = self._reachable(places, up_to=0.0)
         place = next((place for place in found if self._path(place, speed=FREE_SPEED) is not None), None)
         if place is None:
             raise self._out_of_reach(f"{np.round(position, 3).tolist()}", places)
@@ -347,7 +352,8 @@ class Expert:
         except GaveUp:  # so much is enough to be clear of what was put down
             yield from self.move(least, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
-        for _ in range(0 if self._keeps_bytes else round(ROCKING_SECONDS * world.fps)):
+        rocking = 0 if self._keeps_bytes else round(ROCKING_SECONDS * world.fps)
+        for _ in range(rocking):  # holds still while it rocks
             if all(check.passed for check in rest_checks(world, name)):
                 break
             yield self.step()
@@ -401,7 +407,7 @@ class Expert:
         others: list[Pose] = []
         if not (keep_yaw or goal.yaw_symmetry):
             others = places_of(body, pose, wanted, hand=hand, yaw_symmetry=ANY_YAW)
-        place = next(self._nearest(places, up_to=height, others=others), None)
+        place = next(self._reachable(places, up_to=height, others=others), None)
         if place is None:
             raise self._out_of_reach(f"the goal of {goal.object}", places)
         return place

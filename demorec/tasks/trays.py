@@ -103,7 +103,9 @@ class SortByColor(TableTask):
             tray(f"{color}_tray", (sampler.uniform(0.36, 0.44), side * TRAY_Y), 0.0, color_name=color)
             for color, side in zip(colors, (1, -1), strict=True)
         ]
-        cubes, goals, points = list[Body](), list[Goal](), list[tuple[float, float]]()
+        cubes: list[Body] = []
+        goals: list[Goal] = []
+        points: list[tuple[float, float]] = []
         for color, count, target in zip(colors, counts, trays, strict=True):
             for slot in range(count):
                 point = sampler.point(SORTED_CUBES, away_from=points, min_distance=0.12, what="a cube")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -26,6 +27,7 @@ _PLOTS: Mapping[str, tuple[str, ...]] = {
 the features of other episodes, has a plot of its own."""
 _COMPARED_PLOTS = {("joints (rad)" if "position" in names else title): names[:1] for title, names in _PLOTS.items()}
 """Of two episodes over each other: what was asked for would hide what is compared."""
+_NOT_IN_3D: tuple[Literal["/depth", "/segmentation", "/boxes"], ...] = ("/depth", "/segmentation", "/boxes")
 _FLOOR = 3.0
 """Bodies wider than this (metres) are the floor, which would only hide the grid."""
 
@@ -125,7 +127,7 @@ def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spati
             if episode.scene is None:  # nobody knows where it is
                 contents.append(f"- {paths.camera(camera)}/**")
                 continue
-            contents += [f"- {paths.camera(camera)}/{images}" for images in ("depth", "segmentation", "boxes")]
+            contents += [f"- {paths.camera(camera, more)}" for more in _NOT_IN_3D]
         for body in () if episode.scene is None else episode.scene.bodies:
             if max(body.shape.extents) > _FLOOR:
                 contents.append(f"- {paths.body(body.name)}")

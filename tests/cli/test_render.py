@@ -35,12 +35,12 @@ def test_the_same_command_keeps_what_is_drawn(
     drawn: list[Path] = []
     write = EpisodeWriter.finish
 
-    def until_the_second(writer: EpisodeWriter, outcome: Outcome) -> object:
+    def until_the_second(writer: EpisodeWriter, outcome: Outcome) -> Path:
         if drawn:
             raise KeyboardInterrupt
-        stats = write(writer, outcome)
-        drawn.append(stats)
-        return stats
+        path = write(writer, outcome)
+        drawn.append(path)
+        return path
 
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeWriter, "finish", until_the_second)

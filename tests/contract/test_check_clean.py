@@ -18,7 +18,7 @@ from demorec.mcap import Recording
 
 SLOW = [pytest.mark.slow]
 FILMED = ("unstack", "pick_anything", "tutorial")
-"""The others are more of the same."""
+"""One of cubes, one of meshes, one whose cube is held by a constraint; the others are more of the same."""
 
 
 @pytest.mark.parametrize(
@@ -117,14 +117,16 @@ def test_a_small_arm_that_touches_much(task: str, index: int, tmp_path: Path) ->
 @pytest.mark.parametrize(
     "config",
     [
-        {"robot": "iiwa", "width": 128, "height": 128},
-        {"robot": "iiwa", "variation": "full", "depth": True, "segmentation": True},
+        pytest.param({"robot": "iiwa", "width": 128, "height": 128}, marks=pytest.mark.long),
+        pytest.param(
+            {"robot": "iiwa", "variation": "full", "depth": True, "segmentation": True}, marks=pytest.mark.long
+        ),
         {"variation": "full", "depth": True, "segmentation": True},
-        {"width": 320, "height": 240},
+        pytest.param({"width": 320, "height": 240}, marks=pytest.mark.long),
         {"width": 128, "height": 128, "video": VideoConfig(codec="av1", crf=35)},
         {"video": VideoConfig(codec="jpeg", jpeg_quality=60)},
         {"fps": 60},
-        {"fps": 10},
+        pytest.param({"fps": 10}, marks=pytest.mark.long),
         {
             "robot": "iiwa",
             "variation": "full",

@@ -14,7 +14,7 @@ from demorec.loop import make_world
 CASES = [(*pair, "full") for pair in PAIRS] + [
     ("pick_place", "panda", preset) for preset in PRESET_NAMES if preset != "full"
 ]
-SLOW = [("pick_anything", "panda", "full"), ("tutorial", "panda", "full")]
+SAMPLED = [("pick_anything", "panda", "full"), ("tutorial", "panda", "full")]
 FAST = [case for case in CASES if case[0] == "pick_place" and case[2] == "full"]
 
 
@@ -40,7 +40,7 @@ def test_repeats_and_replays_to_the_bit(task: str, robot: str, variation: str) -
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "robot", "variation"),
-    [pytest.param(*case, marks=() if case in SLOW else pytest.mark.long) for case in CASES if case not in FAST],
+    [pytest.param(*case, marks=() if case in SAMPLED else pytest.mark.long) for case in CASES if case not in FAST],
 )
 def test_every_row_repeats_and_replays_to_the_bit(task: str, robot: str, variation: str) -> None:
     check(task, robot, variation)

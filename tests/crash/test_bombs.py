@@ -84,11 +84,7 @@ def test_a_small_recording_never_becomes_large(
 
 @pytest.mark.parametrize(
     "bomb",
-    [
-        one_huge_chunk,
-        empty_messages,
-        *(pytest.param(b, marks=pytest.mark.long) for b in (many_large_chunks, empty_records)),
-    ],
+    [pytest.param(b, marks=pytest.mark.long if b in (many_large_chunks, empty_records) else ()) for b in BOMBS],
 )
 def test_recovering_a_bomb_is_bounded(
     bomb: Callable[[Path, Path], None], good: Path, commands: LimitedCommands, tmp_path: Path

@@ -54,7 +54,7 @@ def exit_code(context: Any, *arguments: Any, **limits: int) -> int:
 @pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("exporter", "mode"),
-    [pytest.param(*case, marks=pytest.mark.long if case[1] == "overwrite" else ()) for case in CASES],
+    [pytest.param(*case, marks=pytest.mark.long if case[1] == "new" else ()) for case in CASES],
 )
 def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, exporter: str, mode: str, kills: int) -> None:
     place = tmp_path / "place"
@@ -92,7 +92,7 @@ def test_killed_at_any_moment(context: Any, run: Path, tmp_path: Path, exporter:
     assert list(place.iterdir()) == [out]
 
 
-@pytest.mark.parametrize("limit", [500, *(pytest.param(limit, marks=pytest.mark.long) for limit in (1, 4_000, 15_000))])
+@pytest.mark.parametrize("limit", [4_000, *(pytest.param(limit, marks=pytest.mark.long) for limit in (1, 500, 15_000))])
 @pytest.mark.parametrize(("exporter", "mode"), CASES)
 def test_a_full_disk(context: Any, run: Path, tmp_path: Path, exporter: str, mode: str, limit: int) -> None:
     """A limit on the size of a file fails the write that crosses it, as a full disk does."""

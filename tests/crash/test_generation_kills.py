@@ -31,7 +31,7 @@ def start(out: Path, num_episodes: int) -> subprocess.Popen[str]:
     return subprocess.Popen(command(out, num_episodes), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
-@pytest.fixture(scope="module", params=[4, pytest.param(80, marks=pytest.mark.long)])
+@pytest.fixture(scope="module", params=[6, pytest.param(80, marks=pytest.mark.long)])
 def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Made by one worker without any trouble."""
     out = tmp_path_factory.mktemp("reference") / "run"

@@ -287,7 +287,7 @@ def test_two_runs_into_one_folder_exclude_each_other_until_the_owner_dies(tmp_pa
     assert attempts_of(run_fake(out, num_episodes=4)) == expected_attempts(4)
 
 
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.long), signal.SIGINT])
 def test_the_first_interrupt_lets_current_episodes_end(
     tmp_path: Path, reference: RunResult, number: signal.Signals
 ) -> None:
@@ -321,7 +321,7 @@ def test_a_signal_to_the_whole_group_is_left_to_the_driver(tmp_path: Path) -> No
     assert len(run.successes) == num_finished(out) < 8
 
 
-@pytest.mark.parametrize("maker", [pytest.param("make_for_ever", marks=pytest.mark.slow), "make_stubbornly"])
+@pytest.mark.parametrize("maker", [pytest.param("make_for_ever", marks=pytest.mark.long), "make_stubbornly"])
 def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path: Path, maker: str) -> None:
     out = tmp_path / "run"
     process = driver(out, maker, 4, grace_s=0.3)
@@ -357,7 +357,7 @@ def test_a_killed_driver_leaves_no_orphans(tmp_path: Path) -> None:
     assert_gone(workers)
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(40, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kills", [4, pytest.param(40, marks=pytest.mark.long)])
 def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path: Path, kills: int) -> None:
     """SIGKILL to the driver or to a worker, at moments spread over the run."""
     num_episodes, chance = 20 * kills, random.Random(kills)

@@ -168,7 +168,8 @@ def _quantities(group: Episodes) -> Iterator[tuple[str, str, Readings]]:
     """(quantity, camera or "", its readings) of a group."""
     moved = {number: each.movement for number, each in group.items() if each.movement is not None}
     for name in _LAWS:
-        yield name, "", {number: each.readings[name] for number, each in moved.items() if name in each.readings}
+        if found := {number: each.readings[name] for number, each in moved.items() if name in each.readings}:
+            yield name, "", found
     for count in dict.fromkeys(len(each.courses) for each in moved.values()):
         alike = {number: each for number, each in moved.items() if len(each.courses) == count}
         if len(alike) >= neighbours.FEWEST:

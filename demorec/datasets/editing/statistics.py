@@ -86,7 +86,7 @@ def episode_statistics_differences(
         tables = [_of_episodes(source, shared.own(side, name)) for side, source in enumerate(sources)]
         if not tables[0] or not tables[1]:
             if tables[0] or tables[1]:
-                text = f"{name} has statistics of its episodes only in {'B' if tables[1] else 'A'}"
+                text = f"{name} has statistics of all its episodes only in {'B' if tables[1] else 'A'}"
                 yield Difference(level="statistics", name=name, text=text)
             continue
         wrong = [
@@ -105,7 +105,7 @@ def episode_statistics_differences(
 
 
 def _of_episodes(source: Source, name: str) -> list[Mapping[str, Any]]:
-    """The statistics of a feature by episode in order; empty where the table has not all of them."""
+    """The statistics of a feature by episode in order; empty unless each episode has all ten."""
     found = [entry for _, _, entry in source.statistics([name])]
     return found if len(found) == len(source.places) else []
 

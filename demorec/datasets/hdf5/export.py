@@ -124,13 +124,14 @@ def _add(data: h5py.Group, number: int, episode: ExportEpisode, compression: int
         RecordingError: It is damaged.
     """
     demo = data.create_group(f"demo_{number}")
+    # By itself, since its groups are closed when it returns: HDF5 places the bytes that follow accordingly.
     _fill(demo, episode, compression)
     if number == 0:
         data.attrs.update(_attributes(episode))
 
 
 def _fill(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
-    """Write the numbers and images of an episode; how long an object stays open decides where its bytes are."""
+    """Write the numbers and images of an episode."""
     observations, images = _observation_names(episode), _image_names(episode)
     info, count = episode.recording.info, len(episode.rows)
     demo.attrs["num_samples"] = count

@@ -55,7 +55,8 @@ class EpisodeLanguage:
     Attributes:
         persistent: What stands in every row; of one that was read, in the first.
         events: Row -> what stands in it alone, of rows in which anything does.
-        num_rows, differing: Of one that was read: its rows, and in which of them `persistent` is another.
+        num_rows, differing: Only of one that was read: how many rows it has, and in which of them
+            `language_persistent` is not that of the first.
     """
 
     persistent: Sequence[dict[str, Any]] = ()

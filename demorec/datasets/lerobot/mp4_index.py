@@ -21,8 +21,7 @@ from demorec.core.files import open_regular
 _MAX_MOOV = 256 << 20
 _CHUNK = 1 << 20
 """Bytes, below which images that follow each other are listed as one chunk, as libav does."""
-_PARENTS = (b"trak", b"mdia", b"minf", b"stbl", b"edts")
-_PARENTS_ABOVE = (b"moov", b"moof", b"traf")
+_PARENTS = (b"trak", b"mdia", b"minf", b"stbl")
 _MAX_BOXES = 100_000
 
 
@@ -50,7 +49,7 @@ def _claims(file: BinaryIO, size: int) -> Iterator[int]:
             num_boxes += 1
             if num_boxes > _MAX_BOXES:
                 raise ValueError(f"more than {_MAX_BOXES:,} boxes")
-            if kind in _PARENTS or kind in _PARENTS_ABOVE:
+            if kind in (*_PARENTS, b"moov", b"moof", b"traf"):
                 waiting.append((begin, end))
             elif kind in (b"stsz", b"stz2"):
                 _, each, count = _read(file, begin, ">III")
@@ -89,7 +88,7 @@ def _flat(file: BinaryIO, start: int, end: int) -> dict[bytes, bytes]:
     found, waiting = {}, [(start, end)]
     for part in waiting:
         for kind, begin, stop in _boxes(file, *part):
-            if kind in _PARENTS:
+            if kind in (*_PARENTS, b"edts"):
                 waiting.append((begin, stop))
             else:
                 file.seek(begin)
@@ -115,8 +114,11 @@ def mp4_index(path: Path) -> Index:
             if end - begin > _MAX_MOOV:
                 raise ValueError("its index is very large")
             tracks = (_flat(file, *part) for kind, *part in _boxes(file, begin, end) if kind == b"trak")
-            return _index(next(track for track in tracks if track[b"hdlr"][8:12] == b"vide"), size)
-    except (OSError, ValueError, KeyError, IndexError, StopIteration, struct.error) as error:
+            track = next((track for track in tracks if track.get(b"hdlr", b"")[8:12] == b"vide"), None)
+            if track is None:
+                raise ValueError("it has no video track")
+            return _index(track, size)
+    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
         raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
 
 

@@ -209,7 +209,9 @@ class RowStream:
     def read(self, place: EpisodePlace) -> pa.Table:
         """All rows of an episode, as `batches`; ExportError for one without any, too."""
         if not place.length:
-            raise ExportError(f"Episode {place.episode_index} has no frames, drop it: {place.data}")
+            raise ExportError(
+                f"Episode {place.episode_index} has no frames, drop that episode: its data would be in {place.data}"
+            )
         return pa.Table.from_batches(list(self.batches(place)))
 
     def numbers(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:

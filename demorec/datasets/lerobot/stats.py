@@ -51,11 +51,14 @@ class Statistics:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Statistics | None:
-        """Inverse; None when the entry has not all ten."""
+        """Inverse; None when the entry has not all ten, ValueError or TypeError when they are no numbers."""
         if any(name not in entry for name in NAMES):
             return None
-        values = {name: np.asarray(entry[name], dtype=np.float64).reshape(-1) for name in NAMES if name != "count"}
-        count = int(np.asarray(entry["count"]).reshape(-1)[0])
+        try:
+            values = {name: np.asarray(entry[name], dtype=np.float64).reshape(-1) for name in NAMES if name != "count"}
+            count = int(np.asarray(entry["count"]).reshape(-1)[0])
+        except (IndexError, OverflowError) as error:
+            raise ValueError("statistics that are no numbers") from error
         return cls(values=values, count=count, is_camera=np.asarray(entry["mean"]).ndim == 3)
 
 
@@ -234,8 +237,9 @@ def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[A
 
 
 def _moments(parts: Iterable[Array]) -> tuple[int, dict[str, Array]]:
-    """Rows of (T, D) numbers that come in parts; minimum, maximum, mean and standard deviation (Chan, Golub and LeVeque
-    1979).
+    """How many rows numbers (T, D) that come in parts have; their minimum, maximum, mean and deviation.
+
+    Chan, Golub and LeVeque 1979.
     """
     count = 0
     found: dict[str, Array] = {}

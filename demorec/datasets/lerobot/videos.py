@@ -197,7 +197,7 @@ class EpisodeVideo:
             return DepthScale.of(self._feature.info or {})
         except ValueError as error:
             raise ExportError(
-                f"The depth of {self._key} cannot be read by {INFO_PATH} ({error}): {self.path}"
+                f"The depth of {self._key} cannot be read ({error} in {INFO_PATH}): {self.path}"
             ) from error
 
     def codes(self, begin: int = 0) -> Iterator[NDArray[np.uint16]]:

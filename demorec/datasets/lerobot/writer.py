@@ -202,11 +202,15 @@ class DatasetWriter(Closing):
         return episode_digest(episode.task, values, digests) if has_digest else ""
 
     def _write_rows(self, columns: Mapping[str, NDArray[Any] | pa.Array]) -> None:
-        try:
-            arrays = [vector_array(columns[item.name], item.type) for item in self._schema]
-        except pa.ArrowException as error:
-            said = f"is not as {INFO_PATH} says ({describe_error(error)})"
-            raise ExportError(f"A column of what would be episode {self.num_episodes} {said}.") from error
+        arrays = []
+        for item in self._schema:
+            try:
+                arrays.append(vector_array(columns[item.name], item.type))
+            except pa.ArrowException as error:
+                raise ExportError(
+                    f"The column {item.name} of what would be episode {self.num_episodes} is not as {INFO_PATH} says "
+                    f"({describe_error(error)})."
+                ) from error
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
 
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:

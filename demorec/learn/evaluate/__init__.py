@@ -42,7 +42,7 @@ class TakeOver:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What decides the result of a policy's improvement in rounds, beside the demonstrations."""
+    """What decides the result of improving a policy in rounds, besides demonstrations and flags of lerobot-train."""
 
     config_path: Path
     """Settings for lerobot-train (JSON); its dataset, output folder and seed are replaced."""
@@ -70,3 +70,4 @@ class Plan:
         check_option("num_rounds", self.num_rounds, 0, 1000)
         check_option("num_episodes", self.num_episodes, 1, 1_000_000)
         check_option("num_scenes", self.num_scenes, 1, 1_000_000)
+        self.takeover.validate()

@@ -115,7 +115,7 @@ class Turns:
             is_back = step.phase not in _RECOVERY
             if self._hands_back and is_back and self._watch and not self._watch.is_over(self._env.situation):
                 return True
-            yield self._step(replace(step, command=command))
+            yield self._step(replace(step, command=command, is_deliberate_miss=False))
             self.num_retries = retries + expert.num_retries
             if self.success:
                 return False

@@ -33,7 +33,8 @@ class Canvas:
         camera: Size, lens and clipping distances.
         batch: The scene's meshes at this camera's level of detail.
         stage: What all cameras share.
-        setup: Of which the light, for the sky, and what is drawn count: 2x2 samples a pixel where it is antialiased.
+        setup: Its light colours the sky; its flags say whether depth and segmentation are drawn, and whether a pixel
+            has 2x2 samples.
 
     Attributes:
         samples: Along a pixel's side, 1 or 2.
@@ -70,7 +71,14 @@ class Canvas:
         self._focal = float(k[0, 0])
         self._clip_from_world = np.zeros((3, 4))
         self.looks = Looks(
-            *batch[1:], stage.light_table, _sky_table(setup.light), stage.heights.reshape(-1), stage.shadow_size
+            face_table=batch.face_table,
+            face_color=batch.face_color,
+            texels=batch.texels,
+            mips=batch.mips,
+            light=stage.light_table,
+            sky=_sky_table(setup.light),
+            heights=stage.heights.reshape(-1),  # a view: the stage writes in place
+            size=stage.shadow_size,
         )
         self.still_looks = self.looks._replace(heights=stage.still_heights.reshape(-1))
 

@@ -98,7 +98,10 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
 
 def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
     """The report that it could not be made again; ResourceError where this machine cannot do it."""
-    if (lack := resource_error(error)) is not None:
+    lack = resource_error(error)
+    if lack is error:
+        raise error
+    if lack is not None:
         raise lack from error
     return replace(report, error=str(error))
 

@@ -155,47 +155,57 @@ def content_differences(
         info: Of the one made again.
         fps: Of the recording.
     """
-    found: list[Differing] = []
+    images: dict[str, list[int]] = {}
+    return list(_gathered(_all_differing(recorded, again, info, fps, images))), images
+
+
+def _all_differing(
+    recorded: Contents, again: Contents, info: EpisodeInfo, fps: int, images: dict[str, list[int]]
+) -> Iterator[Differing]:
+    """One by one; frames whose coded images differ go into `images`."""
     for name in recorded.attachments.keys() | again.attachments.keys():
         a, b = recorded.attachments.get(name), again.attachments.get(name)
         if a != b:
-            found.append((f"attachment {name}", "data", None, a, b))
+            yield f"attachment {name}", "data", None, a, b
     for name in dict.fromkeys((*again.metadata, *recorded.metadata)):
         for path, a, b in _metadata_differences(recorded.metadata.get(name), again.metadata.get(name)):
             if not (name == EPISODE and path.startswith(_VERSIONS)):
-                found.append((f"metadata {name}", path, None, a, b))
-    images: dict[str, list[int]] = {}
+                yield f"metadata {name}", path, None, a, b
     coded = coded_topics(info)
     for topic in dict.fromkeys((*again.channels, *recorded.channels)):
         if topic not in recorded.channels or topic not in again.channels:
             ours, theirs = (sum(map(len, c.messages.get(topic, {}).values())) for c in (recorded, again))
-            found.append((topic, "messages", None, ours or None, theirs or None))
+            yield topic, "messages", None, ours or None, theirs or None
             continue
         for name, a, b in _differing(recorded.channels[topic], again.channels[topic]):
-            found.append((topic, name, None, a, b))
+            yield topic, name, None, a, b
         for name, frame, a, b in _topic_differences(topic, recorded, again, fps):
             if topic in coded and name == "data":
                 images.setdefault(topic, []).append(frame)
             else:
-                found.append((topic, name, frame, a, b))
-    return list(_gathered(found)), images
+                yield topic, name, frame, a, b
 
 
 def _gathered(found: Iterable[Differing]) -> Iterator[Difference]:
-    """Those of one field over all frames as one."""
-    groups: dict[tuple[str, str], list[Differing]] = {}
-    for each in found:
-        groups.setdefault(each[:2], []).append(each)
-    for (stream, name), group in groups.items():
-        *_, recorded, again = group[0]
-        apart = [by for *_, a, b in group if (by := _apart(a, b)) is not None]
+    """Those of one field over all frames as one, of which the first is shown."""
+    groups: dict[tuple[str, str], tuple[str, str, dict[int, None]]] = {}
+    largest: dict[tuple[str, str], float] = {}
+    for stream, name, frame, a, b in found:
+        key = stream, name
+        if key not in groups:
+            groups[key] = difference_in_words(a), difference_in_words(b), {}
+        if frame is not None:
+            groups[key][2][frame] = None
+        if (apart := _apart(a, b)) is not None:
+            largest[key] = max(apart, largest.get(key, 0.0))
+    for (stream, name), (recorded, again, frames) in groups.items():
         yield Difference(
             stream=stream,
             field=name,
-            frames=tuple(dict.fromkeys(frame for _, _, frame, *_ in group if frame is not None)),
-            recorded=difference_in_words(recorded),
-            again=difference_in_words(again),
-            largest=max(apart, default=None),
+            frames=tuple(frames),
+            recorded=recorded,
+            again=again,
+            largest=largest.get((stream, name)),
         )
 
 
@@ -223,7 +233,9 @@ def _topic_differences(
 ) -> Iterator[tuple[str, int, Any, Any]]:
     """(field, frame, recorded, made again) of what differs in a topic."""
     ours, theirs, schema = recorded.messages[topic], again.messages[topic], again.schemas[topic]
-    for time_ns in sorted(ours.keys() | theirs.keys()) if ours != theirs else ():
+    if ours == theirs:
+        return
+    for time_ns in sorted(ours.keys() | theirs.keys()):
         a_messages, b_messages = ours.get(time_ns, []), theirs.get(time_ns, [])
         frame = round(time_ns * fps / 1e9)
         if len(a_messages) != len(b_messages):
