@@ -77,7 +77,7 @@ class TimedRenderer:
 
 def timed_encoders(clock: Clock) -> None:
     """Count the time within the video encoders apart from the rest of the recorder."""
-    for kind in (video._StreamEncoder, video.Encoder):
+    for kind in (video._StreamEncoder, video._JpegEncoder):
         for name in ("encode", "finish"):
             original = getattr(kind, name)
 

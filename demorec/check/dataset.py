@@ -16,13 +16,14 @@ from demorec.check.base import Form, NotMeasured
 from demorec.check.cells import Cells
 from demorec.check.coverage import motion_vector
 from demorec.check.drawn import NOT_DRAWABLE, ImageComparison, compare, draw, frames_to_draw
+from demorec.check.episode import CheckedEpisode
 from demorec.check.episode_drawn import drawable_scene
 from demorec.check.evidence import Motions, Named, course_of, motions_of_dataset, quaternions
 from demorec.check.films import Film, Films, films_of_dataset, likeness_of_films
 from demorec.check.rows import LinkMatrices
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import open_table, read_table
+from demorec.datasets.lerobot.files import open_table, read_table, tables_in
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
@@ -82,12 +83,6 @@ class DescribedEpisode:
     tasks: tuple[str, ...]
     kept: dict[str, Any]
     info: EpisodeInfo
-
-
-def read_rows(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Some columns of all tables of episodes below a folder."""
-    paths = sorted((folder / "episodes").glob("*/*.parquet"))
-    return [row for path in paths for row in read_table(path, names).to_pylist()]
 
 
 class Dataset:
@@ -211,7 +206,7 @@ class Dataset:
         """The rows that demorec keeps beside each episode, those of older versions with fewer columns; empty for a
         dataset of somebody else's."""
         found = []
-        for path in sorted((self.path / SIDECAR_DIR / "episodes").glob("*/*.parquet")):
+        for path in tables_in(self.path, f"{SIDECAR_DIR}/episodes"):
             there = set(open_table(path).schema_arrow.names)
             needed = (*_NEEDED, *({"robot_digest"} & there))
             others = [name for name in EPISODE_SCHEMA.names if name in there and name not in needed]
@@ -379,3 +374,7 @@ def _is_in_the_air(body: Body, bodies: Sequence[Body]) -> bool:
             height = other.shape.extents[2] / 2 if is_upright else float(np.linalg.norm(other.shape.extents))
             tops.append(float(other.world_from_body.position[2]) + height)
     return float(z) - radius > max(tops) + _IN_THE_AIR
+
+
+Recorded = CheckedEpisode | Dataset
+"""What has motions and films, whoever recorded it."""

@@ -23,7 +23,7 @@ from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, MissingDependencyError, ResourceError
 from demorec.core.tables import ROBOTS
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
-from demorec.datasets.lerobot.files import open_table, read_json, read_table
+from demorec.datasets.lerobot.files import open_table, read_json, read_table, tables_in
 from demorec.datasets.lerobot.inspect import dataset_problems
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -94,7 +94,7 @@ def dataset_counts(dataset: Dataset) -> Measurement:
 def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
     """Where the episodes' table says that things are: rows of the dataset, and seconds of each video."""
     ends = [f"videos/{key}/to_timestamp" for key in dataset.info.video_keys]
-    for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
+    for path in tables_in(dataset.path, "meta/episodes"):
         columns = open_table(path).schema_arrow.names
         names = [name for name in ("dataset_to_index", *ends) if name in columns]
         begins = [name.replace("to_", "from_") for name in names]
@@ -110,7 +110,7 @@ def _stray_rows(dataset: Dataset) -> Iterator[str]:
     used: dict[Path, int] = {}
     for place in dataset.places:
         used[place.data] = used.get(place.data, 0) + place.length
-    for file in sorted((dataset.path / "data").glob("*/*.parquet")):
+    for file in tables_in(dataset.path, "data"):
         found = open_table(file).metadata.num_rows
         if (count := used.get(file, 0)) != found:
             yield f"{file.name} has {found} rows, {count} of them of episodes"
@@ -155,7 +155,7 @@ def dataset_strays(dataset: Dataset) -> Measurement | None:
 
 def _said_elsewhere(dataset: Dataset) -> Iterator[str]:
     names = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
-    for file in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
+    for file in tables_in(dataset.path, "meta/episodes"):
         if set(names) <= set(open_table(file).schema_arrow.names):
             there = file.relative_to(dataset.path).as_posix()
             for chunk, number in {tuple(row.values()) for row in read_table(file, names).to_pylist()}:
@@ -205,7 +205,7 @@ def _columns(dataset: Dataset) -> Iterator[str]:
         found = features.get(name)
         if found is None or (found.dtype, found.shape) != (fixed.dtype, fixed.shape):
             yield f"{name} is no {fixed.dtype} of shape {fixed.shape}"
-    for path in sorted((dataset.path / "data").glob("*/*.parquet")):
+    for path in tables_in(dataset.path, "data"):
         schema = open_table(path).schema_arrow
         columns = set(schema.names)
         yield from (f"{path.name} has no column {name}" for name in features if name not in columns)

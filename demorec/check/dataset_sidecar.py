@@ -24,7 +24,7 @@ from demorec.datasets.lerobot.facts import (
     progress_table,
     read_progress,
 )
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, read_table
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, read_table, tables_in
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import read_robot
@@ -168,7 +168,7 @@ def _alike(found: Any, expected: Any, tolerance: float) -> bool:
 
 def _camera_poses(dataset: Dataset) -> Iterator[tuple[int, Mapping[str, Array]]]:
     """(episode, (camera -> (T, 7) world_from_camera, and frame_index (T, 1))) of the cameras that move."""
-    for path in sorted((dataset.path / SIDECAR_DIR / "camera_poses").glob("*/*.parquet")):
+    for path in tables_in(dataset.path, f"{SIDECAR_DIR}/camera_poses"):
         table = read_table(path)
         columns = {name: column_numbers(table.column(name).combine_chunks()) for name in table.column_names}
         episodes = columns.pop("episode_index")[:, 0]
@@ -238,7 +238,7 @@ def dataset_facts(dataset: Dataset) -> Measurement | None:
     if not dataset.sidecar or not names:
         return None
     rows: dict[int, dict[str, Any]] = {}
-    for path in sorted((dataset.path / "meta" / "episodes").glob("*/*.parquet")):
+    for path in tables_in(dataset.path, "meta/episodes"):
         if set(names) <= set(open_table(path).schema_arrow.names):  # LeRobot's own recordings have none of them
             rows.update({row["episode_index"]: row for row in read_table(path, ["episode_index", *names]).to_pylist()})
     wrong = list(_strange_attempts(dataset))
@@ -264,7 +264,7 @@ def _expected_facts(dataset: Dataset, each: DescribedEpisode) -> dict[str, Any]:
 
 def _strange_attempts(dataset: Dataset) -> Iterator[str]:
     """Attempts that are said to be in the dataset, against its episodes; starts and goals of these."""
-    paths = sorted((dataset.path / SIDECAR_DIR / "attempts").glob("*/*.parquet"))
+    paths = tables_in(dataset.path, f"{SIDECAR_DIR}/attempts")
     if not paths or not dataset.sidecar or not all(set(_ATTEMPT) <= row.keys() for row in dataset.sidecar):
         return
     rows = [row for path in paths for row in read_table(path).to_pylist() if row["in_dataset"]]

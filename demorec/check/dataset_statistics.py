@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from demorec.check.base import Found, Measurement, dataset_check, worst
-from demorec.check.dataset import Dataset, read_rows
+from demorec.check.dataset import Dataset
 from demorec.check.films import Film
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.files import read_json, rows_in
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
 
@@ -68,7 +68,8 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
 def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
     """The columns stats/... of the episodes' table, from which LeRobot merges those of several datasets."""
     names = _numeric(dataset)
-    stored = read_rows(dataset.path / "meta", [f"stats/{name}/{quantity}" for name in names for quantity in NAMES])
+    columns = [f"stats/{name}/{quantity}" for name in names for quantity in NAMES]
+    stored = list(rows_in(dataset.path, "meta/episodes", columns))
     for number, (row, rows) in enumerate(zip(stored, dataset.rows, strict=False)):
         for name in names:
             said = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
@@ -77,7 +78,7 @@ def dataset_episode_statistics(dataset: Dataset) -> Iterator[Found]:
 
 def episode_column(dataset: Dataset, name: str) -> list[Any]:
     """The values of a column of the episodes' table; ExportError when there is none."""
-    return [row[name] for row in read_rows(dataset.path / "meta", [name])]
+    return [row[name] for row in rows_in(dataset.path, "meta/episodes", [name])]
 
 
 def read_statistics(dataset: Dataset) -> dict[str, Any]:

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Found, Lacking, Measurement, NotMeasured
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import Dataset, Recorded
 from demorec.check.evidence import Motion, is_gripper, quaternion_places
 from demorec.check.likeness import CARTESIAN, likeness_check, same_joints
-from demorec.check.motion import Recorded
 from demorec.check.rows import matrices
 from demorec.check.targets import NO_TARGETS, target_check
 from demorec.core.geometry import Array

@@ -21,7 +21,7 @@ from demorec.check.base import (
     sidecar_check,
     worst_frame,
 )
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import Dataset, Recorded
 from demorec.check.drawn import ImageComparison, judge_lag, judge_unlike
 from demorec.check.episode import CheckedEpisode
 from demorec.check.full_size import FullSize
@@ -193,7 +193,7 @@ def _stale_frames(camera: SceneCamera, compared: ImageComparison, count: int, fi
     on=("simulated", "external", "dataset"),
     needs="two cameras",
 )
-def distinct_cameras(subject: CheckedEpisode | Dataset) -> Iterator[Found]:
+def distinct_cameras(subject: Recorded) -> Iterator[Found]:
     """Two cameras in different places do not show the same images, as when one is plugged in under two names."""
     pairs = list(subject.likeness_of_cameras())
     if not pairs:

@@ -28,7 +28,7 @@ from demorec.check.base import (
     worst_entry,
     worst_frame,
 )
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import Recorded
 from demorec.check.dynamics import Dynamics, dynamics_by_frames, point_masses
 from demorec.check.episode import CheckedEpisode
 from demorec.check.evidence import Motion
@@ -60,8 +60,6 @@ _LEAST_STROKE = 0.2
 _STILL_FRAMES = 19
 """Of the arm's motion in which a sensor of another robot may stand still, if that is all of the episode."""
 
-Recorded = CheckedEpisode | Dataset
-"""What has motions and rotations, whoever recorded it."""
 EVERYWHERE: tuple[Form, ...] = ("simulated", "external", "dataset")
 
 motion_check = partial(check, group="physics", on=EVERYWHERE)

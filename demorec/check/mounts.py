@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from demorec.check.base import EE_POSES, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.dataset import Recorded
 from demorec.check.evidence import FEWEST, Motion
-from demorec.check.motion import Recorded
 from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.core.geometry import Array
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import IMAGES, Found, Lacking, Measurement, NotMeasured, image_check
-from demorec.check.dataset import Dataset
-from demorec.check.episode import CheckedEpisode
+from demorec.check.dataset import Recorded
 from demorec.check.evidence import Flags
 from demorec.check.films import STANDS, Film, difference, turned
 from demorec.core.geometry import Array
@@ -58,13 +57,10 @@ _OTHER_VIEW = 0.7
 CHANGES = 1.5
 """Levels of 255 by which an image differs clearly from the one before."""
 
-Filmed = CheckedEpisode | Dataset
-"""What has films."""
-
 film_check = partial(image_check, on=("external", "dataset"), needs=IMAGES)
 
 
-def _all(subject: Filmed, fewest: int = 0) -> Iterator[Film]:
+def _all(subject: Recorded, fewest: int = 0) -> Iterator[Film]:
     """Every film of so many images at least."""
     for films in subject.films.values():
         yield from (film for film in films if len(film.cells) >= fewest)
@@ -73,7 +69,7 @@ def _all(subject: Filmed, fewest: int = 0) -> Iterator[Film]:
 @film_check(
     measures="cameras whose images are of one colour, or show no distance, in more than half of them",
 )
-def images_show_something(subject: Filmed) -> Found:
+def images_show_something(subject: Recorded) -> Found:
     """No camera is covered, and none of depth sees nothing."""
     blank = [camera for camera, films in subject.films.items() if any(film.is_blank for film in films)]
     for camera, images in subject.distances():
@@ -88,7 +84,7 @@ def images_show_something(subject: Filmed) -> Found:
 @film_check(
     measures="images that are of one colour, or unlike both of their neighbours though the robot does not move so",
 )
-def stray_images(subject: Filmed) -> Iterator[Found]:
+def stray_images(subject: Recorded) -> Iterator[Found]:
     """No image is empty (where most are, `images_show_something` says so), and none is from another moment or place."""
     wrong, count = [], 0
     for film in _all(subject):
@@ -125,7 +121,7 @@ def _alien(film: Film) -> Flags:
     warn=5.0,
     fail=float("inf"),
 )
-def image_cuts(subject: Filmed) -> Iterator[Found]:
+def image_cuts(subject: Recorded) -> Iterator[Found]:
     """What a camera sees goes on from frame to frame: catches one that is hit, light that is switched, films that were
     put together. What falls away before it takes several frames."""
     for film in _all(subject, FEWEST_IMAGES):
@@ -160,7 +156,7 @@ def _times_beside(film: Film) -> Array:
     warn=3.0,
     fail=5.0,
 )
-def images_stay_upright(subject: Filmed) -> Iterator[Found]:
+def images_stay_upright(subject: Recorded) -> Iterator[Found]:
     """A camera's images do not turn round or change the order of their colours in the midst of an episode."""
     for film in _all(subject, 2 * _BESIDE):
         row = int(np.argmax(film.step[_BESIDE - 1 : -_BESIDE + 1])) + _BESIDE
@@ -175,7 +171,7 @@ def images_stay_upright(subject: Filmed) -> Iterator[Found]:
     warn=0.54,
     fail=0.7,
 )
-def images_follow_state(subject: Filmed) -> Iterator[Found]:
+def images_follow_state(subject: Recorded) -> Iterator[Found]:
     """Images move when the robot does: catches those of another episode, late, backwards or frozen ones.
 
     How much an image changes is correlated with the speed of the state. What counts is how far that is below the
@@ -237,7 +233,7 @@ def _near(table: Array) -> float:
     warn=0.06,
     fail=float("inf"),
 )
-def steady_exposure(subject: Filmed) -> Iterator[Found]:
+def steady_exposure(subject: Recorded) -> Iterator[Found]:
     """What stands still before a fixed camera keeps its colours: catches drifting exposure, white balance."""
     for film in _all(subject, FEWEST_IMAGES):
         gains = film.gains
@@ -259,7 +255,7 @@ def _coarse(cells: NDArray[np.uint8]) -> NDArray[np.float32]:
     warn=2.4,
     fail=float("inf"),
 )
-def steady_sharpness(subject: Filmed) -> Iterator[Found]:
+def steady_sharpness(subject: Recorded) -> Iterator[Found]:
     """What stands still before a fixed camera stays as sharp: catches lost focus, drops on the lens, noise."""
     for film in _all(subject, FEWEST_IMAGES):
         if isinstance(film.gains, NotMeasured):
@@ -280,7 +276,7 @@ def steady_sharpness(subject: Filmed) -> Iterator[Found]:
     measures="images that look like another camera's, while that one's look like this one's",
     needs="two cameras",
 )
-def exchanged_cameras(subject: Filmed) -> Iterator[Found]:
+def exchanged_cameras(subject: Recorded) -> Iterator[Found]:
     """Each camera shows its own view: catches two that change places, within an episode or from one to another.
 
     A view is the median of the first fifth of an episode's images, of all episodes together. Cameras that move leave

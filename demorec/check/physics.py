@@ -19,9 +19,10 @@ from demorec.check.base import (
     worst_entry,
     worst_frame,
 )
+from demorec.check.dataset import Recorded
 from demorec.check.dynamics import MIN_FRAMES
 from demorec.check.episode import CheckedEpisode
-from demorec.check.motion import EVERYWHERE, Recorded
+from demorec.check.motion import EVERYWHERE
 from demorec.check.rows import displacement, matrices
 from demorec.core.geometry import Array
 from demorec.episode.episode import POLICY_PHASE

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured
+from demorec.check.dataset import Recorded
 from demorec.check.evidence import Flags
 from demorec.check.films import MOVING, Film, difference
-from demorec.check.over_time import CHANGES, FEWEST_IMAGES, Filmed, film_check
+from demorec.check.over_time import CHANGES, FEWEST_IMAGES, film_check
 
 _NEARLY, _NEARLY_COUNTS, _CATCHES_UP = 0.05, 0.25, 2.0
 """Share of the usual change at a speed below which an image is nearly the same; what counts of such a time: of clean
@@ -35,7 +36,7 @@ _FEWEST_CHANGING, _FEWEST_REPEATS = 25, 5
     warn=0.33,
     fail=1.0,
 )
-def frozen_images(subject: Filmed) -> Iterator[Found]:
+def frozen_images(subject: Recorded) -> Iterator[Found]:
     """A camera that sees the robot move shows it: catches a stream that hangs.
 
     A camera that shows the same in more than a fifth of the other moving frames does not see the robot, and tells
@@ -92,7 +93,7 @@ def _catches_up(film: Film, moves: Flags, begin: int, end: int) -> bool:
     warn=0.05,
     fail=float("inf"),
 )
-def stale_images(subject: Filmed) -> Iterator[Found]:
+def stale_images(subject: Recorded) -> Iterator[Found]:
     """A camera gives a new image for each frame: catches one that is slower than the frames, and images that were lost
     and replaced.
     """
@@ -131,7 +132,7 @@ def _repeats(films: Sequence[Film], least: float) -> tuple[list[int], int]:
     warn=0.46,
     fail=float("inf"),
 )
-def interpolated_images(subject: Filmed) -> Iterator[Found]:
+def interpolated_images(subject: Recorded) -> Iterator[Found]:
     """No image is a mixture of the two around it: catches a video that was brought to twice its rate.
 
     In the median of the episodes. Predicted images of a video whose every second one is a keyframe are nearer, too, by

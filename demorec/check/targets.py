@@ -21,9 +21,9 @@ from demorec.check.base import (
     worst,
     worst_entry,
 )
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import Dataset, Recorded
 from demorec.check.evidence import FEWEST, MOVES, Motion, correlations, is_gripper, quaternion_places
-from demorec.check.motion import Recorded, motion_check, of_each_motion, told_gripper
+from demorec.check.motion import motion_check, of_each_motion, told_gripper
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 from demorec.episode.features import ACTION

@@ -233,7 +233,7 @@ class SampledFrame:
 
 
 def _nothing() -> Any:
-    """Of a column that only simulated episodes have: of any other, asking for it raises NotSimulatedError."""
+    """The default of a column that only simulated episodes have; asking others for it raises NotSimulatedError."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

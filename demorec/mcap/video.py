@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, Protocol, cast
 
 import av
 import numpy as np
@@ -126,28 +126,37 @@ def size_problem(video: VideoConfig, width: int, height: int) -> str:
 
 def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
     """An encoder as configured; RecordingError when this build of FFmpeg lacks the codec."""
-    return Encoder(video, width, height, fps) if video.codec == "jpeg" else _StreamEncoder(video, width, height, fps)
+    made = _JpegEncoder if video.codec == "jpeg" else _StreamEncoder
+    return made(video, width, height, fps)
 
 
-class Encoder:
-    """Codes the images of one camera, in order: as JPEG files, each by itself."""
+class Encoder(Protocol):
+    """Codes the images of one camera, in order."""
 
+    settings: VideoSettings
+
+    def encode(self, image: Rgb) -> list[bytes]:
+        """Take one image; return the packets that are ready, oldest first."""
+
+    def finish(self) -> list[bytes]:
+        """Return the packets that were held back."""
+
+
+class _JpegEncoder:
     def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
         settings = settings_of_coded(video.codec, width, height, fps)
         self.settings = replace(settings, jpeg_quality=video.jpeg_quality)
 
     def encode(self, image: Rgb) -> list[bytes]:
-        """Take one image; return the packets that are ready, oldest first."""
         buffer = io.BytesIO()
         Image.fromarray(image).save(buffer, format="JPEG", quality=self.settings.jpeg_quality, subsampling="4:2:0")
         return [buffer.getvalue()]
 
     def finish(self) -> list[bytes]:
-        """Return the packets that were held back."""
         return []
 
 
-class _StreamEncoder(Encoder):
+class _StreamEncoder:
     def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
         if video.codec == "h264":
             # Keyframes at a fixed distance; no reordering, no delay. Zero latency also leaves x264's macroblock tree

@@ -261,7 +261,7 @@ def _plain_yaml(text: str) -> Any:
 
 
 def _blocks(source: Any, unpacked: Unpacked) -> Iterator[bytes]:
-    """What is compressed, in parts: at once, as much as it claims to be would be reserved, whatever comes."""
+    """Unpacked bytes, block by block: unpacking at once would reserve as much memory as the data claim to need."""
     for block in zstandard.ZstdDecompressor().read_to_iter(source, write_size=_COPY_BYTES):
         unpacked.add(len(block))
         yield block

@@ -60,6 +60,8 @@ class Vector:
     """Numbers of a topic that could be part of a feature.
 
     Attributes:
+        topic, type: Where they are.
+        field: As of a source.
         reader: Of its numbers.
         kind: Of what: joints of an arm, a gripper or a base (wheels, legs), a pose, a velocity in space, or others.
         role: state, action, or "" where no word says which.

@@ -66,7 +66,7 @@ class Timeline:
 
     @property
     def rule(self) -> str:
-        """By which rows take messages, for people."""
+        """How rows take messages, in words."""
         return f"{self.sample} by {'header' if self.is_header else 'log'} time"
 
     @property

@@ -26,13 +26,18 @@ from demorec.sources.frames_writer import FramesImport, Image, importing_version
 
 
 def import_lerobot(
-    roots: Sequence[Path], mapping: None, out: Path, *, video: VideoConfig | None = None, motors: Motors | None = None
+    roots: Sequence[Path],
+    mapping: Path | None,
+    out: Path,
+    *,
+    video: VideoConfig | None = None,
+    motors: Motors | None = None,
 ) -> FramesImport:
     """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, whoever wrote it, into a run.
 
     Args:
         roots: The dataset's folder, the only one.
-        mapping: It needs none.
+        mapping: Unused: datasets need none.
         out: The run's folder; one that the same dataset began is continued.
         video: How images are encoded whose packets cannot pass through.
         motors: The servos whose values LeRobot recorded as state and action.

@@ -48,7 +48,13 @@ NOTE = "note"
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something odd: one word of a fixed list, the stream ("camera front", "" for the bag as a whole), and figures."""
+    """Something odd.
+
+    Attributes:
+        kind: What, in one word of a fixed list.
+        stream: Which ("observation.state", "camera front"), "" for the bag as a whole.
+        text: What was found, with figures.
+    """
 
     kind: str
     stream: str

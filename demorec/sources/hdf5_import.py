@@ -26,6 +26,7 @@ from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, Stored
 from demorec.episode.episode import Outcome, Vector
 from demorec.episode.info import EpisodeInfo, SourceFile
 from demorec.episode.validity import find_problems
+from demorec.robots.motors import Motors
 from demorec.runs.external import differences, open_external_run
 from demorec.runs.find import expect
 from demorec.sources.fields import FieldError
@@ -40,7 +41,12 @@ _LENGTHS = "compress_len"
 
 
 def import_hdf5(
-    paths: Sequence[Path], mapping_path: Path, out: Path, *, video: VideoConfig | None = None, motors: None = None
+    paths: Sequence[Path],
+    mapping_path: Path | None,
+    out: Path,
+    *,
+    video: VideoConfig | None = None,
+    motors: Motors | None = None,
 ) -> FramesImport:
     """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
 
@@ -49,13 +55,14 @@ def import_hdf5(
         mapping_path: Of the mapping.
         out: The run's folder; one that the same files and mapping began is continued.
         video: How images are encoded that come as pixels.
-        motors: The mapping says what the numbers are.
+        motors: Unused: the mapping says what the numbers are.
 
     Raises:
         ConfigError: The mapping is impossible, the files differ, or the folder holds something else.
         Hdf5Error: A file cannot be read, or does not fit the mapping.
         RecordingError: The disk is full or gone.
     """
+    assert mapping_path is not None, "whoever calls asks for it"
     mapping = read_mapping(mapping_path, "hdf5")
     urdf = urdf_text(mapping, mapping_path)
     for path in paths:

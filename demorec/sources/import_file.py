@@ -86,8 +86,13 @@ class EpisodeReport:
 
 @dataclass(frozen=True, kw_only=True)
 class BagReport:
-    """All that is said about a bag: the name of the file or folder, without its place; name and SHA-256 of each of its
-    files, and their bytes; what came of it.
+    """All that is said about a bag.
+
+    Attributes:
+        name: Of the file or folder, without its place.
+        files: Name and SHA-256 of each of its files.
+        num_bytes: Of them.
+        streams, findings, episodes: As described there.
     """
 
     name: str

@@ -126,7 +126,7 @@ class Batch:
         self._progress(0, len(paths))
 
     def look(self, digest: Callable[[Bag], Future[Files]]) -> list[Bag]:
-        """Open all bags, and begin to digest those that may be in the run; those that are not in it yet."""
+        """Open all bags; those that are not in the run yet, by `digest` where sizes and names are known."""
         bags = []
         for path in self._paths:
             try:

@@ -1,6 +1,6 @@
 """A bag is read and judged as a whole: the episodes that shall be recorded of it, and a report of what was found.
 
-Where episodes begin and end, what they are called and how they ended says the mapping, by what the bag holds.
+The mapping says where episodes begin and end, what they are called and how they ended, by what the bag holds.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ class Timelines:
             raise BagError(f"No message of {empty[0].label} has a time at which it could be used")
 
     def sources(self, feature: str) -> list[Timeline]:
-        """Those that a feature is made of, or the one that it is next."""
+        """The timelines of a feature's sources; of one that is another's next row, that one's."""
         sources = self.mapping.features[feature]
         if sources[0].next:
             return self.sources(sources[0].next)

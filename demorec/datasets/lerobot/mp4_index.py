@@ -21,7 +21,8 @@ from demorec.core.files import open_regular
 _MAX_MOOV = 256 << 20
 _CHUNK = 1 << 20
 """Bytes, below which images that follow each other are listed as one chunk, as libav does."""
-_PARENTS = (b"trak", b"mdia", b"minf", b"stbl")
+_PARENTS = (b"trak", b"mdia", b"minf", b"stbl", b"edts")
+_PARENTS_OF_CLAIMS = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 _MAX_BOXES = 100_000
 
 
@@ -49,7 +50,7 @@ def _claims(file: BinaryIO, size: int) -> Iterator[int]:
             num_boxes += 1
             if num_boxes > _MAX_BOXES:
                 raise ValueError(f"more than {_MAX_BOXES:,} boxes")
-            if kind in (*_PARENTS, b"moov", b"moof", b"traf"):
+            if kind in _PARENTS_OF_CLAIMS:
                 waiting.append((begin, end))
             elif kind in (b"stsz", b"stz2"):
                 _, each, count = _read(file, begin, ">III")
@@ -88,7 +89,7 @@ def _flat(file: BinaryIO, start: int, end: int) -> dict[bytes, bytes]:
     found, waiting = {}, [(start, end)]
     for part in waiting:
         for kind, begin, stop in _boxes(file, *part):
-            if kind in (*_PARENTS, b"edts"):
+            if kind in _PARENTS:
                 waiting.append((begin, stop))
             else:
                 file.seek(begin)
