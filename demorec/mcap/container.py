@@ -20,7 +20,15 @@ from demorec.core.errors import RecordingError, ResourceError, describe_error, r
 from demorec.core.files import MCAP_MAGIC, open_regular
 from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, blocks_of, chunk_content, records_in
 from demorec.mcap.limits import LimitError, Limits
-from demorec.mcap.scan import MAX_METADATA_BYTES, MESSAGE_HEAD, NO_SCHEMA, read_channel, read_record, read_schema
+from demorec.mcap.scan import (
+    MAX_CHANNELS,
+    MAX_METADATA_BYTES,
+    MESSAGE_HEAD,
+    NO_SCHEMA,
+    read_channel,
+    read_record,
+    read_schema,
+)
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _DAMAGE = (OSError, MemoryError, ValueError, KeyError, IndexError, OverflowError, EOFError)
@@ -113,6 +121,9 @@ class Container:
                 schema = read_schema(content)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHUNK_INDEX:
+                # Before it is parsed: of each channel, the number and where its messages begin, 10 bytes.
+                if int.from_bytes(content[32:36], "little") > 10 * MAX_CHANNELS:
+                    raise ValueError(f"a chunk of more than {MAX_CHANNELS:,} topics")
                 self._chunks.append(read_record(content, ChunkIndex))
             elif opcode == Opcode.METADATA_INDEX:
                 metadata = read_record(content, MetadataIndex)
