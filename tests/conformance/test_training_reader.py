@@ -26,8 +26,8 @@ KINDS = ("ours", "lerobot", "lerobot_images", "lerobot_long_gops")
 
 
 def quick(*chosen: str) -> list[Any]:
-    """All kinds, those that are not chosen as slow tests: LeRobot's reader takes its time."""
-    return [kind if kind in chosen else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+    """All kinds, those that are not chosen as long tests: LeRobot's reader takes its time."""
+    return [kind if kind in chosen else pytest.param(kind, marks=pytest.mark.long) for kind in KINDS]
 
 
 HISTORY = [-2 / 30, 0.0]
@@ -101,7 +101,7 @@ def test_every_item_is_equal(kind: str, roots: dict[str, Path]) -> None:
     assert_same_item(fast[-1], slow[-1])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", quick("ours"))
 def test_every_window_is_equal(kind: str, roots: dict[str, Path]) -> None:
     _, plain = pair(roots[kind])
     fast, slow = pair(roots[kind], delta_timestamps=windows(plain), return_uint8=False, depth_output_unit="m")

@@ -298,7 +298,7 @@ def test_the_good_one_passes(good: Good) -> None:
 
 
 @pytest.mark.parametrize(("kind", "name", "fault", "check"), CASES, ids=[f"{kind}: {name}" for kind, name, *_ in CASES])
-@pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=[pytest.mark.slow, pytest.mark.long])])
 def test_a_fault(camera: str, kind: ImageKind, name: str, fault: Fault, check: str, good: Good) -> None:
     rows = good.images[camera, kind]
     changed = fault(rows)
@@ -345,7 +345,7 @@ def test_the_good_one_passes_drawn_in_part(good: Good, poses: Array) -> None:
 
 
 @pytest.mark.parametrize(("name", "fault", "check"), COLOR, ids=[name for name, *_ in COLOR])
-@pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("camera", ["front", pytest.param("wrist", marks=[pytest.mark.slow, pytest.mark.long])])
 def test_a_fault_of_one_drawn_in_part(
     camera: str, name: str, fault: Fault, check: str, good: Good, poses: Array
 ) -> None:

@@ -271,7 +271,9 @@ def changed(bases: dict[str, Path], tmp_path: Path) -> Callable[[str], tuple[Pat
     return make
 
 
-@pytest.mark.parametrize("case", INJECTED)
+@pytest.mark.parametrize(
+    "case", [pytest.param(name, marks=pytest.mark.long if number % 2 else ()) for number, name in enumerate(INJECTED)]
+)
 def test_each_difference_is_named_and_nothing_else(
     case: str, changed: Callable[[str], tuple[Path, Path]], capsys: pytest.CaptureFixture[str]
 ) -> None:

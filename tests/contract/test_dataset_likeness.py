@@ -31,6 +31,7 @@ from support.dataset_edits import (
 from support.dataset_particular import held, repeats
 from support.export import export
 from support.foreign_dataset import write_foreign
+from support.params import first_of_each_kind
 
 pytestmark = pytest.mark.slow
 
@@ -169,7 +170,7 @@ def test_a_gripper_that_is_not_used_may_tremble(increments: Path, tmp_path: Path
     assert level_of(dataset, "elements_alive", "dataset") == "pass"
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", first_of_each_kind(FAULTS, 1))
 def test_one_episode_unlike_the_others(name: str, increments: Path, tmp_path: Path) -> None:
     fault, law, level = FAULTS[name]
     dataset = Path(shutil.copytree(increments, tmp_path / "dataset"))
@@ -315,17 +316,7 @@ def test_good_targets_and_images_pass(filmed: Path) -> None:
     assert [level_of(filmed, law, "dataset") for law in VIEWS] == ["pass"] * len(VIEWS)
 
 
-FIRST = {law: name for name, (_, law) in reversed(FILMED_FAULTS.items())}
-"""Law -> the first fault that it finds."""
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if FIRST[law] == name else pytest.mark.long)
-        for name, (_, law) in FILMED_FAULTS.items()
-    ],
-)
+@pytest.mark.parametrize("name", first_of_each_kind(FILMED_FAULTS, 1))
 def test_targets_and_images_unlike_the_others(name: str, filmed: Path, tmp_path: Path) -> None:
     fault, law = FILMED_FAULTS[name]
     dataset = Path(shutil.copytree(filmed, tmp_path / "dataset"))

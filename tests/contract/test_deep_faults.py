@@ -18,6 +18,7 @@ import pytest
 from support.check import Message, Spoilt, level_of, rewrite_messages, simulate
 from support.faults import Changed, Fault, Rows, both_grippers, condition, info, late, outcome
 from support.mcap import sealed
+from support.params import every_other_long
 
 from demorec.core.geometry import Pose
 from demorec.episode.camera_error import error_values
@@ -304,14 +305,6 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
         return deep_check(spoilt).level
 
     return level
-
-
-def every_other_long(faults: list[tuple[str, Any]]) -> list[Any]:
-    """Parameters, named; neighbours are of a kind."""
-    return [
-        pytest.param(*fault, id=fault[0], marks=pytest.mark.long if number % 2 else ())
-        for number, fault in enumerate(faults)
-    ]
 
 
 def test_the_good_ones_come_out_the_same(good: Path, blind: Path, tmp_path: Path, judge: Judge) -> None:
