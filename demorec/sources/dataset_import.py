@@ -61,6 +61,7 @@ def import_lerobot(
         dataset.leave_out(name, "it has whole numbers that float64 cannot hold")
     cameras, fates = _cameras(dataset)
     digest, num_new = functools.cache(sha256_of), 0
+    video = video or VideoConfig()
     with open_external_run(out, recovers=False) as folder:
         for number in range(len(dataset.places)):
             recording = DatasetRecording(dataset, number)
@@ -72,16 +73,8 @@ def import_lerobot(
             frames = ({name: values[row] for name, values in columns.features.items()} for row in rows)
             images = {camera.name: _images(recording, camera) for camera in info.cameras}
             leads = {camera.name: int(columns.images[camera.name][0]) for camera in info.cameras if camera.kept}
-            write_frames(
-                folder,
-                info,
-                frames,
-                images,
-                outcome=recording.outcome,
-                video=video or VideoConfig(),
-                leads=leads,
-                subtasks=subtasks,
-            )
+            outcome = recording.outcome
+            write_frames(folder, info, frames, images, outcome=outcome, video=video, leads=leads, subtasks=subtasks)
             num_new += 1
     return FramesImport(
         num_episodes=len(dataset.places),

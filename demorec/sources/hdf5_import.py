@@ -72,7 +72,6 @@ def import_hdf5(
     plans: list[tuple[Path, str, EpisodeInfo, Outcome]] = []
     left_out: dict[str, str] = {}
     cameras: dict[str, str] = {}
-    has_last = False
     for path in paths:
         with ForeignFile(path) as file, _named(path):
             source = SourceFile(name=path.name, sha256=sha256_of(path))
@@ -80,16 +79,12 @@ def import_hdf5(
             for place in places:
                 episode = _Stored(file, place, mapping)
                 info = episode.described(urdf, source, len(plans))
-                plans.append(
-                    (path, place, _alike(info, plans[0][2] if plans else info, file, place), episode.outcome())
-                )
-                cameras = cameras or {
-                    one.name: f"{one.width}x{one.height}, {one.description}" for one in episode.cameras
-                }
-                has_last |= episode.has_last
+                first = plans[0][2] if plans else info
+                plans.append((path, place, _alike(info, first, file, place), episode.outcome()))
+                cameras = cameras or {c.name: f"{c.width}x{c.height}, {c.description}" for c in episode.cameras}
+                if episode.has_last:
+                    left_out["the last observation of each episode"] = "no action follows it"
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
-    if has_last:
-        left_out["the last observation of each episode"] = "no action follows it"
     with open_external_run(out, recovers=False) as folder:
         missing = [plan for plan in plans if not folder.has(plan[2])]
         for path, place, info, outcome in missing:
