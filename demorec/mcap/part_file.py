@@ -142,7 +142,7 @@ class PartFile:
                 context=self._context,
                 metadata={"offered_qos_profiles": _LATCHED_QOS} if latched else {},
             )
-        log: Callable[..., None] = self._channels[topic].base.log  # the wrapper looks for JSON
+        log: Callable[..., None] = self._channels[topic].base.log  # past its wrapper, which looks for JSON
         return log
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:

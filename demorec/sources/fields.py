@@ -280,7 +280,7 @@ def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ..
     """What the elements that a source takes are called in the feature; FieldError when it speaks of more or fewer."""
     for what, given in (("names", source.names), ("limits", source.limits)):
         if given and len(given) != len(labels):
-            raise FieldError(f"{what} tells of {len(given)} of the {len(labels)} elements of {place}")
+            raise FieldError(f"{what}: {len(given)} given for the {len(labels)} elements of {place}")
     return tuple(source.prefix + name for name in source.names or labels)
 
 

@@ -45,7 +45,7 @@ WRONG = [
     ('field = "position"', 'field = "header.frame_id"', r"holds no numbers"),
     ('field = "position"', 'field = "position"\njoints = ["shoulder_pam"]', r"Did you mean 'shoulder_pan'\?"),
     ('field = "position"', 'field = "position"\nelements = [9]', r"no element 9 among the 6"),
-    ('field = "position"', 'field = "position"\nnames = ["a"]', r"names tells of 1 of the 6 elements"),
+    ('field = "position"', 'field = "position"\nnames = ["a"]', r"names: 1 given for the 6 elements"),
     ("/follower/cam_front/image_raw/compressed", "/follower/joint_states", r"camera front .* it holds no image"),
 ]  # fmt: skip
 
