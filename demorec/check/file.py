@@ -12,6 +12,7 @@ import numpy as np
 from demorec.check.base import Found, Measurement, NotMeasured, external_check, file_check, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.episode.episode import NO_IMAGE
+from demorec.episode.info import FORMAT_VERSION
 from demorec.mcap import channels, messages
 from demorec.mcap.streams import frame_streams
 
@@ -25,7 +26,7 @@ _NANOSECONDS = 1_000_000_000
 )
 def opens(episode: CheckedEpisode) -> Measurement:
     """The index and the metadata pass their checksums and are of a known format version."""
-    return Measurement(value=0, detail=f"format version {episode.recording.info.format_version}")
+    return Measurement(value=0, detail=f"format version {FORMAT_VERSION}")
 
 
 @file_check(

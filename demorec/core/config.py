@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from demorec.core.errors import ConfigError, OptionError, check_option
-from demorec.core.plain import from_plain, leave_out_defaults
+from demorec.core.plain import from_plain
 from demorec.core.registry import modules_of
 from demorec.episode.variation import PRESET_NAMES, Preset, Ranges
 
@@ -187,9 +187,6 @@ class GenerateConfig:
         check_option("max_attempts", self.max_attempts, 1, 100)
         check_option("max_episode_seconds", self.max_episode_seconds, 1.0, 3600.0)
         self.video.validate()
-
-
-leave_out_defaults(GenerateConfig, "interject", "objects", "object_split")
 
 
 @dataclass(frozen=True, kw_only=True)

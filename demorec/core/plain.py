@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import math
 import re
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from numbers import Integral, Real
 from typing import Any
 
 import cattrs
 import numpy as np
-from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn, override
 from cattrs.preconf.json import make_converter
 from cattrs.v import format_exception
 
@@ -85,108 +82,6 @@ _converter.register_unstructure_hook(
 )
 
 
-Layout = type | str | None
-"""How a field is written: as this type, under this key, or not at all."""
-
-
-class _Flat(dict[str, Any]):
-    """The keys of a part that stood among those of its owner."""
-
-
-def write_flat(
-    owner: type, name: str, part: type, *, otherwise: type, keys: Mapping[str, str], leave_out: tuple[str, ...] = ()
-) -> None:
-    """Have a field that is a dataclass itself written as keys of its owner, not as an object within it.
-
-    Args:
-        owner: The dataclass that has the field.
-        name: Of the field.
-        part: The field's dataclass.
-        otherwise: The other dataclass that it may be; that one is written as an object within its owner.
-        keys: Field of `part` -> key that it has among those of `owner`.
-        leave_out: Fields of `owner` that are written only where they differ from their defaults.
-    """
-    renamed: Any = {field: override(rename=key) for field, key in keys.items()}
-    structure_part: Any = make_dict_structure_fn(part, _converter, _cattrs_forbid_extra_keys=True, **renamed)
-    _converter.register_structure_hook(part, structure_part)
-    _converter.register_unstructure_hook(part, make_dict_unstructure_fn(part, _converter, **renamed))
-    of_part = frozenset(keys.values())
-    _converter.register_structure_hook(
-        part | otherwise,
-        lambda value, _: _converter.structure(value, part if isinstance(value, _Flat) else otherwise),
-    )
-    structure: Any = make_dict_structure_fn(owner, _converter, _cattrs_forbid_extra_keys=True)
-    omitted: Any = {field: override(omit_if_default=True) for field in leave_out}
-    unstructure: Any = make_dict_unstructure_fn(owner, _converter, **omitted)
-
-    def from_flat(value: Mapping[str, Any], _: type) -> Any:
-        if name in value:
-            return structure(value, owner)
-        nested = {key: item for key, item in value.items() if key not in of_part}
-        nested[name] = _Flat({key: item for key, item in value.items() if key in of_part})
-        return structure(nested, owner)
-
-    def to_flat(value: Any) -> dict[str, Any]:
-        plain: dict[str, Any] = unstructure(value)
-        if isinstance(getattr(value, name), otherwise):
-            return plain
-        nested: dict[str, Any] = plain.pop(name)
-        return plain | nested
-
-    _converter.register_structure_hook(owner, from_flat)
-    _converter.register_unstructure_hook(owner, to_flat)
-
-
-def _structure_as(kind: type, value: object, _: object) -> Any:
-    return _converter.structure(value, kind)
-
-
-def write_optional_part(
-    owner: type, name: str, part: type, *, with_part: Mapping[str, Layout], without_part: Mapping[str, Layout]
-) -> None:
-    """Have a field that is a dataclass itself, or None, written as keys of its owner, not as an object within it.
-
-    Args:
-        owner: The dataclass that has the field.
-        name: Of the field.
-        part: The field's dataclass.
-        with_part, without_part: Where the part is there and where it is not: field of `owner` -> how it is written.
-    """
-
-    def hooks(layout: Mapping[str, Layout]) -> tuple[Callable[[Any, type], Any], Callable[[Any], dict[str, Any]]]:
-        chosen: Any = {}
-        for field, how in layout.items():
-            if isinstance(how, str):
-                chosen[field] = override(rename=how)
-            elif how is None:
-                chosen[field] = override(omit=True)
-            else:
-                chosen[field] = override(struct_hook=partial(_structure_as, how))
-        read: Any = make_dict_structure_fn(owner, _converter, _cattrs_forbid_extra_keys=True, **chosen)
-        return read, make_dict_unstructure_fn(owner, _converter, **chosen)
-
-    read_with, write_with = hooks(with_part)
-    read_without, write_without = hooks({**without_part, name: None})
-    of_part = frozenset(field.name for field in dataclasses.fields(part))
-    only_of_part = of_part - set(without_part.values())
-
-    def from_layout(value: Mapping[str, Any], _: type) -> Any:
-        if not only_of_part & value.keys():
-            return read_without(value, owner)
-        others = {key: item for key, item in value.items() if key not in of_part}
-        return read_with({name: {key: value[key] for key in of_part & value.keys()}, **others}, owner)
-
-    def to_layout(value: Any) -> dict[str, Any]:
-        if getattr(value, name) is None:
-            return write_without(value)
-        plain = write_with(value)
-        nested: dict[str, Any] = plain.pop(name)
-        return plain | nested
-
-    _converter.register_structure_hook(owner, from_layout)
-    _converter.register_unstructure_hook(owner, to_layout)
-
-
 class PartValue[V]:
     """A value of an optional part, read as one of its owner's.
 
@@ -207,15 +102,6 @@ class PartValue[V]:
             raise self._absent(self._name)
         value: V = getattr(part, self._name)
         return value
-
-
-def leave_out_defaults(owner: type, *names: str) -> None:
-    """Write fields of a dataclass only where they differ from their defaults, which files from before them mean.
-
-    All such fields of a dataclass are named in one call.
-    """
-    kept: Any = {name: override(omit_if_default=True) for name in names}
-    _converter.register_unstructure_hook(owner, make_dict_unstructure_fn(owner, _converter, **kept))
 
 
 def _in_words(error: BaseException, type_: type | None) -> str:

@@ -16,15 +16,12 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import NotSimulatedError
 from demorec.core.geometry import Array, Pose
-from demorec.core.plain import PartValue, leave_out_defaults, write_optional_part
+from demorec.core.plain import PartValue
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
 
-FORMAT_VERSION = 2
-"""Of the recordings of simulated episodes. A reader knows every version up to this one; `recordings/sample/` holds a
-file of each."""
-EXTERNAL_VERSION = 1
-"""The same, of the recordings of external episodes."""
+FORMAT_VERSION = 3
+"""Format version of recordings, the only one that is read; versions 1 and 2 were never released."""
 
 Kept = Literal["", "h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
 DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
@@ -62,9 +59,6 @@ class Feature:
         scale = self.calibration or [degree if unit in ("deg", "degree") else (1.0, 0.0) for unit in units]
         factor, offset = np.array(scale).T
         return np.asarray(values.astype(np.float64) * factor + offset)
-
-
-leave_out_defaults(Feature, "calibration")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +151,6 @@ class EpisodeInfo:
     """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
 
     Attributes:
-        format_version: Of the recording; 0 stands for the newest.
         episode_index: Which episode of the run.
         attempt: Which attempt at it.
         instruction: What the robot is asked to do, in words; LeRobot's task text.
@@ -174,7 +167,6 @@ class EpisodeInfo:
             those of the episode (`info.scene`); that raises NotSimulatedError where there are none.
     """
 
-    format_version: int = 0
     episode_index: int
     attempt: int = 0
     instruction: str
@@ -203,11 +195,10 @@ class EpisodeInfo:
         return replace(self, simulation=replace(self.simulation, **changes))
 
     def __post_init__(self) -> None:
+        known: dict[str, Any] = {}
         if self.simulation is None:
-            known: dict[str, Any] = {"format_version": self.format_version or EXTERNAL_VERSION}
             known["origin"] = self.origin or Origin()
         else:
-            known = {"format_version": self.format_version or FORMAT_VERSION}
             known["robot_name"] = self.simulation.robot.name
             known["cameras"] = tuple(
                 Camera(
@@ -222,12 +213,3 @@ class EpisodeInfo:
             )
         for name, value in known.items():
             object.__setattr__(self, name, value)
-
-
-write_optional_part(
-    EpisodeInfo,
-    "simulation",
-    Simulation,
-    with_part={"origin": str, "robot_name": None, "urdf": None, "features": None, "cameras": None},
-    without_part={"origin": Origin, "robot_name": "robot", "attempt": None},
-)

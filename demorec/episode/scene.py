@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, intrinsic_matrix
-from demorec.core.plain import leave_out_defaults
 
 Rgba = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
@@ -64,9 +63,6 @@ class Shape:
         if self.kind == "capsule":
             return (2 * self.size[0], 2 * self.size[0], self.size[1] + 2 * self.size[0])
         return (self.size[0], self.size[1], self.size[2])
-
-
-leave_out_defaults(Shape, "mesh")
 
 
 Pattern = Literal["plain", "checker", "stripes", "noise", "wood"]
@@ -203,28 +199,20 @@ class Physics:
         grip_iterations: The same of steps while a finger touches something; 0 for as many as of the others.
         gravity: m/s^2.
         contact_breaking_threshold: How far two bodies may move along each other until Bullet forgets a contact point
-            that it found before, as a share of the smaller one's radius.
+            that it found before, as a share of the smaller one's radius. With Bullet's 0.02 a small, light, slippery
+            cube can rock between fingers that touch it in one point each, and they sink into it (docs/simulation.md).
         finger_stiffness: Of the contact of a finger, N/m: a finger that pushes with a force at one point is as deep in
-            what it holds as the force divided by it.
+            what it holds as the force divided by it. With PyBullet's 30,000 and 20 N that is 0.7 mm, and more than a
+            millimetre when the object meets the table (docs/simulation.md).
     """
 
     hz: int = 240
     solver_iterations: int = 50
     gravity: Vector3 = (0.0, 0.0, -9.81)
-    contact_breaking_threshold: float = 0.02
-    finger_stiffness: float = 30_000.0
+    contact_breaking_threshold: float = 0.05
+    finger_stiffness: float = 120_000.0
     grip_iterations: int = 0
 
-
-leave_out_defaults(Goal, "area")
-leave_out_defaults(Physics, "contact_breaking_threshold", "finger_stiffness", "grip_iterations")
-
-CONTACT_BREAKING_THRESHOLD = 0.05
-"""Of new episodes; recordings that do not say it have 0.02. With that, a small, light, slippery cube could rock between
-fingers that touched it in one point each, and they sank into it (docs/simulation.md)."""
-FINGER_STIFFNESS = 120_000.0
-"""Of new episodes; recordings that do not say it have 30,000, with which a finger that pushes with 20 N is 0.7 mm deep
-in what it touches in one point, and more than a millimetre when that meets the table (docs/simulation.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)

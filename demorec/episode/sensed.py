@@ -92,7 +92,6 @@ class Sensed:
         components: Names of their elements, as tables of frames have them.
         layout: Of them: "wrench" is a force and a torque on the hand, along the axes of its link
             (geometry_msgs/WrenchStamped); "array" is any vector (std_msgs/Float64MultiArray).
-        since: The first format version that has them.
     """
 
     quantity: str
@@ -103,7 +102,6 @@ class Sensed:
     topic: str = ""
     components: Callable[[RobotSpec], tuple[str, ...]] = lambda robot: ()
     layout: Literal["wrench", "array"] = "array"
-    since: int = 1
 
     def values(self, sensed: Mapping[str, Array], robot: RobotSpec) -> Array | None:
         """(T, D) of quantities (T, ...); None where it was not sensed."""
@@ -138,7 +136,6 @@ SENSED: Mapping[str, Sensed] = {
         topic="/wrench",
         components=lambda robot: ("fx", "fy", "fz", "tx", "ty", "tz"),
         layout="wrench",
-        since=2,
     ),
 }
 """Feature -> what it is."""

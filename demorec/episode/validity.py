@@ -49,14 +49,14 @@ def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
 
     Args:
         text: What to read.
-        simulated: Whether it must be that of a simulated episode, or of any other.
+        simulated: Whether only that of a simulated episode will do.
 
     Raises:
         ValueError: One line that says what is wrong with it.
     """
     info = from_description(text, EpisodeInfo)
-    if simulated != (info.simulation is not None):
-        raise ValueError(f"it describes {'no' if simulated else 'a'} simulated episode")
+    if simulated and info.simulation is None:
+        raise ValueError("it describes no simulated episode")
     wrong = find_problems(info)
     if wrong:
         raise ValueError("; ".join(wrong[:_MAX_LISTED]))

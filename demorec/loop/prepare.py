@@ -17,7 +17,7 @@ from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.episode.camera_error import error_values
 from demorec.episode.info import EpisodeInfo, Simulation
-from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Scene, SceneCamera
+from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
 from demorec.objects.folder import load_shelf
 from demorec.render import Renderer
@@ -149,13 +149,7 @@ def _layout(plan: EpisodePlan, robot: RobotSpec, ranges: Ranges, task: Task, beh
         scene = task.sample_scene(robot, sampler)
         for module in modules_of([config.task]):
             scene = _with_model_names(scene, module)
-        physics = replace(
-            scene.physics,
-            hz=config.physics_hz,
-            contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD,
-            finger_stiffness=FINGER_STIFFNESS,
-        )
-        scene = replace(scene, physics=physics)
+        scene = replace(scene, physics=replace(scene.physics, hz=config.physics_hz))
         scene = vary_physics(scene, ranges, _rng(plan, "physics"), distractors=not task.draws_distractors)
         if task.is_in_reach(scene, robot.scaled(scene.robot.scale), behaviour):
             break

@@ -43,11 +43,10 @@ class EpisodeFile(Closing):
         self.path = Path(path)
         self._container = Container(self.path)
         try:
-            record = next((name for name in metadata.RECORDS if name in self._container.metadata_names), "")
-            if (found := self._container.metadata(record)) is None:
+            if (found := self._container.metadata(metadata.EPISODE)) is None:
                 raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
             try:
-                self._read_metadata(record, found)
+                self._read_metadata(found)
             except RecordingError as error:
                 raise RecordingError(f"{without_path(error, self.path)}: {self.path}") from error
         except BaseException:
@@ -58,18 +57,19 @@ class EpisodeFile(Closing):
         """Close the file; harmless when called twice."""
         self._container.close()
 
-    def _read_metadata(self, record: str, found: Mapping[str, str]) -> None:
+    def _read_metadata(self, found: Mapping[str, str]) -> None:
         """Read what is known without reading the numbers."""
-        info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(record, found)
-        self._read_end(record, FRAMES if info.simulation is None else GRIPPER)
+        info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(found)
+        self._read_end(info)
         if self.num_frames and len(self._cameras) != len(info.cameras):
             raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
         self.info = self._with_urdf(info, urdf_sha256) if urdf_sha256 else info
 
-    def _read_end(self, record: str, topic: str) -> None:
-        """Read how it ended; RecordingError unless its end is that of as many frames as `topic` has messages."""
+    def _read_end(self, info: EpisodeInfo) -> None:
+        """Read how it ended; RecordingError unless the outcome has as many frames as there are messages."""
+        topic = FRAMES if info.simulation is None else GRIPPER
         outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
-        self.outcome = None if outcome is None else metadata.read_outcome_metadata(record, outcome)
+        self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome, info)
         self.num_frames, self.is_recovered = self._container.counts.get(topic, 0), recovered is not None
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
@@ -133,13 +133,9 @@ class EpisodeFile(Closing):
     def _digest_of_description(self) -> hashlib._Hash:
         """That of the metadata, to go on with: not of what versions wrote them."""
         described = to_plain(self.info)
-        del described["versions"], described["format_version"]
+        del described["versions"]
         result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-        result.update(
-            b"no outcome"
-            if self.outcome is None
-            else to_json(metadata.plain_outcome(metadata.record_of(self.info), self.outcome)).encode()
-        )
+        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
         return result
 
     @property

@@ -44,9 +44,7 @@ class FrameCheck:
         self._joints, self._arm = (len(info.robot.joint_names),), (len(info.robot.arm_joints),)
         self._objects = {body.name for body in info.scene.movable}
         self._cameras = {camera.name for camera in info.scene.cameras}
-        self._sensed = {
-            name: (len(row.names(info.robot)),) for name, row in STREAMS.items() if row.since <= info.format_version
-        }
+        self._sensed = {name: (len(row.names(info.robot)),) for name, row in STREAMS.items()}
 
     def __call__(self, frame: Frame) -> None:
         """Raise RecordingError for what is wrong with a frame; images are looked at when they are encoded."""

@@ -114,7 +114,9 @@ class CameraWriter:
         else:
             self._encoder = make_encoder(video, camera.width, camera.height, fps)
             settings = self._encoder.settings
-        self.streams = CameraStreams(video=settings, **dict.fromkeys(beside, True))
+        self.streams = CameraStreams(
+            video=settings, depth=camera.is_depth or "depth" in beside, segmentation="segmentation" in beside
+        )
         self._frame_id = camera_frame(camera.name)
         self._waiting: list[tuple[int, list[Message]]] = []
         self._packets: list[bytes] = []

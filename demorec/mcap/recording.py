@@ -46,7 +46,7 @@ class Recording(EpisodeFile):
         is_recovered: Whether a crash cut it off.
 
     Raises:
-        RecordingError: No recording, cut off, damaged, or of an unknown format version; so do all methods.
+        RecordingError: No recording, cut off, damaged, or of another format version; so do all methods.
         NotSimulatedError: A method was asked for what only a simulated episode has.
     """
 
@@ -289,8 +289,7 @@ class Recording(EpisodeFile):
         """SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.
 
         Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold bit for bit
-        the same episode. A column that the format version does not have is not part of it, so that recordings of
-        older versions keep their digests.
+        the same episode.
         """
         result = self._digest_of_description()
         columns = self.columns()

@@ -7,7 +7,7 @@ front until one is cut off or damaged; what all streams have in common up to the
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,10 +17,11 @@ from mcap.records import Metadata
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.core.files import MCAP_MAGIC, make_folder, open_regular
 from demorec.episode.episode import frame_time_ns
-from demorec.episode.info import Origin
+from demorec.episode.info import EpisodeInfo, Origin
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.limits import LimitError, Limits, Unpacked
+from demorec.mcap.metadata import CameraStreams
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
@@ -66,7 +67,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     part = target.with_name(f"{target.name}.recovering")
     file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
     try:
-        file.metadata(survey.record, survey.episode)
+        file.metadata(metadata.EPISODE, survey.episode)
         for item in _items(source):
             if isinstance(item, str):
                 break
@@ -113,8 +114,8 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
         origin: That of the recording that is about to be written in its place, as its info has it.
     """
     for item in _items(part):
-        if isinstance(item, Metadata) and item.name in metadata.RECORDS:
-            info, _, _ = metadata.read_episode_metadata(item.name, item.metadata)
+        if isinstance(item, Metadata) and item.name == metadata.EPISODE:
+            info, _, _ = metadata.read_episode_metadata(item.metadata)
             return info.origin == origin and origin not in ("", Origin())
         if isinstance(item, str):
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
@@ -127,14 +128,13 @@ class _Survey(NamedTuple):
     """What is whole in a file.
 
     Attributes:
-        record, episode: Name and values of the metadata that say what is recorded.
+        episode: The metadata of what is recorded.
         outcome: Those of how it ended, where all of it is there.
         reason: Why reading stopped.
         num_frames: That all streams have in common.
         keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
     """
 
-    record: str
     episode: dict[str, str]
     outcome: dict[str, str] | None
     reason: str
@@ -177,23 +177,22 @@ def _survey(source: Path) -> _Survey:
             found[item.name] = item.metadata
         elif item is not None:
             counts[item.channel.topic] += 1
-    for name in metadata.RECORDS:
-        if name not in found:
-            continue
-        (num_frames, keeps), outcome = _frames(name, found[name], counts), found.get(metadata.OUTCOME)
+    if metadata.EPISODE in found:
+        episode, outcome = found[metadata.EPISODE], found.get(metadata.OUTCOME)
+        info, cameras, _ = metadata.read_episode_metadata(episode)
+        num_frames, keeps = _frames(info, cameras, counts)
         reason = reason or "the end is missing"
-        if outcome is not None and metadata.read_outcome_metadata(name, outcome).num_frames != num_frames:
+        if outcome is not None and metadata.read_outcome_metadata(outcome, info).num_frames != num_frames:
             outcome = None
         if num_frames:
-            return _Survey(name, found[name], outcome, reason, num_frames, keeps)
+            return _Survey(episode, outcome, reason, num_frames, keeps)
     raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
 
 
 def _frames(
-    record: str, episode: dict[str, str], counts: Counter[str]
+    info: EpisodeInfo, cameras: Mapping[str, CameraStreams], counts: Counter[str]
 ) -> tuple[int, Callable[[ScannedMessage, int], bool]]:
-    """`num_frames` and `keeps` of a survey, by the metadata and the number of messages on each topic."""
-    info, cameras, _ = metadata.read_episode_metadata(record, episode)
+    """`num_frames` and `keeps` of a survey, by the description and the number of messages on each topic."""
     topics = {stream.topic for stream in frame_streams(info)}
     if info.simulation is None:  # images come before the frames that hold them: what is there of these has its images
         num_frames = min(counts[topic] for topic in topics)

@@ -2,8 +2,7 @@
 
 `frame_streams` is the table of an episode. A row says which values of frames its messages hold (`rows`) and which
 columns of `Columns` they become when a recording is read (`columns`); the writer, the reader, recovery and the checks
-go through the rows and know no topic by name. `since` is the format version that brought a stream: in older recordings
-it is neither expected nor written, and what it would hold is None.
+go through the rows and know no topic by name.
 
 A simulated episode has a fixed set of streams. Any other has a topic for each feature, and `/frames`, which says which
 sample of every feature and which image of every camera a frame holds: the features' stamps, then the cameras' image
@@ -74,7 +73,6 @@ class FrameStream:
         rows: Of N frames (`FrameValues`, or `SampledFrame` where demorec did not simulate) the values, (N, K).
         columns: The K values of T messages, (T, K), as columns.
         stamp_ns: What the header of a frame's message says; None: the frame's time.
-        since: The first format version that has it.
     """
 
     topic: str
@@ -83,7 +81,6 @@ class FrameStream:
     rows: Callable[[Sequence[Any]], NDArray[Any]]
     columns: Callable[[NDArray[Any]], ColumnArrays]
     stamp_ns: Callable[[Any], int] | None = None
-    since: int = 1
 
     def encode(self, frames: Sequence[Any], time_ns: Sequence[int]) -> list[bytes]:
         """One message for each frame, at its time."""
@@ -92,7 +89,7 @@ class FrameStream:
 
 
 def frame_streams(info: EpisodeInfo, tree: FrameTree | None = None) -> tuple[FrameStream, ...]:
-    """The streams of a recording of the version that `info` names, with a tree also that of its moving frames.
+    """The streams of a recording, with a tree also that of its moving frames.
 
     `/joint_states` of a simulated episode comes first; it may have more messages between the frames.
     """
@@ -101,12 +98,11 @@ def frame_streams(info: EpisodeInfo, tree: FrameTree | None = None) -> tuple[Fra
         moving = (FrameStream(TF, messages.TRANSFORMS, transforms_layout(tree.moving), tree.rows, lambda values: {}),)
     if info.simulation is None:
         return (*(_feature(feature) for feature in info.features), *moving, _held(info))
-    streams = (stream for stream in _simulated_streams(info) if stream.since <= info.format_version)
-    return (*streams, *moving)
+    return (*_simulated_streams(info), *moving)
 
 
 def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
-    """The table of all versions' streams."""
+    """The streams of a simulated episode."""
     robot, scene = info.robot, info.scene
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
     base = robot.base_link
@@ -188,9 +184,7 @@ def _sensed(row: Sensed, robot: RobotSpec) -> FrameStream:
     else:
         schema, laid_out = messages.FLOAT64_ARRAY, _array_layout(messages.FLOAT64_ARRAY, row.names(robot))
     rows = _gathered(lambda values: (values.observation.sensed[row.quantity],))
-    return FrameStream(
-        row.topic, schema, laid_out, rows, lambda values: {"sensed": {row.quantity: values}}, since=row.since
-    )
+    return FrameStream(row.topic, schema, laid_out, rows, lambda values: {"sensed": {row.quantity: values}})
 
 
 def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> FrameStream:

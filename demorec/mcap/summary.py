@@ -9,6 +9,7 @@ import numpy as np
 
 from demorec.core.plain import to_plain
 from demorec.episode.episode import NO_IMAGE, Outcome
+from demorec.episode.info import FORMAT_VERSION
 from demorec.mcap.recording import Recording, open_recording
 
 
@@ -32,7 +33,7 @@ def summarize(path: Path) -> dict[str, Any]:
             "kind": "external recording" if simulated is None else "recording",
             "path": str(path),
             "bytes": path.stat().st_size,
-            "format_version": info.format_version,
+            "format_version": FORMAT_VERSION,
             "episode_index": info.episode_index,
             "attempt": info.attempt,
             "root_seed": None if simulated is None else simulated.root_seed,

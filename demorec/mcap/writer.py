@@ -125,7 +125,7 @@ class EpisodeWriter(Closing):
         self._is_begun = True
         try:
             streams = {name: camera.streams for name, camera in self._cameras.items()}
-            self._file.metadata(metadata.record_of(self._info), metadata.episode_metadata(self._info, streams))
+            self._file.metadata(metadata.EPISODE, metadata.episode_metadata(self._info, streams))
             has_labels = any(camera.segmentation for camera in streams.values())
             for topic, schema, data in channels.latched_messages(self._info, self._tree, has_labels=has_labels):
                 self._file.log(topic, schema, data, 0, latched=True)
@@ -288,8 +288,7 @@ class EpisodeWriter(Closing):
         for camera in self._cameras.values():
             if (statistics := camera.statistics()) is not None:
                 self._file.log(*statistics, camera.last_ns)
-        record = metadata.record_of(self._info)
-        self._file.metadata(metadata.OUTCOME, metadata.outcome_metadata(record, outcome))
+        self._file.metadata(metadata.OUTCOME, metadata.outcome_metadata(outcome))
         self._file.publish()
         return self._file.path
 

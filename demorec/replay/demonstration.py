@@ -22,7 +22,7 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind
 from demorec.episode.info import EpisodeInfo, Simulation
-from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, FINGER_STIFFNESS, Physics, RobotPlacement, Scene
+from demorec.episode.scene import Physics, RobotPlacement, Scene
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.frames import action_at, frames_of, observation_at
 from demorec.robots.motors import Motors
@@ -287,7 +287,7 @@ def demonstration_of(
         joint_position=tuple(state[0, :count].tolist()),
         gripper_width=float(state[0, count]),
     )
-    physics = Physics(hz=hz, contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD, finger_stiffness=FINGER_STIFFNESS)
+    physics = Physics(hz=hz)
     info = EpisodeInfo(
         episode_index=episode_index,
         instruction="",

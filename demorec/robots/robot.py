@@ -9,7 +9,6 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.core.plain import write_flat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,21 +243,3 @@ class RobotSpec:
     def scaled(self, scale: float) -> RobotSpec:
         """The same robot with its lengths multiplied, as `RobotPlacement.scale` does to the URDF."""
         return replace(self, gripper=self.gripper.scaled(scale))
-
-
-# In files, since format version 1, a parallel gripper's fields stand beside the robot's; another kind is an object.
-write_flat(
-    RobotSpec,
-    "gripper",
-    ParallelGripper,
-    otherwise=JawGripper,
-    leave_out=("task_scale", "wrist_camera"),
-    keys={
-        "joints": "gripper_joints",
-        "finger_links": "finger_links",
-        "max_width": "gripper_max_width",
-        "force": "gripper_force",
-        "finger_depth": "finger_depth",
-        "palm_clearance": "palm_clearance",
-    },
-)

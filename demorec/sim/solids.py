@@ -19,7 +19,7 @@ from demorec.core.cache import cache_folder, write_whole
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array, Pose
 from demorec.episode.mesh import UNIT, SolidMesh, decode_mesh, encode_mesh
-from demorec.episode.scene import CONTACT_BREAKING_THRESHOLD, Body, Physics, Shape
+from demorec.episode.scene import Body, Physics, Shape
 from demorec.sim.bodies import add_body
 from demorec.sim.client import connect, silence
 from demorec.sim.world import set_engine
@@ -124,7 +124,7 @@ def _settled(mesh: SolidMesh) -> Pose:
         mass=0.1,
         rolling_friction=ROLLING_FRICTION,
     )
-    client, physics = connect(), Physics(contact_breaking_threshold=CONTACT_BREAKING_THRESHOLD)
+    client, physics = connect(), Physics()
     try:
         set_engine(client, physics)
         add_body(client, floor)

@@ -54,12 +54,13 @@ def _everywhere(value: Any) -> Any:
 def _fields(info: dict[str, Any]) -> dict[str, Any]:
     """A description whose free texts are hostile and whose references still fit."""
     info["instruction"] += HOSTILE
-    info["task"] += HOSTILE
     info["origin"] = f"replay of {HOSTILE}"
-    info["robot"]["name"] += HOSTILE
-    info["config_digest"] += HOSTILE
     info["versions"] = {f"demorec{HOSTILE}": HOSTILE}
-    info["behaviour"] = {HOSTILE: 1.0}
+    simulation = info["simulation"]
+    simulation["task"] += HOSTILE
+    simulation["robot"]["name"] += HOSTILE
+    simulation["config_digest"] += HOSTILE
+    simulation["behaviour"] = {HOSTILE: 1.0}
     return info
 
 

@@ -21,7 +21,7 @@ from support.commands import exit_code
 from demorec.mcap import Recording
 from demorec.view.from_dataset import open_dataset_episode
 
-SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
+SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 
 CAMERA = "observation.images.top"
 LENGTHS = (6, 5)

@@ -170,7 +170,7 @@ def test_a_description_of_very_many_values(good: Path, commands: LimitedCommands
         found = recording._container.metadata("demorec.episode")
     assert found is not None
     info = json.loads(found["info"])
-    info["scene"]["bodies"] = [{}] * 240_000
+    info["simulation"]["scene"]["bodies"] = [{}] * 240_000
     path.write_bytes(rewritten(good, change={"demorec.episode": {"info": json.dumps(info)}}))
     assert len(commands.refused("info", path)) < 1000
 

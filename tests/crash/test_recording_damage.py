@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from support.mcap import rewritten
 from support.recording import write_episode
 
 from demorec.core.config import VideoConfig
@@ -278,17 +279,9 @@ def test_a_foreign_mcap_file(tmp_path: Path) -> None:
         Recording(path)
 
 
-def test_a_newer_format_is_refused_by_its_number(tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    from support.recording import make_episode
-
-    from demorec.mcap import EpisodeWriter
-
-    info, frames, outcome = make_episode(num_frames=2, cameras=())
-    with EpisodeWriter(tmp_path / "a.mcap", replace(info, format_version=99)) as writer:
-        for frame in frames:
-            writer.write(frame)
-        writer.finish(outcome)
-    with pytest.raises(RecordingError, match=f"format version 99, this demorec reads 1 to {FORMAT_VERSION}"):
+@pytest.mark.parametrize("version", ["2", "99"])
+def test_another_format_is_refused_by_its_number(version: str, tmp_path: Path) -> None:
+    path = write_episode(tmp_path / "good.mcap", num_frames=2, cameras=())
+    (tmp_path / "a.mcap").write_bytes(rewritten(path, change={"demorec.episode": {"format_version": version}}))
+    with pytest.raises(RecordingError, match=f"format version {version}, this demorec reads {FORMAT_VERSION}"):
         Recording(tmp_path / "a.mcap")

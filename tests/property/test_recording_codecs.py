@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
 from demorec.mcap.cdr import Slot, decode, layout
-from demorec.mcap.description import Primitive, body_description, fit_primitives, robot_description
+from demorec.mcap.description import body_description, robot_description
 from demorec.mcap.lossless import LabelDecoder, decode_depth, decode_labels, encode_depth, encode_labels
 from demorec.mcap.messages import JOINT_STATE
 from demorec.mcap.ros2 import DEFINITIONS
@@ -118,30 +119,18 @@ def test_reading_junk_raises_nothing_but_value_errors(junk: bytes) -> None:
                 decode(schema, data)
 
 
-def inside(primitive: Primitive, points: np.ndarray[Any, Any], slack: float) -> Any:
-    """(N,) whether points lie within a primitive."""
-    offset = np.abs(points - np.array(primitive.center))
-    if primitive.kind == "box":
-        return np.all(offset <= np.array(primitive.size) / 2 + slack, axis=1)
-    if primitive.kind == "sphere":
-        return np.sqrt((offset**2).sum(axis=1)) <= primitive.size[0] + slack
-    radius, length = primitive.size
-    across = np.delete(offset, primitive.axis, axis=1)
-    return (np.sqrt((across**2).sum(axis=1)) <= radius + slack) & (offset[:, primitive.axis] <= length / 2 + slack)
-
-
-@pytest.mark.parametrize("name", [f"link{n}" for n in range(8)] + ["hand", "finger"])
-def test_primitives_cover_the_robot_and_little_more(name: str) -> None:
+@pytest.mark.parametrize("name", ["link0", "link5", "hand", "finger"])
+def test_a_mesh_is_described_by_the_box_around_it(name: str) -> None:
     path = asset_path("franka_panda/panda.urdf").parent / "meshes" / "collision" / f"{name}.obj"
     mesh = trimesh.load(path, force="mesh", process=False)
-    primitives = fit_primitives(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    assert 1 <= len(primitives) <= 6
-    points, _ = trimesh.sample.sample_surface(mesh, 2000, seed=1)
-    slack = 0.03 * float(np.linalg.norm(mesh.extents))  # the spacing of the points that were fitted
-    covered = np.any([inside(primitive, points, slack) for primitive in primitives], axis=0)
-    assert covered.all(), f"{(~covered).sum()} of 2000 points of {name} stick out"
-    hull = trimesh.convex.convex_hull(mesh).volume
-    assert sum(primitive.volume for primitive in primitives) < 2.2 * hull
+    link = "panda_leftfinger" if name == "finger" else f"panda_{name}"
+    robot = ET.fromstring(robot_description("franka_panda/panda.urdf", 1.0))
+    visual = robot.find(f"link[@name='{link}']/visual")
+    assert visual is not None
+    size = [float(side) for side in visual.find("geometry/box").attrib["size"].split()]  # type: ignore[union-attr]
+    center = [float(part) for part in visual.find("origin").attrib["xyz"].split()]  # type: ignore[union-attr]
+    assert np.allclose(size, mesh.extents, atol=1e-4)
+    assert np.allclose(center, mesh.bounds.mean(axis=0), atol=1e-4)
 
 
 def test_descriptions_are_urdf_that_pybullet_loads(tmp_path: Path) -> None:

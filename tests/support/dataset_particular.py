@@ -206,7 +206,7 @@ def other_camera(entry: Entry) -> None:
 def heavier(told: str) -> str:
     """The movable bodies of an EpisodeInfo's JSON have twice their mass."""
     found = json.loads(told)
-    for body in found["scene"]["bodies"]:
+    for body in found["simulation"]["scene"]["bodies"]:
         body["mass"] *= 2
     return json.dumps(found)
 

@@ -14,7 +14,7 @@ from demorec.check import dataset_files
 from demorec.check.base import Measurement
 from demorec.check.dataset import Dataset
 
-SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
+SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 _OF_LEROBOT = "OfflineModeIsEnabled: Cannot reach the Hub: please unset the `HF_HUB_OFFLINE` environment variable."
 """What LeRobot 0.6.1 ends with where a file of the dataset is missing: it asks the Hub for it."""
 

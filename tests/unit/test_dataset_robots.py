@@ -29,7 +29,7 @@ from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.save import save
 from demorec.view.sources import find_episodes
 
-SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
+SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 
 
 @pytest.fixture(scope="module")

@@ -122,7 +122,7 @@ def test_nothing_foreign_acts_in_a_card(tmp_path: Path) -> None:
     with Recording(good) as recording:
         info = json.loads(recording._container.metadata("demorec.episode")["info"])  # type: ignore[index]
     info["instruction"] = hostile
-    info["config"]["renderer"] = hostile
+    info["simulation"]["config"]["renderer"] = hostile
     (tmp_path / "bad.mcap").write_bytes(rewritten(good, change={"demorec.episode": {"info": json.dumps(info)}}))
     export(tmp_path / "bad.mcap", tmp_path / "d")
     card = (tmp_path / "d" / "README.md").read_text()

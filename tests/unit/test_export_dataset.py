@@ -245,7 +245,7 @@ def test_the_sidecar_tells_what_lerobot_cannot_hold(run: Path, tmp_path: Path) -
     assert camera["name"] == "front"
     assert camera["intrinsics"] == made.scene.cameras[0].intrinsics.reshape(-1).tolist()
     assert camera["world_from_camera_start"] == frames[0].images["front"].world_from_camera.vector().tolist()
-    assert json.loads(row["episode_info"])["scene"]["bodies"][1]["name"] == "cube"
+    assert json.loads(row["episode_info"])["simulation"]["scene"]["bodies"][1]["name"] == "cube"
     poses = pq.read_table(out / "demorec/camera_poses/chunk-000/file-000.parquet")
     assert poses.column_names == ["episode_index", "frame_index", "wrist"]  # the front camera stands still
     assert poses.num_rows == 61

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from demorec.core.errors import SceneError
-from demorec.mcap.description import _mesh_primitives
+from demorec.mcap.description import self_contained
 from demorec.robots.obj import read_obj
 
 SQUARE = "v 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n"
@@ -51,5 +51,6 @@ def test_a_face_of_points_that_are_not_there_is_refused(tmp_path: Path, face: st
     (tmp_path / "x.obj").write_text(f"{SQUARE}{face}\n")
     with pytest.raises(ValueError, match=r"a face names vertex \d+ of 4"):
         read_obj(tmp_path / "x.obj")
+    mesh = "<visual><geometry><mesh filename='x.obj'/></geometry></visual>"
     with pytest.raises(SceneError, match="A mesh of the scene cannot be read"):  # what describes it says so, too
-        _mesh_primitives(tmp_path / "x.obj", (1.0, 1.0, 1.0))
+        self_contained(f"<robot name='x'><link name='l'>{mesh}</link></robot>", tmp_path)

@@ -21,7 +21,7 @@ from demorec.view.from_dataset import held, open_dataset_episode
 from demorec.view.save import save
 from demorec.view.sources import find_episodes
 
-SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "format_1.mcap"
+SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 """A simulated episode: the cube is lifted, carried 26 cm and put down."""
 
 

@@ -136,7 +136,7 @@ def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Pat
 
 def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> None:
     """On a recording of the demo's task, since the examples name what lies on its table."""
-    sample = Path(__file__).parents[2] / "recordings/sample/format_2.mcap"
+    sample = Path(__file__).parents[2] / "recordings/sample/pick_place.mcap"
     recording = {"recordings/demo/episodes/episode_000000.mcap": sample}
     assert run_examples("docs/recording.md", "from demorec.mcap import open_recording", recording) == 2
     assert capsys.readouterr().out

@@ -219,10 +219,9 @@ def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
     assert episode is not None
     assert outcome is not None
     info, ended = json.loads(episode["info"]), json.loads(outcome["outcome"])
-    for key in ("task", "instruction"):
-        info[key] = HOSTILE
-    info["robot"]["name"] += HOSTILE
-    info["config"] = {HOSTILE: HOSTILE}
+    info["instruction"] = info["simulation"]["task"] = HOSTILE
+    info["simulation"]["robot"]["name"] += HOSTILE
+    info["simulation"]["config"] = {HOSTILE: HOSTILE}
     info["versions"] = {"demorec": HOSTILE}
     ended.update(success=False, failure_phase=HOSTILE, failure_reason=HOSTILE)
     ended["checks"][0].update(name=HOSTILE, unit=HOSTILE, passed=False)

@@ -47,7 +47,6 @@ class MotorRecording(Recording):
         self._motors, self._spec = arm.motors(units, calibration), simulated.robot
         self.info = replace(
             simulated,
-            format_version=0,
             robot_name=arm.robot_type,
             urdf=self.description(),
             features=motor_features(self._motors),

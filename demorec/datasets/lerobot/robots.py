@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from demorec.core.errors import DemorecError, ExportError, describe_error
 from demorec.core.files import read_text_limited
-from demorec.core.plain import digest, from_json, leave_out_defaults, to_json
+from demorec.core.plain import digest, from_json, to_json
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import MAX_JSON_BYTES
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
@@ -85,9 +85,6 @@ class RobotRecord:
             units=fitting(self.units),
             calibration=fitting(self.calibration),
         )
-
-
-leave_out_defaults(RobotRecord, "calibration")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -127,7 +127,7 @@ def _recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateCon
 
 
 def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
-    """Make the episode of a recording again, as a recording of the same format version, into a file.
+    """Make the episode of a recording again, into a file.
 
     A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
     its commands are sent again in its recorded scene, and labels, phases and events are taken over.
@@ -146,10 +146,9 @@ def _generate_again(recorded: EpisodeInfo, path: Path, simulators: SimulatorCach
     """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
     config = _recorded_config(recorded, allowed)
     episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
-    info = replace(episode.info, format_version=recorded.format_version)
-    world, renderer = simulators.acquire(info)
+    world, renderer = simulators.acquire(episode.info)
     session = Session.of_episode(world, episode, renderer)
-    with EpisodeWriter(path, info, video=config.video) as writer:
+    with EpisodeWriter(path, episode.info, video=config.video) as writer:
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)
         writer.finish(session.outcome)
