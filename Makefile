@@ -15,13 +15,19 @@ STAMP := .venv/.stamp-$(PYBULLET)
 # Containers often set this; every process would then compile LeRobot's and PyTorch's modules again, for 10 s each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-long setup lint constraints clean
+.PHONY: demo sample test test-slow test-long setup lint constraints clean
 
 demo: $(STAMP)
 	@echo "Generating five episodes into $(DEMO)"
 	@$(BIN)/generate-dataset --config demo.toml --out $(DEMO)
 	@$(BIN)/demorec view $(DEMO) --save $(DEMO)/playback.rrd --overwrite
 	@echo "Look at it:  $(BIN)/demorec view $(DEMO)   (or --web in a browser, or $(BIN)/rerun $(DEMO)/playback-*.rrd)"
+
+# The recording in recordings/sample/, after a change of the format.
+sample: $(STAMP)
+	@folder=$$(mktemp -d) && \
+	$(BIN)/generate-dataset --num-episodes 1 --width 128 --height 128 --no-export --out $$folder/run && \
+	cp $$folder/run/episodes/episode_000000.mcap recordings/sample/pick_place.mcap; rm -rf $$folder
 
 test: $(STAMP)
 	$(BIN)/pytest -m "not slow" $(IN_PARALLEL)
