@@ -217,7 +217,7 @@ def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf,
         reason = f"the model installed here has other joints ({urdf})"
     assert description is not None
     assert recorded is not None
-    log.warning("The robot is drawn as the boxes and cylinders of the recording, since %s.", reason)
+    log.warning("The robot is drawn as the boxes of the recording, since %s.", reason)
     return recorded, urdf_meshes(description, None)
 
 

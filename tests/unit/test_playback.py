@@ -186,7 +186,7 @@ def test_a_recording_shows_everything_where_the_models_are_not_installed(
     monkeypatch.setattr(assets, "data_folder", lambda: elsewhere)
     drawn = _drawn(with_models, tmp_path)
     said = caplog.text
-    assert "The robot is drawn as the boxes and cylinders of the recording" in said
+    assert "The robot is drawn as the boxes of the recording" in said
     assert said.count("An object is drawn as the recording describes it") == 2
     assert all(message.endswith(".") and ". " not in message for message in caplog.messages)  # a sentence each
     links = {entity for entity in drawn if "/robot/" in entity and _has(drawn[entity], "Mesh3D:vertex_positions")}

@@ -61,7 +61,7 @@ class RobotRecord:
         calibration: Feature -> of its elements, as `Feature` has it; only of servos that say something else.
         spec: Of a simulated arm: TCP link, limits, gripper, and `urdf`, the model that the meshes belong to.
         meshes: Link -> the mesh files that this model draws it with, as its URDF names them, where it is installed;
-            the URDF here has boxes, balls and cylinders in their place.
+            the URDF here has their boxes.
     """
 
     name: str

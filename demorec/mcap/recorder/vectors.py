@@ -140,7 +140,7 @@ class RobotFacts:
 
     Attributes:
         name: Of it.
-        urdf: Its description as text, "" when unknown; that of a file with every mesh replaced by boxes and cylinders,
+        urdf: Its description as text, "" when unknown; that of a file with every mesh replaced by its box,
             so that it can be drawn without any other file.
         joints: Names of all that move, in the order in which vectors have them, where that is known.
     """
