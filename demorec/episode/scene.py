@@ -214,7 +214,6 @@ class Physics:
     grip_iterations: int = 0
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class Light:
     """One directional light and the sky, for every renderer.

@@ -231,9 +231,11 @@ def test_recovering_onto_a_full_disk_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_recover_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recover_of_nothing(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut = (folder / "c.mcap.part").read_bytes()[:3000]
     assert run("recover", tmp_path / "nothing.mcap.part") == 2
-    (tmp_path / "empty.mcap.part").touch()
-    assert run("recover", tmp_path / "empty.mcap.part") == 1
-    assert "the file is empty" in capsys.readouterr().err
-    assert not (tmp_path / "empty.mcap").exists()
+    for content, words in ((b"", "the file is empty"), (cut, "Nothing can be recovered")):
+        (tmp_path / "empty.mcap.part").write_bytes(content)
+        assert run("recover", tmp_path / "empty.mcap.part") == 1
+        assert words in capsys.readouterr().err
+        assert not (tmp_path / "empty.mcap").exists()

@@ -21,7 +21,8 @@ def test_the_sample_is_one_small_file() -> None:
 def test_the_sample_is_read() -> None:
     with SAMPLE.open("rb") as file:
         summary = make_reader(file).get_summary()
-    assert summary is not None and summary.statistics is not None
+    assert summary is not None
+    assert summary.statistics is not None
     counts = {summary.channels[key].topic: count for key, count in summary.statistics.channel_message_counts.items()}
     with Recording(SAMPLE) as recording:
         assert recording.info.instruction == "move the red cube to the green target"

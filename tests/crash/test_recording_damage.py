@@ -9,7 +9,6 @@ import random
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,10 +69,6 @@ def swap_pieces(data: bytes, rng: random.Random) -> bytes:
     length = min(256, second - first)
     a, b = data[first : first + length], data[second : second + length]
     return data[:first] + b + data[first + length : second] + a + data[second + length :]
-
-
-def flip_bit_at(at: int, data: bytes, rng: random.Random) -> bytes:
-    return data[:at] + bytes([data[at] ^ (1 << at % 8)]) + data[at + 1 :]
 
 
 def damage_the_index(data: bytes, rng: random.Random) -> bytes:
@@ -215,28 +210,6 @@ def test_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         run_fuzz(fuzz, 300)
     assert fuzz.results["damaged"] >= 250
     assert fuzz.results["refused in one sentence"] > 100
-
-
-@pytest.mark.slow
-@pytest.mark.long
-@pytest.mark.timeout(1200)
-def test_two_thousand_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fuzz = Fuzz(tmp_path)
-    with reported(capsys, fuzz, "damaged recordings"):
-        run_fuzz(fuzz, 2400)
-    assert fuzz.results["damaged"] >= 2000
-    assert fuzz.results["read, all data right"] > 0  # the unused bytes of the format exist
-
-
-@pytest.mark.slow
-@pytest.mark.long
-@pytest.mark.timeout(1200)
-def test_a_flipped_bit_all_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fuzz = Fuzz(tmp_path)
-    places = range(0, len(fuzz.originals[0][0]), 17)
-    with reported(capsys, fuzz, f"one flipped bit at each of {len(places)} places"):
-        for at in places:
-            fuzz.try_one(partial(flip_bit_at, at), 3 * at)
 
 
 def test_recovering_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -65,14 +63,7 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
         return written + len(notes.read())
 
 
-@pytest.mark.parametrize(
-    ("codec", "kills"),
-    [
-        ("h264", 8),
-        pytest.param("h264", 50, marks=LONG),
-        pytest.param("av1", 20, marks=LONG),
-    ],
-)
+@pytest.mark.parametrize(("codec", "kills"), [("h264", 8), pytest.param("av1", 20, marks=LONG)])
 def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(5)
     info, frames, _ = make_episode(num_frames=2 * MOST_FRAMES, fps=FPS)
@@ -114,24 +105,3 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
         )
     assert written_total > kills * FPS  # most were killed in the middle, not before the beginning
     assert kept_nothing < kills / 2
-
-
-def test_recover_exits_with_1_when_it_keeps_nothing(tmp_path: Path) -> None:
-    info, frames, _ = make_episode(num_frames=10)
-    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
-        for frame in frames:
-            writer.write(frame)
-    part = tmp_path / "a.mcap.part"
-    part.write_bytes(part.read_bytes()[:3000])
-    done = subprocess.run(
-        [sys.executable, "-c", "from demorec.cli import main; main()", "recover", str(part)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert "Nothing can be recovered" in done.stderr
-    assert not (tmp_path / "a.mcap").exists()
-    assert part.exists()

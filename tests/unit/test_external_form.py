@@ -79,7 +79,7 @@ BAD: dict[str, tuple[Callable[[EpisodeWriter, SampledFrame], object], str]] = {
     "nan": (_sample("action", np.array([0, np.nan, 0]), 10**18 * 2), "is nan in its element 'elbow.pos'"),
     "unknown feature": (_sample("acton", np.zeros(3)), "unknown feature 'acton'.*'action'"),
     "missing feature": (_frame(samples={}), "Frame 1 lacks the feature observation.state, action, observation.force"),
-    "same time": (_frame(time_ns=10**18), "stamps must not go backwards"),
+    "earlier": (_frame(time_ns=10**18), "stamps must not go backwards"),
     "negative time": (_frame(time_ns=-1), "allowed are 0 to"),
     "float time": (_frame(time_ns=1.5), "must be a whole number of nanoseconds"),
     "feature goes back": (_sample("action", np.zeros(3), 7), "The feature 'action' of frame 1 has the stamp 7 ns"),

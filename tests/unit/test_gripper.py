@@ -11,6 +11,7 @@ from demorec.core.plain import from_json, from_plain, to_json, to_plain
 from demorec.core.tables import ROBOTS
 from demorec.robots.robot import RobotSpec
 
+
 @pytest.mark.parametrize(("name", "has"), [("panda", {"max_width": 0.08}), ("so101", {"open_width": 0.034})])
 def test_each_kind_of_gripper_is_read_as_it_was_written(name: str, has: dict[str, float]) -> None:
     robot = ROBOTS.load(name)

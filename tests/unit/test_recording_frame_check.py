@@ -43,14 +43,6 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: observed(f, joint_position=f.observation.joint_position[:7]),
         r"joint_position of shape \(7,\) in its observation, it must be of shape \(9,\)",
     ),
-    "a column": (
-        lambda f: observed(f, joint_effort=f.observation.joint_effort[:, None]),
-        r"joint_effort of shape \(9, 1\)",
-    ),
-    "a target with fingers": (
-        lambda f: moved(f, joint_target=np.zeros(9)),
-        r"joint_target of shape \(9,\) in its command, it must be of shape \(7,\)",
-    ),
     "a sample of another length": (
         lambda f: replace(f, joint_samples=(replace(f.joint_samples[0], joint_velocity=np.zeros(3)),)),
         r"joint_velocity of shape \(3,\) in its joint sample",
@@ -68,21 +60,9 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: observed(f, sensed={}),
         r"no wrench in its observation, it must be of shape \(6,\)",
     ),
-    "a force without a torque": (
-        lambda f: observed(f, sensed={"wrench": np.zeros(3)}),
-        r"a wrench of shape \(3,\)",
-    ),
     "a NaN in the wrench": (
         lambda f: observed(f, sensed={**f.observation.sensed, "wrench": with_nan(f.observation.sensed["wrench"])}),
         "wrench in its observation that is not finite",
-    ),
-    "a NaN in a joint": (
-        lambda f: observed(f, joint_velocity=with_nan(f.observation.joint_velocity)),
-        "joint_velocity in its observation that is not finite",
-    ),
-    "an infinite opening": (
-        lambda f: observed(f, gripper_width=float("inf")),
-        "gripper_width in its observation that is not finite",
     ),
     "a NaN in a pose": (
         lambda f: observed(f, base_from_tcp=pose_of_nan(f.observation.base_from_tcp)),
