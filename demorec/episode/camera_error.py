@@ -44,7 +44,7 @@ def stated_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
         behaviour: Of the episode; from a file, so that anything may stand there.
 
     Returns:
-        None where they do not tell it: older recordings lack the quaternion; or where they contradict each other.
+        None where they do not state it, or contradict each other.
     """
     words = [f"calibration_{name}_{word}" for word in ("x", "y", "z", "qx", "qy", "qz", "angle")]
     numbers = np.array([behaviour.get(word, math.nan) for word in words])

@@ -76,7 +76,7 @@ def dataset_of(name: str, folder: Path, source: Path) -> Path:
     (table_path,) = (folder / "demorec" / "episodes").rglob("*.parquet")
     table = pq.read_table(table_path)
     (described,) = table.column("episode_info").to_pylist()
-    assert json.loads(described)["task"] == name  # the export kept the stranger's word
+    assert json.loads(described)["simulation"]["task"] == name  # the export kept the stranger's word
     assert isinstance(table, pa.Table)
     return folder
 

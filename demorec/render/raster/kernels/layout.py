@@ -33,8 +33,8 @@ SMOOTH, TEXTURED = 1, 2  # bits of FACE_FLAGS
 FACE_RED, FACE_GREEN, FACE_BLUE, FACE_SPECULAR = 0, 1, 2, 3
 
 # Columns of a record: what a triangle needs while it is shaded. Each quantity q is a plane over the image, as
-# value at the origin, step in x, step in y; all but the first are divided by depth, so that they are planes at all.
-INVERSE_DEPTH_PLANE = 0
+# value at the origin, step in x, step in y; all but the first, the inverse depth, are divided by depth, so that they
+# are planes at all.
 SHADOW_X_PLANE, SHADOW_Y_PLANE, SHADOW_Z_PLANE = 3, 6, 9
 TO_LIGHT_PLANE, UPWARD_PLANE, HALFWAY_PLANE = 12, 15, 18
 TEX_U_PLANE, TEX_V_PLANE = 21, 24
