@@ -1,7 +1,7 @@
-"""What is known of an episode before its first frame: one description, of which not all must be there.
+"""The description of an episode before its first frame; unknown parts are absent.
 
-A simulated episode is an episode that also has a `Simulation`: a scene, a seed, the robot's model. Of any other nothing
-is known but what came: vectors and images, each with the stamp of its own clock. What is not known is absent.
+A simulated episode also has a `Simulation`: a scene, a seed, the robot's model. Any other has vectors and images, each
+with the timestamp of its clock.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Feature:
 
     Attributes:
         name: As datasets call it: "observation.state", "action", "observation.force".
-        dtype: Of its numbers, kept as it came.
+        dtype: Type of its numbers, as recorded.
         names: Of its elements; there are D.
         units: Of its elements ("rad", "deg", "m"), or none where they are unknown.
         joints: For each element the joint of the URDF of which it is the position ("" for none); empty where none is.
@@ -53,7 +53,7 @@ class Feature:
     calibration: tuple[tuple[float, float], ...] = ()
 
     def in_si(self, values: NDArray[Any]) -> Array:
-        """(..., D) float64 of values (..., D): positions in rad and m, the rest as it is."""
+        """(..., D) float64 of values (..., D): positions in rad and m, other values unchanged."""
         degree = (math.radians(1.0), 0.0)
         units = self.units or ("",) * len(self.names)
         scale = self.calibration or [degree if unit in ("deg", "degree") else (1.0, 0.0) for unit in units]
@@ -63,17 +63,17 @@ class Feature:
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A camera, as far as it is known.
+    """A camera; unknown parts are absent.
 
     Attributes:
         name: Unique; also its topic.
         width, height: Pixels.
-        kept: The codec of its images where they come encoded and stay as they are; "" where they come as pixels, which
-            the recorder codes. Of a depth camera ROS's name for its distances, whose every bit stays: "16UC1" (whole
-            millimetres, 0 where nothing was measured) or "32FC1" (metres, 0 or not finite where nothing was).
+        kept: Codec of images that are encoded already and pass through; "" for pixels, which the recorder encodes. For
+            a depth camera ROS's name for its distances, recorded bit-exact: "16UC1" (whole millimetres, 0 where nothing
+            was measured) or "32FC1" (metres, 0 or not finite where nothing was measured).
         intrinsics: K row by row, 9 numbers in pixels; None when unknown.
         distortion: Of the plumb bob model (k1, k2, p1, p2, k3); empty for none.
-        mount: The link of the URDF that carries it, "world" for one that stands in a scene; "" when unknown.
+        mount: The link of the URDF that carries it, "world" for a fixed camera of a scene; "" when unknown.
         mount_from_camera: Pose in the frame of that link, OpenCV axes; None when unknown.
         source: Where its images came from, in words.
     """
@@ -98,7 +98,7 @@ class Camera:
 class SourceFile:
     """A file that an episode was read from: its name, and the SHA-256 (hex) of its bytes.
 
-    The name is without folders, but for the files of a dataset: their places in there.
+    The name has no folders; for files of a dataset it is the path within the dataset.
     """
 
     name: str
@@ -107,12 +107,12 @@ class SourceFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """How an external episode came here.
+    """The origin of an external episode.
 
     Attributes:
-        kind: By the `Recorder` in somebody's program, by `demorec import`, or read in place from a dataset.
-        files: What was imported.
-        mapping_digest: Of the mapping by which it was imported.
+        kind: The `Recorder` in a user's program, `demorec import`, or a dataset that is read in place.
+        files: Imported files.
+        mapping_digest: Digest of the mapping used by the import.
     """
 
     kind: Literal["recorder", "import", "dataset"] = "recorder"
@@ -122,7 +122,7 @@ class Origin:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """What is known of an episode that demorec simulated, and of no other.
+    """The part of a description that only simulated episodes have.
 
     Attributes:
         root_seed: Of the run.
@@ -148,23 +148,23 @@ class Simulation:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInfo:
-    """What is known before the first frame; recorded as metadata. Holds no clock, host name or path.
+    """The description of an episode, recorded as metadata. Holds no clock, host name or path.
 
     Attributes:
         episode_index: Which episode of the run.
         attempt: Which attempt at it.
-        instruction: What the robot is asked to do, in words; LeRobot's task text.
-        robot_name: What the robot is called.
+        instruction: The task in words; LeRobot's task text.
+        robot_name: Name of the robot.
         urdf: Its description as text, "" when unknown; that of a simulated robot is in the scene's models.
-        fps: Nominal frames per second; the frames' own stamps say what they were.
+        fps: Nominal frames per second; the timestamps of the frames are exact.
         features: Vectors that every frame has; a simulated episode has the fixed ones of `Columns` instead.
         cameras: None to many; those of a simulation are its scene's.
         origin: How the episode came here; of a simulated one "" for a generated one, "replay of DIGEST", "render of
             DIGEST" for a derived one.
-        versions: package -> version, of what wrote it; for a simulated one of what decides the bits (demorec, pybullet,
-            numpy, numba, av), with the sources of modules of one's own.
-        simulation: Scene, seed, task; None of an episode that demorec did not simulate. Its values can be read as
-            those of the episode (`info.scene`); that raises NotSimulatedError where there are none.
+        versions: package -> version of the packages that wrote it; for a simulated one those that determine the bits
+            (demorec, pybullet, numpy, numba, av), and digests of the user's own modules.
+        simulation: Scene, seed, task; None for an episode that demorec did not simulate. Its values can be read as
+            those of the episode (`info.scene`), which raises NotSimulatedError for other episodes.
     """
 
     episode_index: int

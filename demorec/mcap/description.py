@@ -1,7 +1,7 @@
-"""URDF text of the robot and of each body that needs no other file to be drawn: meshes as their bounding boxes.
+"""URDF text of the robot and of each body that needs no other file to be drawn, with a bounding box for each mesh.
 
-Rerun draws the robot of a bare recording from its URDF, but gives up on the whole robot when one mesh file is not
-where the URDF says. So the recorded description has no meshes, but boxes, cylinders and spheres.
+Rerun draws the robot of a bare recording from its URDF, but draws nothing of it if one mesh file is missing. So the
+recorded description has boxes, cylinders and spheres only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from demorec.robots.obj import read_obj
 from demorec.robots.urdf import UrdfShape, parse_xml, read_links
 
 _MIN_SIDE_M = 1e-4
-"""Of the box around a mesh that is flat: the shortest length that is written."""
+"""Shortest side of the box around a flat mesh."""
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 _KINDS: dict[str, Literal["box", "sphere", "cylinder"]] = {
     "box": "box",
@@ -32,7 +32,7 @@ _KINDS: dict[str, Literal["box", "sphere", "cylinder"]] = {
     "cylinder": "cylinder",
     "capsule": "cylinder",
 }
-"""Shape -> the primitive that it is, but for a capsule's ends."""
+"""Shape -> primitive; the ends of a capsule are added as spheres."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +62,11 @@ def robot_description(urdf: str, scale: float) -> str:
 
 
 def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
-    """A URDF that needs no other file, as `robot_description`, of the text of one whose meshes lie below `folder`.
+    """As `robot_description`, from the text of a URDF with meshes below `folder`.
 
     Raises:
-        SceneError: One of its meshes cannot be read.
-        ValueError: The text is no URDF.
+        SceneError: A mesh cannot be read.
+        ValueError: The text is not a URDF.
     """
     source = parse_xml(text)
     robot = ET.Element("robot", name=source.get("name", "robot"))

@@ -1,6 +1,6 @@
-"""The records of an episode that are not messages: what is known before the first frame, and how it ended.
+"""The metadata records of a recording: the description before the first frame, and the outcome.
 
-MCAP protects messages with checksums, but not metadata records; each of ours carries its own.
+MCAP protects messages with checksums, but not metadata records, so each record here has a checksum among its values.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from demorec.mcap.video import VideoSettings
 EPISODE = "demorec.episode"
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
-"""Of a recording that a crash cut off."""
+"""Record of a recording that a crash cut off."""
 _CHECKSUM = "crc32"
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraStreams:
-    """What was recorded of one camera.
+    """The recorded streams of one camera.
 
     Attributes:
         video: Coding of the colour images.
@@ -40,9 +40,9 @@ class CameraStreams:
 
 
 def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
-    """The record that makes an MCAP file a recording; the first few values are for people.
+    """Values of the record that makes an MCAP file a recording; the first few are for people.
 
-    A URDF is not in it but a message of its own; its SHA-256 is.
+    The URDF is a message; the record has its SHA-256.
     """
     about = {"instruction": info.instruction, "robot": info.robot_name, "episode_index": str(info.episode_index)}
     if info.simulation is not None:
@@ -64,16 +64,16 @@ def urdf_sha256(urdf: str) -> str:
 
 
 def outcome_metadata(outcome: Outcome) -> dict[str, str]:
-    """The record that ends a complete recording."""
+    """Values of the record that ends a complete recording."""
     success = "unknown" if outcome.success is None else str(outcome.success).lower()
     return sealed({"success": success, "outcome": to_json(outcome)})
 
 
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams], str]:
-    """Inverse of `episode_metadata`, with the SHA-256 of the URDF, which `info` lacks.
+    """Inverse of `episode_metadata`; third the SHA-256 of the URDF, which `info` lacks.
 
     Raises:
-        RecordingError: It is damaged, or of another format version.
+        RecordingError: The record is damaged, or has another format version.
     """
     check_seal(EPISODE, metadata)
     version = metadata.get("format_version", "")
@@ -111,7 +111,7 @@ def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> N
 
 
 def read_outcome_metadata(metadata: Mapping[str, str], info: EpisodeInfo) -> Outcome:
-    """Inverse of `outcome_metadata`, of an episode; RecordingError on damage."""
+    """Inverse of `outcome_metadata`. Raises RecordingError if the record is damaged."""
     check_seal(OUTCOME, metadata)
     try:
         outcome = from_description(metadata["outcome"], Outcome)
@@ -125,12 +125,12 @@ def read_outcome_metadata(metadata: Mapping[str, str], info: EpisodeInfo) -> Out
 
 
 def sealed(metadata: dict[str, str]) -> dict[str, str]:
-    """The metadata with their checksum, which `check_seal` looks at."""
+    """The metadata with their checksum, which `check_seal` verifies."""
     return {**metadata, _CHECKSUM: _checksum(metadata)}
 
 
 def check_seal(name: str, metadata: Mapping[str, str]) -> None:
-    """Raise RecordingError unless the metadata are as they were written."""
+    """Raise RecordingError unless the checksum matches the other values."""
     if metadata.get(_CHECKSUM) != _checksum(metadata):
         raise RecordingError(f"The recording is damaged: the checksum of its metadata {name} does not match")
 
