@@ -1,7 +1,7 @@
 """CPU time of an image by each renderer, on frames of a real episode, all measured in one interleaved run.
 
     python benchmarks/render.py                        # a quick look
-    python benchmarks/render.py --rounds 11 --memory --rate-seconds 10
+    python benchmarks/render.py --rounds 11
     python benchmarks/render.py --robot so101 --task stack --sizes 224x224
 
 Process CPU time, since machines are shared; medians over rounds; the ratio is against TinyRenderer in the same run.
@@ -10,17 +10,10 @@ Process CPU time, since machines are shared; medians over rounds; the ratio is a
 from __future__ import annotations
 
 import argparse
-import gc
-import multiprocessing
-import os
 import statistics
-import sys
 import time
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
-
-import psutil
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import RenderError
@@ -123,60 +116,7 @@ def table(episode: Episode, renderers: list[str], sizes: list[tuple[int, int]], 
                     print(f"  {variant.label:50s} {middle:8.2f} {ratio}", flush=True)
 
 
-def draw_for(renderer_name: str, size: tuple[int, int], seconds: float, ready: Any, counts: Any) -> None:
-    """A worker: images drawn within the time, both cameras."""
-    episode = plan(width=size[0], height=size[1])
-    with make_world(episode.info) as world, RENDERERS.load(renderer_name)() as renderer:
-        states = run_episode(world, episode)
-        painter = painter_for(renderer, world, episode.info.scene.cameras, antialias=True, everything=False)
-        painter.images()
-        ready.wait()
-        count, end = 0, time.perf_counter() + seconds
-        while time.perf_counter() < end:
-            state = states[(count // 2) % len(states)]
-            world.set_state(joint_position=state.joint_position, object_poses=state.object_poses)
-            count += len(painter.images())
-        counts.put(count / seconds)
-
-
-def rate(renderers: list[str], sizes: list[tuple[int, int]], seconds: float, workers: int) -> None:
-    """Images a second with one process a core (wall time: only meaningful on a quiet machine)."""
-    context = multiprocessing.get_context("spawn")
-    for size in sizes:
-        for name in renderers:
-            ready, counts = context.Barrier(workers), context.Queue()
-            processes = [
-                context.Process(target=draw_for, args=(name, size, seconds, ready, counts)) for _ in range(workers)
-            ]
-            for process in processes:
-                process.start()
-            total = sum(counts.get(timeout=300) for _ in processes)
-            for process in processes:
-                process.join()
-            print(f"  {size[0]}x{size[1]} {name:8s} {total:8.0f} images a second, {workers} processes", flush=True)
-
-
-def memory(images: int, resets: int) -> bool:
-    """Whether the process stays as large as it was over many images and scenes, after a first round of them."""
-    process = psutil.Process()
-    sizes = []
-    episode = plan(width=224, height=224)
-    with make_world(episode.info) as world, RENDERERS.load("raster")() as renderer:
-        states = run_episode(world, episode)
-        for number in range(resets):
-            world.reset(plan(number, width=224, height=224).info.scene)
-            painter = painter_for(renderer, world, episode.info.scene.cameras, antialias=True, everything=True)
-            for step in range(images // resets // len(episode.info.scene.cameras)):
-                world.set_state(joint_position=states[(number + step) % len(states)].joint_position)
-                painter.images()
-            gc.collect()
-            sizes.append(process.memory_info().rss / 2**20)
-    settled, last = sizes[resets // 5], sizes[-1]
-    print(f"\nMemory over {images} images, {resets} scenes: {settled:.0f} MiB after a fifth, {last:.0f} after all")
-    return last - settled < 0.05 * settled
-
-
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--renderers", nargs="+", default=list(RENDERERS.names()), choices=RENDERERS.names())
     parser.add_argument("--robot", default="panda", help="whose episode the table measures")
@@ -184,31 +124,19 @@ def main() -> int:
     parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=16, help="frames a round; a quarter of them for slow renderers")
-    parser.add_argument("--rate-seconds", type=float, default=0.0, help="measure images a second for so long")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--memory", action="store_true", help="2,000 images and 50 scenes; fails when memory grows")
     options = parser.parse_args()
     sizes = [(int(w), int(h)) for w, _, h in (size.partition("x") for size in options.sizes)]
     renderers = []
     for name in options.renderers:
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(RENDERERS.load(name)())
-            except RenderError as error:
-                print(f"{name} is left out: {error}")
-                continue
+        try:
+            RENDERERS.load(name)().close()
+        except RenderError as error:
+            print(f"{name} is left out: {error}")
+            continue
         renderers.append(name)
-    if options.rounds > 0:
-        episode = plan(width=96, height=96, robot=options.robot, task=options.task)
-        table(episode, renderers, sizes, options.rounds, options.frames)
-    if options.rate_seconds > 0:
-        print(f"\nImages a second, both cameras, {options.rate_seconds:g} s each")
-        rate(renderers, sizes, options.rate_seconds, options.workers)
-    if options.memory and not memory(2000, 50):
-        print("Memory grew.", file=sys.stderr)
-        return 1
-    return 0
+    episode = plan(width=96, height=96, robot=options.robot, task=options.task)
+    table(episode, renderers, sizes, options.rounds, options.frames)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
