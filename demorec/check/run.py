@@ -1,27 +1,23 @@
-"""Does a run's folder hold what its run.json says, each episode once, and do they cover what was randomised.
+"""Checks of a run's folder against its run.json, and the findings of an import.
 
-Of an imported run also what the import found in its bags, which need not be there any more: the report that
-`demorec import` keeps in import.json, judged again.
+`demorec import` keeps its findings in import.json: the bags themselves may be gone.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.check.base import SCENE, Form, Found, Lacking, Measurement, NotMeasured, check, run_check, worst
-from demorec.check.coverage import MIN_EPISODES, motion_vector, pieces, start_vector, twins, worst_gap
-from demorec.check.dataset import Dataset
+from demorec.check.base import Form, Found, Measurement, counted, run_check
+from demorec.check.evidence import motion_vector
 from demorec.core.errors import ConfigError, RecordingError, describe_error, resource_error
 from demorec.core.files import open_regular, read_json_limited
 from demorec.core.geometry import Array
 from demorec.core.plain import digest
-from demorec.datasets.lerobot.files import read_json
-from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_recording
@@ -31,11 +27,7 @@ if TYPE_CHECKING:
     from demorec.sources.import_file import ImportFile
 
 _MAX_JSON_BYTES = 2 << 30
-_TIMES = frozenset(
-    ("clock_offset", "clock_jump", "clock_drift", "unstamped", "drops", "gap", "slow", "fps", "jitter", "order")
-) | {"duplicates", "late_start", "early_end", "cut_off", "repeats", "skips"}
-_IMAGES = frozenset(("frozen", "same_pictures", "swapped", "size", "format", "keyframe", "frame_id"))
-_MOST_LISTED = 5
+_MAX_LISTED = 5
 _LINE = {"episode_index": int, "attempt": int, "seed": int, "success": bool, "file": str, "sha256": str}
 """What the line of an attempt says, as far as it is checked."""
 
@@ -133,14 +125,13 @@ class CheckedRun:
         """Whether every episode starts alike because that was asked for."""
         return self.form == "run" and bool(self.run.get("config", {}).get("fixed"))
 
-    def courses(self) -> tuple[list[str], list[Array], list[Array]]:
-        """Files of the successes, their motions and their starts, as far as these are known."""
+    def courses(self) -> tuple[list[str], list[Array]]:
+        """Names of the recordings in episodes/ that can be read, and their motions."""
         if self.form == "external run":
             motions = dict(self._external_motions())
-            return list(motions), list(motions.values()), []
-        kept = {file: attempt for file, attempt in self.attempts.items() if file.startswith("episodes/")}
-        starts = [start_vector(info.scene) for info, _, _ in kept.values()]
-        return list(kept), [motion for _, _, motion in kept.values()], starts
+        else:
+            motions = {file: motion for file, (_, _, motion) in self.attempts.items() if file.startswith("episodes/")}
+        return list(motions), list(motions.values())
 
     def _external_motions(self) -> Iterator[tuple[str, Array]]:
         """Of the recordings that can be read and have a state."""
@@ -151,13 +142,6 @@ class CheckedRun:
                         yield path.name, motion_vector(features[STATE])
             except (RecordingError, OSError):
                 continue  # check `opens` or `readable` of that recording says so
-
-    @property
-    def successes(self) -> list[EpisodeInfo]:
-        """Infos of the recordings in episodes/ that were asked for last (others may be there from a larger request)."""
-        asked = self.run["num_episodes"]
-        infos = [info for file, (info, _, _) in self.attempts.items() if file.startswith("episodes/")]
-        return [info for info in infos if info.episode_index < asked]
 
 
 @run_check(
@@ -180,7 +164,7 @@ def run_files(run: CheckedRun) -> Measurement:
             if (lack := resource_error(error, run.path / file)) is not None:
                 raise lack from error
             wrong.append(f"{file} cannot be read ({error.strerror})")
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(there)} recordings")
+    return counted(wrong, f"{len(there)} recordings")
 
 
 @run_check(
@@ -189,7 +173,7 @@ def run_files(run: CheckedRun) -> Measurement:
 def run_agrees(run: CheckedRun) -> Measurement:
     """Number, attempt, seed and config, value by value, of each recording are those of its line and of the run."""
     wrong = [text for line in run.lines for text in _contradictions(run, line)]
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or f"{len(run.lines)} lines")
+    return counted(wrong, f"{len(run.lines)} lines")
 
 
 def _contradictions(run: CheckedRun, line: dict[str, Any]) -> Iterator[str]:
@@ -230,84 +214,23 @@ def _config_off(config: Any, info: EpisodeInfo) -> Iterator[str]:
         yield "config_digest"
 
 
-@run_check(
-    measures="episodes that have the start or the motion of another, or a piece of it",
-    on=("run", "external run", "dataset"),
-    needs="two episodes",
-)  # fmt: skip
-def duplicates(subject: CheckedRun | Dataset) -> Found:
-    """Every episode is there once: no two start alike (within a tenth of a millimetre) or move alike; and in datasets
-    none has a piece of another one, or twice of itself, bit for bit."""
-    names, motions, starts = subject.courses()
-    if len(names) < 2:
-        return Lacking(need="two episodes")
-    if subject.has_equal_starts:
-        return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
-    found = [twins(starts, names, "starts")] if starts else []
-    found += [pieces(subject.numbers, names)] if isinstance(subject, Dataset) else []
-    return worst(*found, twins(motions, names, "motions"))
+import_check = partial(run_check, on=("external run",), needs="a run that was imported", fail=math.inf)
 
 
-@run_check(
-    measures="largest gap in the range of a randomised quantity, share",
-    warn=0.35,
-    fail=0.6,
-    on=("run", "dataset"),
-    needs=f"{MIN_EPISODES} episodes, each with {SCENE}",
-)  # fmt: skip
-def coverage(subject: CheckedRun | Dataset) -> Found:
-    """Start places, yaws, sizes and goals are spread over their ranges (judged from 50 episodes on)."""
-    return worst_gap(subject.successes)
-
-
-@run_check(
-    measures="episodes that the run's dataset lacks or has too many",
-)
-def run_dataset(run: CheckedRun) -> Measurement | None:
-    """The dataset that was made from the run has an episode for each success of those asked for last."""
-    path = run.path / "dataset" / INFO_PATH
-    if not path.is_file():
+@import_check(measures="findings about clocks, losses, images and numbers in the bags that were imported")
+def import_findings(run: CheckedRun) -> Found:
+    """List what the import found in its bags."""
+    if (found := run.import_file) is None:
         return None
-    try:
-        episodes = int(read_json(path)["total_episodes"])
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ConfigError(f"info.json of the dataset cannot be used ({describe_error(error)}): {path}") from error
-    successes = sum(1 for line in run.lines if line["success"] and line["episode_index"] < run.run["num_episodes"])
-    return Measurement(value=abs(episodes - successes), detail=f"{episodes} in the dataset, {successes} successes")
-
-
-import_check = partial(check, on=("external run",), needs="a run that was imported", fail=math.inf)
+    words = [
+        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
+        for bag in found.bags
+        for finding in bag.odd
+    ]
+    return Measurement(value=len(words), detail="; ".join(words[:_MAX_LISTED]))
 
 
 @import_check(
-    group="time",
-    measures="findings about times in the bags that were imported: clocks, losses, gaps, repeats, jitter, order",
-)
-def import_times(run: CheckedRun) -> Found:
-    """The streams of the bags were whole, in order and on one clock."""
-    return _found(run, lambda kind: kind in _TIMES)
-
-
-@import_check(
-    group="images",
-    measures="findings about cameras in the bags that were imported: frozen, swapped, of several sizes",
-)
-def import_images(run: CheckedRun) -> Found:
-    """Each camera showed its own images, of one size and kind."""
-    return _found(run, lambda kind: kind in _IMAGES)
-
-
-@import_check(
-    group="physics",
-    measures="findings about numbers in the bags that were imported: NaN, stuck sensors, spikes, units",
-)
-def import_numbers(run: CheckedRun) -> Found:
-    """The numbers of the bags were such as robots have."""
-    return _found(run, lambda kind: kind not in _TIMES | _IMAGES)
-
-
-@import_check(
-    group="run",
     measures="episodes that an import dropped, since something was missing or too old, and bags that it skipped",
 )
 def import_dropped(run: CheckedRun) -> Found:
@@ -316,16 +239,4 @@ def import_dropped(run: CheckedRun) -> Found:
         return None
     rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
     dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
-    return Measurement(value=len(dropped), detail="; ".join(dropped[:_MOST_LISTED]))
-
-
-def _found(run: CheckedRun, is_mine: Callable[[str], bool]) -> Found:
-    if (found := run.import_file) is None:
-        return None
-    words = [
-        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
-        for bag in found.bags
-        for finding in bag.odd
-        if is_mine(finding.kind)
-    ]
-    return Measurement(value=len(words), detail="; ".join(words[:_MOST_LISTED]))
+    return Measurement(value=len(dropped), detail="; ".join(dropped[:_MAX_LISTED]))

@@ -40,7 +40,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
     workers = useful_workers(subjects, images=False, cores=available_cores())
-    options = CheckOptions(images=False, workers=workers, allowed=result.run.config.modules)
+    options = CheckOptions(images=False, workers=workers)
     warnings = 0
     failures: list[str] = []
     failed_attempts = 0

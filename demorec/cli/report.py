@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow
 from demorec.cli.shared.output import counted, say, size_in_words
 from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
@@ -75,7 +75,7 @@ class Report:
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
-        checks = CheckOptions(images=self.images, allowed=allowed_modules(self.allow)) if self.checks else None
+        checks = CheckOptions(images=self.images) if self.checks else None
         with (
             reading([self.path], self.mapping) as (path,),
             ProgressBar("reading", unit="item") as bar,
