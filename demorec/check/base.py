@@ -24,7 +24,7 @@ Form = Literal["simulated", "external", "run", "external run", "dataset"]
 Group = Literal["file", "time", "physics", "alignment", "images", "run", "dataset"]
 
 _BLOCKED = "it needs what is damaged"
-_NOT_APPLICABLE = "not applicable: it needs "
+NOTHING = "nothing to measure"
 
 SCENE = "a simulated scene"
 ANY_EPISODE: tuple[Form, ...] = ("simulated", "external", "dataset")
@@ -47,28 +47,17 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class NotMeasured:
-    """That there is something to measure, but that it cannot be judged: neither good nor bad.
+    """That a check cannot judge its subject.
 
     Attributes:
-        why: For people: "too little moves before the camera".
+        why: For people: "too few frames", or what is missing.
     """
 
     why: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lacking:
-    """That the subject lacks what the check needs.
-
-    Attributes:
-        need: "a URDF", in the words of `Check.needs`.
-    """
-
-    need: str
-
-
-Found = Measurement | NotMeasured | Lacking | None
-"""What a check returns; None where the thing does not exist (no cameras, no depth)."""
+Found = Measurement | NotMeasured | None
+"""The result of a check; None where the thing does not exist (no cameras, no depth)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,17 +115,11 @@ class Check:
             odd = Measurement(value=math.nan, detail="the data are such that this check cannot be computed on them")
             return self._result("fail", odd)
         if found is None:
-            return self.skipped("nothing to measure")
-        if isinstance(found, Lacking):
-            return self.not_applicable(found.need)
+            return self.skipped(NOTHING)
         if isinstance(found, NotMeasured):
-            return self.skipped(f"not measured: {found.why}")
+            return self.skipped(found.why)
         level: Level = "pass" if found.value <= self.warn else "warn" if found.value <= self.fail else "fail"
         return self._result(level, found)
-
-    def not_applicable(self, need: str = "") -> Result:
-        """The result of a check that the subject lacks something for: by default all that it `needs`."""
-        return self.skipped(f"{_NOT_APPLICABLE}{need or self.needs}")
 
     def blocked(self) -> Result:
         """The result of a check that needs what another one has found to be damaged."""
@@ -191,12 +174,6 @@ class Result:
         """Whether nothing was measured since what it needs is damaged, which another check tells."""
         return self.level == "skip" and self.detail == _BLOCKED
 
-    @property
-    def lacks(self) -> str:
-        """What the subject lacks for it, "" where it could be measured."""
-        is_lacking = self.level == "skip" and self.detail.startswith(_NOT_APPLICABLE)
-        return self.detail.removeprefix(_NOT_APPLICABLE) if is_lacking else ""
-
 
 def check(
     *,
@@ -250,10 +227,8 @@ def worst(*found: Found) -> Found:
     """
     known = [measurement for measurement in found if isinstance(measurement, Measurement)]
     reasons = list(dict.fromkeys(row.why for row in found if isinstance(row, NotMeasured)))
-    if not known and not reasons:
-        return next((row for row in found if isinstance(row, Lacking)), None)
     if not known:
-        return NotMeasured(why="; ".join(reasons))
+        return NotMeasured(why="; ".join(reasons)) if reasons else None
     largest = max(known, key=lambda m: math.inf if math.isnan(m.value) else m.value)
     if not reasons:
         return largest

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 
 from demorec.check.base import Form
+from demorec.check.episode import CheckedEpisode
 from demorec.check.evidence import Motions, motion_vector, motions_of_dataset
 from demorec.check.films import CameraFilms, films_of_dataset
 from demorec.core.errors import ConfigError, ExportError, describe_error
@@ -191,3 +192,7 @@ class Dataset:
         names = self.info.features[ACTION].names if ACTION in self.info.features else None
         kinds: tuple[ActionKind, ...] = ("joint", "joint_increment", "ee", "ee_delta")
         return next((kind for kind in kinds if action_names(info.robot, kind) == names), None)
+
+
+Episodes = CheckedEpisode | Dataset
+"""One episode or several, with motions and images, whoever recorded them."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from demorec.check.base import Lacking, Measurement, counted, dataset_check
+from demorec.check.base import Measurement, NotMeasured, counted, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError
 from demorec.datasets.episode import SUCCESS
@@ -20,10 +20,8 @@ from demorec.datasets.lerobot.files import open_table, read_json, read_table, ta
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
-    EPISODES_PATH,
     TASKS_PATH,
     DatasetFeature,
-    FilePosition,
 )
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.videos import PacketReader, opened_video
@@ -38,14 +36,14 @@ _RATE_TOLERANCE = 0.01
 
 @dataset_check(measures="tables that cannot be read")
 def dataset_readable(dataset: Dataset) -> Measurement:
-    """info.json, the tables and every row can be read."""
+    """Read info.json, the tables and every row."""
     frames = sum(len(rows["index"]) for rows in dataset.rows)
     return Measurement(value=0, detail=f"{len(dataset.rows)} episodes, {frames} frames, {len(dataset.tasks)} tasks")
 
 
-@dataset_check(measures="counters, indices and timestamps that are not as they must be")
+@dataset_check(measures="wrong counters, indices and timestamps")
 def dataset_counts(dataset: Dataset) -> Measurement:
-    """Totals agree with the tables; indices count up without a gap; timestamps are frame_index / fps."""
+    """Compare totals with the tables; indices count up without a gap, timestamps are frame_index / fps."""
     info, wrong = dataset.info, []
     totals = {
         "total_episodes": (info.total_episodes, len(dataset.places)),
@@ -106,37 +104,21 @@ def _stray_rows(dataset: Dataset) -> Iterator[str]:
 
 
 @dataset_check(
-    measures="files of images that no episode has, and of episodes that are said to lie elsewhere",
+    measures="video files without an episode",
     fail=math.inf,
 )
 def dataset_strays(dataset: Dataset) -> Measurement | None:
-    """Every mp4 file is of a camera and an episode: catches what merges, deleted episodes and renamed cameras leave.
-
-    Where the table of an episode lies, LeRobot takes from the episode's row when it merges or deletes.
-    """
+    """Find mp4 files without an episode, as merges, deleted episodes and renamed cameras leave them."""
     if dataset.info.is_old:
         return None
     used = {path for place in dataset.places for path, _ in place.videos.values()}
     found = sorted(set((dataset.path / "videos").rglob("*.mp4")) - used)
-    strays = [*(path.relative_to(dataset.path).as_posix() for path in found), *_said_elsewhere(dataset)]
-    return Measurement(value=len(strays), detail=", ".join(strays[:3]))
-
-
-def _said_elsewhere(dataset: Dataset) -> Iterator[str]:
-    names = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
-    for file in tables_in(dataset.path, "meta/episodes"):
-        if set(names) <= set(open_table(file).schema_arrow.names):
-            there = file.relative_to(dataset.path).as_posix()
-            for chunk, number in {tuple(row.values()) for row in read_table(file, names).to_pylist()}:
-                told = isinstance(chunk, int) and isinstance(number, int)
-                path = FilePosition(chunk=chunk, file=number).path(EPISODES_PATH) if told else "no file"
-                if path != there:
-                    yield f"{there} says of its episodes that they lie in {path}"
+    return counted([path.relative_to(dataset.path).as_posix() for path in found])
 
 
 @dataset_check(measures="episodes without a coded image for every frame")
 def dataset_videos(dataset: Dataset) -> Measurement | None:
-    """Every episode has its images in every camera's file, one after the other.
+    """Find the encoded images of every episode in every camera's file, one after the other.
 
     In front of an episode there may be images from the keyframe on that its first one needs.
     """
@@ -160,10 +142,10 @@ def dataset_videos(dataset: Dataset) -> Measurement | None:
 
 
 @dataset_check(measures="episodes on which dataset and sidecar disagree", needs="the sidecar that demorec keeps")
-def dataset_sidecar(dataset: Dataset) -> Measurement | Lacking:
+def dataset_sidecar(dataset: Dataset) -> Measurement | NotMeasured:
     """Compare instruction, outcome and content digest of each episode with the sidecar."""
     if not dataset.sidecar:
-        return Lacking(need="the sidecar that demorec keeps")
+        return NotMeasured(why="it needs the sidecar that demorec keeps")
     count = len(dataset.places)
     known = [row["episode_index"] for row in dataset.sidecar]
     if sorted(set(known)) != known or not set(known) <= set(range(count)):
@@ -186,7 +168,7 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | Lacking:
 
 @dataset_check(measures="statements of info.json that its tables and videos contradict")
 def dataset_schema(dataset: Dataset) -> Measurement:
-    """Columns, types, shapes, names; codec, size and rate of each video file; splits that cover all episodes."""
+    """Compare columns, types, shapes, names; codec, size and rate of each video file; splits cover all episodes."""
     wrong = [*_columns(dataset), *_names(dataset), *_videos(dataset), *_splits(dataset)]
     found = f"{len(dataset.info.features)} features"
     return counted(wrong, found)

@@ -10,7 +10,6 @@ import numpy as np
 
 from demorec.check.base import Found, Measurement, dataset_check
 from demorec.check.dataset import Dataset
-from demorec.check.films import Film
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import read_json, rows_in
@@ -132,41 +131,28 @@ def numbers_of(value: Any) -> Array:
 
 
 @dataset_check(
-    measures="mean and deviation of colours in the statistics against decoded images, of 1",
+    measures="mean colours in the statistics against decoded images, of 1",
     warn=0.04,
     fail=0.08,
     needs="images",
     needs_images=True,
 )
 def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
-    """Recompute mean and deviation of each camera's colours, of the whole dataset and of each episode."""
+    """Recompute the mean colour of each camera, of the whole dataset and of each episode."""
     if dataset.info.is_old:
         return
     stats = read_statistics(dataset)
     for key, (films, _) in dataset.films.items():
         if not films or dataset.info.features[key].is_depth:
             continue
-        mean, deviation = _pooled(films)
-        entry = stats.get(key, {})
-        yield _colour_error(entry.get("mean"), mean, f"mean of {key}")
-        yield _colour_error(entry.get("std"), deviation, f"deviation of {key}")
-        columns = [f"stats/{key}/mean", f"stats/{key}/std"]
-        for row, film in zip(rows_in(dataset.path, "meta/episodes", columns), films, strict=False):
-            yield _colour_error(row[columns[0]], film.mean, f"mean of {film.where}")
-            yield _colour_error(row[columns[1]], film.deviation, f"deviation of {film.where}")
-
-
-def _pooled(films: Sequence[Film]) -> tuple[Array, Array]:
-    """(3,) mean and deviation of the colours of all films."""
-    weights = [len(film.cells) for film in films]
-    mean = np.average([film.mean for film in films], axis=0, weights=weights)
-    square = np.average([film.deviation**2 + film.mean**2 for film in films], axis=0, weights=weights)
-    return mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+        mean = np.average([film.mean for film in films], axis=0, weights=[len(film.cells) for film in films])
+        yield _colour_error(stats.get(key, {}).get("mean"), mean, key)
+        column = f"stats/{key}/mean"
+        for row, film in zip(rows_in(dataset.path, "meta/episodes", [column]), films, strict=False):
+            yield _colour_error(row[column], film.mean, film.where)
 
 
 def _colour_error(stored: Any, true: Array, detail: str) -> Measurement:
     found = numbers_of(stored)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        return Measurement(value=math.inf, detail=detail)
-    error = np.nan_to_num(np.abs(found - true))  # NaN: too few images were read
-    return Measurement(value=float(error.max()), detail=detail)
+    error = float(np.abs(found - true).max()) if found.shape == true.shape else math.inf
+    return Measurement(value=error, detail=detail)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from demorec.check.base import Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.base import Found, Measurement, NotMeasured, check
 from demorec.check.dataset import Dataset
 from demorec.check.run import CheckedRun
 from demorec.core.geometry import Array
@@ -26,7 +26,7 @@ def duplicates(subject: CheckedRun | Dataset) -> Found:
     """Compare the states of all episodes at 32 moments each."""
     names, motions = subject.courses()
     if len(names) < 2:
-        return Lacking(need="two episodes")
+        return NotMeasured(why="it needs two episodes")
     if subject.has_equal_starts:
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
     copies = _copies(motions)

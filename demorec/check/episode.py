@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from functools import cached_property
@@ -20,8 +19,7 @@ from demorec.core.errors import RecordingError
 from demorec.episode.episode import Columns, frame_time_ns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
-from demorec.mcap import Recording, channels
-from demorec.mcap.chunks import Block
+from demorec.mcap import Recording
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
 
@@ -81,26 +79,12 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
         """Every message of every topic, read once: every chunk's checksum is verified on the way."""
-        return scan_topics(self.container, self._blocks)
-
-    @cached_property
-    def _blocks(self) -> dict[str, Block]:
-        """topic -> all its messages, without those of images, which would be too large in memory together."""
-        streams = channels.IMAGE_STREAMS
-        images = {channels.camera_topic(camera.name, stream) for camera in self.cameras for stream in streams}
-        return self.container.blocks([topic for topic in self.container.channels if topic not in images])
+        return scan_topics(self.container)
 
     @cached_property
     def container(self) -> Container:
         """The file's messages and metadata as they are."""
         return self.enter_context(closing(Container(self.path)))
-
-    @property
-    def message_counts(self) -> dict[str, int]:
-        """Topic -> number of messages; every chunk's checksum is verified on the way."""
-        if self.form == "simulated":
-            return {topic: len(scan.time_ns) for topic, scan in self.scan.items()}
-        return Counter(topic for topic, _, _ in self.container.messages(tuple(self.container.channels)))
 
     @cached_property
     def motions(self) -> Motions:

@@ -9,7 +9,9 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, cast
 
+import av
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, RecordingError
@@ -23,10 +25,6 @@ from demorec.mcap.video import decode
 
 _PARTS = 16
 """Parts along each side."""
-_SAMPLE_EVERY = 8
-"""Of so many images one is read pixel by pixel for the deviation of its colours."""
-_MIN_SAMPLES = 8
-"""Such images below which the deviation of an episode is not known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,14 +36,12 @@ class Film:
         fps: Frames per second.
         cells: (N, 16, 16, 3) mean colours of the parts of each image, 0 to 255.
         frames: (N,) frame that each image belongs to.
-        deviation: (3,) standard deviation of each colour over all pixels, of 1; NaN where it is not known.
     """
 
     where: str
     fps: float
     cells: NDArray[np.uint8]
     frames: NDArray[np.intp]
-    deviation: Array
 
     @cached_property
     def steps(self) -> Array:
@@ -66,16 +62,14 @@ class CameraFilms(NamedTuple):
     error: str
 
 
-_UNKNOWN = np.full(3, np.nan)
-
-
 def film_of_recording(recording: Recording, columns: Columns, camera: str) -> CameraFilms:
     """Each image once, with the first frame that holds it."""
     cells: list[NDArray[np.uint8]] = []
     error = ""
+    reformatter = VideoReformatter()
     try:
         for image in decode(recording.video_settings(camera), recording.packets(camera)):
-            cells.append(_cells_of(image))
+            cells.append(_parts(av.VideoFrame.from_ndarray(image, "rgb24"), reformatter))
     except RecordingError as problem:
         error = str(problem)
     held, frames = np.unique(columns.images[camera], return_index=True)
@@ -85,24 +79,13 @@ def film_of_recording(recording: Recording, columns: Columns, camera: str) -> Ca
         fps=recording.info.fps,
         cells=np.stack(cells)[held[shown]] if cells else np.zeros((0, 1, 1, 3), dtype=np.uint8),
         frames=frames[shown],
-        deviation=_UNKNOWN,
     )
     return CameraFilms([film], error)
 
 
-def _cells_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Means of the parts of an image (H, W, 3); pixels beyond the last whole part are left out."""
-    rows, columns = min(_PARTS, image.shape[0]), min(_PARTS, image.shape[1])
-    height, width = image.shape[0] // rows, image.shape[1] // columns
-    # Rows first: NumPy adds long lines fastest.
-    lines = image[: rows * height, : columns * width].reshape(rows, height, -1).sum(axis=1, dtype=np.uint32)
-    sums = lines.reshape(rows, columns, width, 3).sum(axis=2)
-    return np.rint(sums / (height * width)).astype(np.uint8)
-
-
 def films_of_dataset(info: DatasetInfo, places: Iterable[EpisodePlace], key: str) -> CameraFilms:
     """The images of a camera of a dataset in every episode, in order."""
-    files: dict[Path, Iterator[_Decoded]] = {}
+    files: dict[Path, Iterator[NDArray[np.uint8]]] = {}
     ends: dict[Path, int] = {}
     found: list[Film] = []
     try:
@@ -117,41 +100,22 @@ def films_of_dataset(info: DatasetInfo, places: Iterable[EpisodePlace], key: str
                 raise ExportError(
                     f"Episode {place.episode_index} has {place.length} frames, {len(images)} images decode: {path}"
                 )
-            found.append(_film(f"{key}, episode {place.episode_index}", info.fps, images))
+            where = f"{key}, episode {place.episode_index}"
+            found.append(Film(where=where, fps=info.fps, cells=np.stack(images), frames=np.arange(place.length)))
     except ExportError as error:
         return CameraFilms(found, str(error))
     return CameraFilms(found, "")
 
 
-class _Decoded(NamedTuple):
-    """Parts of an image; of some, (2, 3) means of its colours, of 1, and of their squares, over all pixels."""
-
-    cells: NDArray[np.uint8]
-    moments: Array | None
-
-
-def _film(where: str, fps: float, images: Sequence[_Decoded]) -> Film:
-    samples = [image.moments for image in images if image.moments is not None]
-    deviation = _UNKNOWN
-    if len(samples) >= _MIN_SAMPLES:
-        mean, square = np.mean(samples, axis=0)
-        deviation = np.sqrt(np.maximum(square - mean**2, 0.0))
-    cells = np.stack([image.cells for image in images])
-    return Film(where=where, fps=fps, cells=cells, frames=np.arange(len(cells)), deviation=deviation)
-
-
-def _decoded(path: Path) -> Iterator[_Decoded]:
-    from av.video.reformatter import VideoReformatter
-
+def _decoded(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """The parts of every image."""
     reformatter = VideoReformatter()  # a frame's own would be set up again for each
     with opened_video(path) as (container, stream):
         stream.thread_type = "SLICE"
-        for number, frame in enumerate(container.decode(stream)):
-            small = reformatter.reformat(frame, _PARTS, _PARTS, "rgb24", interpolation="AREA")
-            moments = None
-            if number % _SAMPLE_EVERY == 0:
-                pixels = frame.to_ndarray(format="rgb24").reshape(-1, 3)
-                moments = np.stack(
-                    [pixels.mean(axis=0) / 255, np.square(pixels, dtype=np.float32).mean(axis=0) / 255**2]
-                )
-            yield _Decoded(cast("NDArray[np.uint8]", small.to_ndarray()), moments)
+        for frame in container.decode(stream):
+            yield _parts(frame, reformatter)
+
+
+def _parts(image: av.VideoFrame, reformatter: VideoReformatter) -> NDArray[np.uint8]:
+    small = reformatter.reformat(image, _PARTS, _PARTS, "rgb24", interpolation="AREA")
+    return cast("NDArray[np.uint8]", small.to_ndarray())

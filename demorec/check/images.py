@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import ANY_EPISODE, Found, Lacking, Measurement, NotMeasured, check, counted
+from demorec.check.base import ANY_EPISODE, Found, Measurement, NotMeasured, check, counted
+from demorec.check.dataset import Episodes
 from demorec.check.evidence import Motion, without_gaps
 from demorec.check.films import Film
 from demorec.check.rest import longest_rest, moves_of
-from demorec.check.subject import Episodes
 from demorec.episode.features import STATE
 
 MAX_SAME_STEP = 0.1
@@ -63,7 +63,7 @@ def frozen_images(subject: Episodes) -> Iterator[Found]:
             blind += int((same & moves)[rest.outside].sum())
             others += int(moves[rest.outside].sum())
         if not found:
-            yield Lacking(need=f"images and {STATE}")
+            yield NotMeasured(why=f"it needs images and {STATE}")
         elif blind > MAX_BLIND_SHARE * others:
             yield NotMeasured(why=f"{camera} hardly sees the robot move")
         else:

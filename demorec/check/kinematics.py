@@ -7,13 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import ANY_EPISODE, Found, Lacking, Measurement, NotMeasured, check
+from demorec.check.base import ANY_EPISODE, Found, Measurement, NotMeasured, check
+from demorec.check.dataset import Episodes
 from demorec.check.evidence import MIN_FRAMES, Motion
 from demorec.check.rows import LinkMatrices, displacement, matrices
-from demorec.check.subject import Episodes
 from demorec.core.geometry import Array
 
-EE_POSES = "EE poses, and a robot whose URDF is known"
+EE_POSES = "EE poses, and a robot whose URDF is known (--urdf FILE)"
 KNOWN_LINK_TOLERANCE_M = 1e-3
 """Error allowed where the URDF has the link whose pose is recorded, in float32 at least."""
 FITTED_TOLERANCE_M = 0.05
@@ -45,7 +45,7 @@ def forward_kinematics(subject: Episodes) -> Iterator[Found]:
     every = max(1, len(motions) // MAX_FITTED_EPISODES)
     for number, motion in enumerate(motions):
         if motion.ee_pose is None or motion.urdf is None:
-            yield Lacking(need=EE_POSES)
+            yield NotMeasured(why=f"it needs {EE_POSES}")
             return
         known = np.isfinite(motion.ee_pose).all(axis=1) & np.isfinite(motion.state).all(axis=1)
         frames = np.flatnonzero(known)

@@ -7,15 +7,15 @@ from functools import partial
 
 import numpy as np
 
-from demorec.check.base import ANY_EPISODE, Found, Lacking, Measurement, NotMeasured, check, worst_frame
+from demorec.check.base import ANY_EPISODE, Found, Measurement, NotMeasured, check, worst_frame
+from demorec.check.dataset import Episodes
 from demorec.check.evidence import MIN_RANGE, Motion, without_gaps
 from demorec.check.rest import longest_rest, moves_of
 from demorec.check.rows import finest_lag
-from demorec.check.subject import Episodes
 from demorec.core.geometry import Array
 from demorec.episode.features import STATE
 
-URDF = "a robot whose URDF is known"
+URDF = "a robot whose URDF is known (--urdf FILE)"
 VELOCITIES = "velocities of the state's elements"
 TARGETS = "actions that are targets of the state's elements"
 
@@ -68,7 +68,7 @@ def joint_limits(subject: Episodes) -> Iterator[Found]:
     for motion in subject.motions.all:
         known = np.flatnonzero(np.isfinite(motion.lower) | np.isfinite(motion.upper))
         if not len(known):
-            yield Lacking(need=URDF)
+            yield NotMeasured(why=f"it needs {URDF}")
             return
         for element in known.tolist():
             position = motion.state[:, element]
@@ -93,7 +93,7 @@ def velocity_matches_position(subject: Episodes) -> Iterator[Found]:
     """
     motions = [motion for motion in subject.motions.all if motion.velocity is not None and len(motion.state) > 1]
     if not motions:
-        yield Lacking(need=VELOCITIES)
+        yield NotMeasured(why=f"it needs {VELOCITIES}")
         return
     if motions[0].fps < MIN_FPS:
         yield NotMeasured(why=f"fewer than {MIN_FPS} frames a second")

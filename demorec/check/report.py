@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.base import Check, Form, Group, Level, Result
+from demorec.check.base import Check, Form, Level, Result
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
@@ -19,8 +19,6 @@ from demorec.robots.motors import Motors
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
-_OF_THE_FILE: tuple[Group, ...] = ("file", "time")
-"""Groups of the checks that look at the file itself, not at what was recorded."""
 _WORTH_PROCESSES = {"with images": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
 OPENS_IN_LEROBOT = "dataset_opens"
@@ -76,13 +74,10 @@ class Subject:
     Attributes:
         path: Where it is.
         kind: What it is.
-        is_failed_attempt: Whether it is a failed attempt that a run keeps, found there and not named by the user: it
-            is judged apart from what the run made.
     """
 
     path: Path
     kind: SubjectKind
-    is_failed_attempt: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,18 +96,8 @@ class SubjectReport(Subject):
         return max((result.level for result in self.results), key=lambda level: _SEVERITY[level], default="skip")
 
     def is_bad(self, *, strict: bool = False) -> bool:
-        """Whether it must not be as it is: a check failed, or with `strict` warned.
-
-        A failed attempt that a run keeps may have dropped its cube or hit the table, that is why it failed; bad is one
-        whose file is damaged, which the checks of file and time find.
-        """
-        limit = _SEVERITY["warn" if strict else "fail"]
-        return any(_SEVERITY[result.level] >= limit for result in self.judged)
-
-    @property
-    def judged(self) -> tuple[Result, ...]:
-        """The results that count: all, or of a failed attempt those about its file."""
-        return tuple(r for r in self.results if not self.is_failed_attempt or r.group in _OF_THE_FILE)
+        """Whether a check failed, or with `strict` warned."""
+        return _SEVERITY[self.level] >= _SEVERITY["warn" if strict else "fail"]
 
     def count(self, level: Level) -> int:
         """How many results have a level."""
@@ -132,8 +117,7 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
             found.append(Subject(path=path, kind="dataset"))
         elif there.kind == "run":
             found.append(Subject(path=path, kind="run"))
-            found += [Subject(path=file, kind="recording") for file in there.recordings]
-            found += [Subject(path=file, kind="recording", is_failed_attempt=True) for file in there.failed]
+            found += [Subject(path=file, kind="recording") for file in (*there.recordings, *there.failed)]
             if find(path / DATASET).kind == "dataset":
                 found.append(Subject(path=path / DATASET, kind="dataset"))
         else:

@@ -39,8 +39,8 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
     dataset.check_simulated()
     options = export_options(path)
     wrong: list[str] = []
-    successes = sum(line["success"] and line["episode_index"] < run.run["num_episodes"] for line in run.lines)
-    found = sum(row["success"] for row in dataset.sidecar)
+    successes = len(run.run.successes)
+    found = sum(bool(row["success"]) for row in dataset.sidecar)
     if found != successes:
         wrong.append(f"it has {found} successes, the run {successes}")
     for episode, videos in with_videos(dataset):

@@ -31,9 +31,8 @@ _SHOWN = 12
 class Check:
     """Check recordings, runs and datasets: files, times, numbers, motion, images.
 
-    Exit code 0: everything passed (warnings allowed); 1: a check failed. The failed attempts that a run keeps are
-    judged apart: their own failures are reported, but only a damaged file counts. `demorec list checks` says what is
-    measured and with which limits.
+    Exit code 0: everything passed (warnings allowed); 1: a check failed. `demorec list checks` prints what is measured
+    and the limits.
 
     Examples:
       demorec check recordings/cubes
@@ -163,39 +162,28 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
         ("skip", "not measured"),
     )
     blocked = sum(result.is_blocked for result in report.results)
-    absent = sum(bool(result.lacks) for result in report.results)
-    apart = blocked + absent
-    numbers = {level: report.count(level) - (apart if level == "skip" else 0) for level, _ in words}
+    numbers = {level: report.count(level) - (blocked if level == "skip" else 0) for level, _ in words}
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
-    if absent and counts:
-        counts += f", {absent} not applicable"
     counts = counts or f"none of the chosen checks is about a {report.kind}"
-    kind = "failed attempt" if report.is_failed_attempt else report.kind
-    yield f"{report.level:<4}  {kind} {report.path}: {counts}"
+    yield f"{report.level:<4}  {report.kind} {report.path}: {counts}"
     for result in report.results:
         if result.level in ("warn", "fail") or (verbose and not result.is_blocked):
             yield f"      {_result(result)}"
-    if counts and not verbose:
-        yield from _not_applicable([report])
+    if not verbose:
+        yield from _not_measured([report])
     if blocked:
         yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
 
 
-_FLAGS = {
-    "a robot whose URDF is known": "--urdf FILE",
-    "EE poses, and a robot whose URDF is known": "--urdf FILE",
-}
-"""What a check needs -> the flag that may give it."""
+def _not_measured(reports: Sequence[SubjectReport]) -> Iterator[str]:
+    """One line for each reason why checks measured nothing."""
+    from demorec.check.base import NOTHING
 
-
-def _not_applicable(reports: Sequence[SubjectReport]) -> Iterator[str]:
-    """How many checks were not applicable, for lack of what, and what would change it."""
-    needs = Counter(result.lacks for report in reports for result in report.results if result.lacks)
-    if not needs:
-        return
-    reasons = [f"{count} {'needs' if count == 1 else 'need'} {need}" + (f" ({_FLAGS[need]})" if need in _FLAGS else "")
-               for need, count in needs.most_common()]  # fmt: skip
-    yield f"      Not applicable: {'; '.join(reasons)}."
+    results = [result for report in reports for result in report.results if result.level == "skip"]
+    reasons = Counter(f"{r.check}: {r.detail}" for r in results if not r.is_blocked and r.detail != NOTHING)
+    for reason, count in reasons.most_common():
+        times = "" if count == 1 else f" ({count} times)"
+        yield f"      not measured  {reason}{times}"
 
 
 def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
@@ -203,14 +191,12 @@ def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
     if len(reports) < 2:
         yield from (line for report in reports for line in _lines(report, verbose=False))
         return
-    kinds = Counter("failed attempt" if report.is_failed_attempt else report.kind for report in reports)
+    kinds = Counter(report.kind for report in reports)
     passed, skipped = (sum(report.count(level) for report in reports) for level in ("pass", "skip"))
-    absent = sum(bool(result.lacks) for report in reports for result in report.results)
-    unmeasured = f", {skipped - absent} not measured" if skipped - absent else ""
-    unmeasured += f", {absent} not applicable" if absent else ""
+    unmeasured = f", {skipped} not measured" if skipped else ""
     things = ", ".join(counted(number, kind) for kind, number in kinds.items())
     yield f"pass  {things}: {passed} checks passed{unmeasured}"
-    yield from _not_applicable(reports)
+    yield from _not_measured(reports)
 
 
 def _result(result: Result) -> str:
@@ -229,8 +215,6 @@ def _summary(reports: Sequence[SubjectReport], failed: int) -> str:
     text = f"{len(reports) - unmeasured} checked, {failed} failed, {warned} with warnings."
     if unmeasured:
         text += f" Of {unmeasured} nothing was measured."
-    if apart := sum(report.is_failed_attempt and report.level == "fail" and not report.is_bad() for report in reports):
-        text += f" Not counted, since what they recorded fails checks: {counted(apart, 'failed attempt')}."
     return text
 
 
@@ -241,9 +225,7 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
     for result in results:
         if result["value"] is not None and abs(result["value"]) == float("inf"):
             result["value"] = None  # JSON has no infinity; the level and the detail tell
-    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results} | (
-        {"failed_attempt": True} if report.is_failed_attempt else {}
-    )
+    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results}
 
 
 def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:
