@@ -24,8 +24,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-
 from demorec.check.gripper import Convex, depth_in
+
 from demorec.check.rows import LinkMatrices, inverse, matrices
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError
