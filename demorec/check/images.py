@@ -58,8 +58,8 @@ def frozen_images(subject: Episodes) -> Iterator[Found]:
                 continue
             same, moves = film.steps <= MAX_SAME_STEP, moves_of(_state_at(film, motion))
             rest = longest_rest(same, moves, np.diff(film.frames))
-            frame = int(film.frames[rest.start]) + 1 if rest.count else None
-            found.append(Measurement(value=rest.count / film.fps, frame=frame, detail=film.where))
+            frame = int(film.frames[rest.start]) + 1 if rest.moving else None
+            found.append(Measurement(value=rest.moving / film.fps, frame=frame, detail=film.where))
             blind += int((same & moves)[rest.outside].sum())
             others += int(moves[rest.outside].sum())
         if not found:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.base import ANY_EPISODE, Found, Measurement, NotMeasured, check
 from demorec.check.dataset import Episodes
@@ -57,7 +58,7 @@ def forward_kinematics(subject: Episodes) -> Iterator[Found]:
             yield _judged(motion, frames, _fitted_error(motion, frames), FITTED_TOLERANCE_M, quantile=0.9)
 
 
-def _judged(motion: Motion, frames: Array, error_m: Array, allowed_m: float, *, quantile: float) -> Found:
+def _judged(motion: Motion, frames: NDArray[np.intp], error_m: Array, allowed_m: float, *, quantile: float) -> Found:
     if not len(frames):
         return None
     error = float(np.quantile(error_m, quantile))
@@ -65,7 +66,7 @@ def _judged(motion: Motion, frames: Array, error_m: Array, allowed_m: float, *, 
     return Measurement(value=error / allowed_m, frame=int(frames[error_m.argmax()]), detail=detail)
 
 
-def _known_link_error(motion: Motion, frames: Array) -> Array:
+def _known_link_error(motion: Motion, frames: NDArray[np.intp]) -> Array:
     assert motion.urdf is not None
     assert motion.ee_pose is not None
     joints = {name: column[frames] for name, column in motion.joint_position.items()}
@@ -73,7 +74,7 @@ def _known_link_error(motion: Motion, frames: Array) -> Array:
     return displacement(matrices(motion.ee_pose[frames]), hand, lever_m=LEVER_M)
 
 
-def _fitted_error(motion: Motion, frames: Array) -> Array:
+def _fitted_error(motion: Motion, frames: NDArray[np.intp]) -> Array:
     """(T,) metres that are left after the best fit of a base, a tool and a size to some frames."""
     assert motion.urdf is not None
     assert motion.ee_pose is not None

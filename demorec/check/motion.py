@@ -152,9 +152,9 @@ def frozen_sensors(subject: Episodes) -> Iterator[Found]:
             rest = longest_rest(same, moves)
             changes = (table[1:] != table[:-1]).any(axis=1) & moves
             if changes[rest.outside].sum() >= MIN_LIVE_SHARE * moves[rest.outside].sum():
-                seconds = rest.count / motion.fps
+                seconds = rest.moving / motion.fps
                 seconds = seconds if name in live else min(seconds, frozen_sensors.fail)
-                frame = rest.start + 1 if rest.count else None
+                frame = rest.start + 1 if rest.moving else None
                 yield Measurement(value=seconds, frame=frame, detail=_where(name, motion))
 
 
@@ -166,8 +166,8 @@ def _frozen_elements(motion: Motion) -> Iterator[Found]:
         if np.isfinite(action).any() and np.ptp(without_gaps(action)) > MIN_RANGE:
             same = motion.state[1:, element] == motion.state[:-1, element]
             rest = longest_rest(same, moves_of(action))
-            frame = rest.start + 1 if rest.count else None
-            yield Measurement(value=rest.count / motion.fps, frame=frame, detail=_where(name, motion))
+            frame = rest.start + 1 if rest.moving else None
+            yield Measurement(value=rest.moving / motion.fps, frame=frame, detail=_where(name, motion))
 
 
 @check(

@@ -18,12 +18,12 @@ class Rest(NamedTuple):
     """A run of steps in which nothing changes.
 
     Attributes:
-        count: Its moving frames.
+        moving: Its moving frames.
         start: Its first step.
         outside: (N,) all other steps.
     """
 
-    count: int
+    moving: int
     start: int
     outside: Flags
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from demorec.check.base import Form, Found, Measurement, counted, run_check
 from demorec.check.evidence import motion_vector
 from demorec.core.errors import DemorecError, RecordingError, resource_error
+from demorec.core.files import sha256_of
 from demorec.core.geometry import Array
 from demorec.core.plain import to_plain
 from demorec.episode.features import STATE
@@ -28,7 +29,6 @@ from demorec.runs.run_file import (
     is_external_run,
     load_any_run_file,
     recorded_line,
-    sha256_of,
 )
 
 if TYPE_CHECKING:
