@@ -16,20 +16,18 @@ from demorec.check.base import Measurement, NotMeasured, counted, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError
 from demorec.datasets.episode import SUCCESS
-from demorec.datasets.lerobot.files import open_table, read_json, read_table, tables_in
+from demorec.datasets.lerobot.files import open_table, read_table, tables_in
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     TASKS_PATH,
     DatasetFeature,
 )
-from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.videos import PacketReader, opened_video
 
 _TYPES = {
     "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
 }  # fmt: skip
-_CHANNELS, _CHANNEL_COUNTS = ("channel", "channels"), (1, 3, 4)
 _RATE_TOLERANCE = 0.01
 """Files that were put together have rates that are a little off."""
 
@@ -168,8 +166,8 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | NotMeasured:
 
 @dataset_check(measures="statements of info.json that its tables and videos contradict")
 def dataset_schema(dataset: Dataset) -> Measurement:
-    """Compare columns, types, shapes, names; codec, size and rate of each video file; splits cover all episodes."""
-    wrong = [*_columns(dataset), *_names(dataset), *_videos(dataset), *_splits(dataset)]
+    """Compare columns, types, shapes, names; codec, size and rate of each video file."""
+    wrong = [*_columns(dataset), *_names(dataset), *_videos(dataset)]
     found = f"{len(dataset.info.features)} features"
     return counted(wrong, found)
 
@@ -206,9 +204,6 @@ def _fits(found: pa.DataType, feature: DatasetFeature) -> bool:
 
 def _names(dataset: Dataset) -> Iterator[str]:
     for name, feature in dataset.info.features.items():
-        for place, told in enumerate(feature.names or ()) if len(feature.shape) == 3 else ():
-            if told in _CHANNELS and place < 3 and feature.shape[place] not in _CHANNEL_COUNTS:
-                yield f"{name} has {feature.shape[place]} {told} by its names"
         if feature.names is None or len(feature.shape) != 1:
             continue
         if len(feature.names) != feature.shape[0]:
@@ -243,22 +238,3 @@ def _videos(dataset: Dataset) -> Iterator[str]:
                 yield f"{key}: video.{quantity} is {info[f'video.{quantity}']}, the shape has {value}"
         if info.get("video.fps", dataset.info.fps) != dataset.info.fps:
             yield f"{key}: video.fps is {info['video.fps']}, the dataset has {dataset.info.fps}"
-
-
-def _splits(dataset: Dataset) -> Iterator[str]:
-    """Every episode in one split, none beyond."""
-    splits = read_json(dataset.path / INFO_PATH).get("splits")
-    if splits is None:
-        return
-    used: list[int] = []
-    try:
-        for text in splits.values():
-            first, last = (int(part) for part in text.split(":"))
-            if not 0 <= first <= last <= dataset.info.total_episodes:
-                raise ValueError(text)
-            used += range(first, last)
-    except (AttributeError, TypeError, ValueError):
-        yield f"the splits {str(splits)[:80]} are no ranges of its {dataset.info.total_episodes} episodes"
-        return
-    if sorted(used) != list(range(dataset.info.total_episodes)):
-        yield f"the splits have {len(used)} of {dataset.info.total_episodes} episodes"

@@ -114,7 +114,6 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "another height": (of_video(height=128), "dataset_schema"),
     "another shape of the images": (of_feature(CAMERA, shape=[32, 32, 3]), "dataset_schema"),
     "another rate": (of_info(lambda data: data.update(fps=20)), "dataset_schema"),
-    "a split too short": (of_info(lambda data: data.update(splits={"train": "0:2"})), "dataset_schema"),
     "rows in another order": (of_table("data", rows_exchanged), "dataset_counts"),
     "a wrong index": (of_rows("index"), "dataset_counts"),
     "a wrong frame_index": (of_rows("frame_index"), "dataset_counts"),
