@@ -1,12 +1,11 @@
-"""What `demorec check` costs, in CPU time, and what it did in another version of the program.
+"""CPU time of `demorec check`, and of another version of the program.
 
     python benchmarks/check.py --episodes 5
     git worktree add /tmp/before HEAD~1 && python benchmarks/check.py --against /tmp/before
 
-Three runs are made: without cameras, with two, and with depth and labels as well. A process for each version checks
-the same recordings, run folder and dataset by turns, so that both meet the same load. The first recording and dataset
-of a process are told apart: libraries are loaded and models prepared for them. LeRobot, which opens each dataset in a
-process of its own, is not counted.
+Two runs are made: without cameras, and with two, depth and labels. A process for each version checks the same
+recordings, run folder and dataset by turns, so that both meet the same load. The first recording of a process is
+listed apart: libraries are loaded for it. LeRobot is not started.
 """
 
 from __future__ import annotations
@@ -22,25 +21,23 @@ from pathlib import Path
 
 CASES = {
     "no cameras": ("--cameras", "none"),
-    "two cameras": (),
     "two cameras, depth, labels": ("--depth", "--segmentation"),
 }
 
 
 def serve() -> None:
-    """Check every path that comes, and say what it took."""
+    """Check every path on standard input and print the CPU time."""
     from demorec.check.report import CheckOptions, check_subject, find_subjects
 
     for line in sys.stdin:
-        path = Path(line.strip())
-        subject = find_subjects([path])[0]
+        subject = find_subjects([Path(line.strip())])[0]
         start = time.process_time()
         report = check_subject(subject, CheckOptions())
         print(time.process_time() - start, report.level, flush=True)
 
 
 class Checker:
-    """A process that checks, with the program of a folder.
+    """A process that checks with the program in a folder.
 
     Args:
         folder: That holds demorec/.
@@ -73,11 +70,9 @@ class Checker:
 
 
 def main() -> None:
-    """Make runs, check them, tell."""
+    """Make runs, check them, print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--episodes", type=int, default=5)
-    parser.add_argument("--size", type=int, default=224)
-    parser.add_argument("--task", default="pick_place")
     parser.add_argument("--against", type=Path, help="a folder with another version of demorec/")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -91,21 +86,20 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for case, flags in CASES.items():
             run = Path(folder) / case.replace(", ", "_").replace(" ", "_")
-            command = [str(Path(sys.executable).with_name("generate-dataset")), "--task", options.task, "--seed", "3"]
-            command += ["--num-episodes", str(options.episodes + 1), "--width", str(options.size)]
-            command += ["--height", str(options.size), "--out", str(run), "--workers", "1", *flags]
+            command = [str(Path(sys.executable).with_name("generate-dataset")), "--seed", "3", "--out", str(run)]
+            command += ["--num-episodes", str(options.episodes + 1), "--workers", "1", *flags]
             subprocess.run(command, check=True, capture_output=True)
             checkers = {name: Checker(place) for name, place in versions.items()}
-            cpu: dict[tuple[str, str], float] = defaultdict(float)
             first, *others = sorted((run / "episodes").glob("*.mcap"))
             subjects = {"first recording": [first], "recording": others, "run's folder": [run]}
-            subjects |= {"first dataset": [run / "dataset"], "dataset": [run / "dataset"]}
+            subjects["dataset"] = [run / "dataset"]
             for what, paths in subjects.items():
+                cpu: dict[str, float] = defaultdict(float)
                 for path in paths:
                     for name, checker in checkers.items():
-                        cpu[what, name] += checker.seconds(path) / len(paths)
-                told = "".join(f"{1e3 * cpu[what, name]:10.0f}" for name in versions)
-                print(f"{f'{case}: {what}':<42}{told}", flush=True)
+                        cpu[name] += checker.seconds(path) / len(paths)
+                figures = "".join(f"{1e3 * cpu[name]:10.0f}" for name in versions)
+                print(f"{f'{case}: {what}':<42}{figures}", flush=True)
             for checker in checkers.values():
                 checker.close()
 

@@ -1,7 +1,7 @@
-"""How a robot moves in each episode of whatever is checked: the one form in which the laws of motion see it.
+"""The motion of a robot in each episode: the one form in which the checks of any episode see it.
 
-What is known of the elements of `observation.state` comes from the recording, from the sidecar, from the URDF that the
-user names, or from the robot whose joints their names are. What is not known is absent.
+The elements of `observation.state` are identified by the recording, the sidecar, the URDF that the user names, or the
+known robot whose joints have their names. What is not known is absent.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, signs_of_course
-from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
 from demorec.episode.episode import Columns
@@ -25,54 +24,41 @@ from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, 
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.robots.urdf import Urdf
 
-EFFORT = "observation.effort"
 GRIPPER = "gripper.width"
 """The element that is the opening of a simulated gripper, metres."""
 _GRIPPER_WORDS = ("gripper", "finger")
 _SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
-"""What of the name of an element is not that of its joint."""
-_QUATERNION = ("qx", "qy", "qz", "qw")
+"""The part of an element's name that is not the name of its joint."""
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
-FEWEST = 30
-"""Frames below which an episode says nothing of lags and orders."""
-_OWN = 0.5
-"""Correlation with its own element above which an action is a target of the state: 0.97 and more in demonstrations of
-Panda and iiwa, where increments and poses have 0.3 and less."""
-MOVES = 1e-3
-"""Range, rad or m, below which an element stands still."""
+MIN_FRAMES = 30
+"""Frames below which an episode is too short to judge its lag or its kinematics."""
+MIN_TARGET_CORRELATION = 0.5
+"""Correlation with its own element above which an action is a target of the state: at least 0.97 in demonstrations of
+Panda and iiwa, where increments and poses have at most 0.3."""
+MIN_RANGE = 1e-3
+"""Range, rad or m, below which an element does not move."""
 
 Flags = NDArray[np.bool_]
-Named = tuple[str, Array]
-
-
-def is_gripper(name: str) -> bool:
-    """Whether an element is called after a gripper or its fingers."""
-    return any(word in name.lower() for word in _GRIPPER_WORDS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """How a robot moves in one episode; elements are those of observation.state.
+    """The motion of a robot in one episode; elements are those of observation.state.
 
     Attributes:
         where: "episode 3", or "" where there is only one.
         fps: Frames per second.
         steps_s: (T - 1,) time from each frame to the next, seconds.
         names: Of the D elements.
-        state: (T, D) rad or m where the joint is known, else as it came; quaternions by `course_of`.
-        velocity, action, effort: (T, D) of the same elements and units, NaN where an element has none; None for no
-            element.
+        state: (T, D) rad or m where the joint is known, otherwise as recorded; quaternions by `course_of`.
+        velocity, action: (T, D) of the same elements and units, NaN where an element has none; None for no element.
         lower, upper: (D,) limits; infinite where they are not known.
-        speed: (D,) largest speed, rad/s or m/s; infinite where it is not known.
         joints: (D,) of the URDF, "" where it is not known.
         urdf: The joint tree, None where it is not known.
-        model: Text of a URDF with masses, or its name as by `asset_path`.
-        commands: Name -> (T, D) of what else is known to be sent to the same elements, in the same units.
-        ee_pose: (T, 7) of the hand, if there.
-        tcp_link: The link of which it is the pose, "" where that is not known.
-        sensors: Name -> (T, n) of what is measured.
-        contact: (T,) N, force on the fingers; None where nobody measures it.
-        stroke_s: How long the gripper takes from closed to open, seconds; 0 where it is not known.
+        ee_pose: (T, 7) of the hand, position and quaternion xyzw, if recorded.
+        tcp_link: The link that `ee_pose` is the pose of, "" where that is not known.
+        sensors: Name -> (T, n) of the other measured quantities.
     """
 
     where: str
@@ -82,39 +68,23 @@ class Motion:
     state: Array
     velocity: Array | None = None
     action: Array | None = None
-    effort: Array | None = None
     lower: Array
     upper: Array
-    speed: Array
     joints: tuple[str, ...] = ()
     urdf: Urdf | None = None
-    model: str = ""
-    commands: Mapping[str, Array] = field(default_factory=dict)
     ee_pose: Array | None = None
     tcp_link: str = ""
     sensors: Mapping[str, Array] = field(default_factory=dict)
-    contact: Array | None = None
-    stroke_s: float = 0.0
 
     @property
     def grippers(self) -> Flags:
-        """(D,) elements that are called after a gripper or its fingers."""
-        return np.array([is_gripper(name) for name in self.names], dtype=np.bool_)
-
-    @property
-    def gripper(self) -> int | None:
-        """The element that is the opening of a gripper, if one is."""
-        found = np.flatnonzero(self.grippers)
-        return int(found[0]) if len(found) == 1 else None
+        """(D,) elements named after a gripper or its fingers."""
+        return np.array([any(word in name.lower() for word in _GRIPPER_WORDS) for name in self.names], dtype=np.bool_)
 
     @property
     def joint_position(self) -> dict[str, Array]:
         """Joint of the URDF -> (T,)."""
         return {joint: column for joint, column in zip(self.joints, self.state.T, strict=False) if joint}
-
-    def labels(self, known: Flags) -> list[str]:
-        """Names of some elements."""
-        return [name for name, is_known in zip(self.names, known, strict=True) if is_known]
 
 
 class Motions:
@@ -128,49 +98,60 @@ class Motions:
         self.all = motions
 
     @cached_property
-    def targets(self) -> list[tuple[Array, Array]]:
-        """(T, K) states and actions of each episode, of the K elements that have an action and move; less their means
-        and in units of the state's deviation. Empty where the action is no target of the state."""
-        pairs = [motion for motion in self.all if motion.action is not None and len(motion.state) >= FEWEST]
-        kept = self.moving
-        if not pairs or not kept.any():
-            return []
-        found = [
-            (_scaled(motion.state, motion.state)[:, kept], _scaled(_action(motion), motion.state)[:, kept])
-            for motion in pairs
-        ]
-        own = np.diag(correlations(found))
-        return found if float(np.median(own)) > _OWN else []
-
-    @cached_property
     def moving(self) -> Flags:
         """(D,) elements that have an action, and of which state and action change in some episode."""
         moves = [
-            (np.ptp(motion.state, axis=0) > MOVES) & (np.ptp(_action(motion), axis=0) > MOVES)
+            (_range(motion.state) > MIN_RANGE) & (_range(motion.action) > MIN_RANGE)
             for motion in self.all
             if motion.action is not None
         ]
         return np.asarray(np.any(moves, axis=0)) if moves else np.zeros(0, dtype=np.bool_)
 
+    @cached_property
+    def targets(self) -> list[tuple[Array, Array]]:
+        """(T, K) states and actions of each episode, of the K elements that have an action and move.
 
-def _action(motion: Motion) -> Array:
-    assert motion.action is not None
-    return motion.action
+        They are without gaps, less their means, and in units of the state's deviation. Empty where the action is not a
+        target of the state.
+        """
+        kept = self.moving
+        found = []
+        for motion in self.all if kept.any() else ():
+            if motion.action is not None and len(motion.state) >= MIN_FRAMES:
+                state = without_gaps(motion.state[:, kept])
+                action = without_gaps(motion.action[:, kept])
+                deviation = np.maximum(state.std(axis=0), MIN_RANGE)
+                found.append(((state - state.mean(axis=0)) / deviation, (action - action.mean(axis=0)) / deviation))
+        if not found:
+            return []
+        states = np.concatenate([state for state, _ in found])
+        actions = np.concatenate([action for _, action in found])
+        sizes = np.sqrt((states**2).sum(axis=0) * (actions**2).sum(axis=0))
+        correlations = (states * actions).sum(axis=0) / np.maximum(sizes, 1e-12)
+        return found if float(np.median(correlations)) > MIN_TARGET_CORRELATION else []
 
 
-def _scaled(values: Array, state: Array) -> Array:
-    return np.asarray((values - values.mean(axis=0)) / np.maximum(state.std(axis=0), MOVES))
+def _range(values: Array) -> Array:
+    """(D,) range of each column of (T, D); 0 for one without numbers."""
+    return np.asarray(np.ptp(np.nan_to_num(without_gaps(values)), axis=0))
 
 
-def correlations(targets: Sequence[tuple[Array, Array]]) -> Array:
-    """(K, K) of each element of the state with each of the action, over all episodes; 0 where one does not change."""
-    state, action = (np.concatenate(part) for part in zip(*targets, strict=True))
-    size = np.sqrt(np.outer((state**2).sum(axis=0), (action**2).sum(axis=0)))
-    return np.asarray(state.T @ action / np.maximum(size, 1e-12))
+def without_gaps(values: Array) -> Array:
+    """(T, D) values with the last number before each gap in its place; gaps at the start take the first number.
+
+    A column without any number stays as it is.
+    """
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    frames = np.arange(len(values))[:, None]
+    last = np.maximum.accumulate(np.where(known, frames, -1), axis=0)
+    source = np.where(last >= 0, last, known.argmax(axis=0))
+    return np.asarray(np.take_along_axis(values, source, axis=0))
 
 
 def quaternion_places(names: Sequence[str]) -> list[int]:
-    """Where four elements in a row are x, y, z and w of one thing: orientation.x to orientation.w, qw to qz."""
+    """The first of each four adjacent elements that are x, y, z and w of one rotation: orientation.x, or qw to qz."""
     fours = [(start, names[start : start + 4]) for start in range(len(names) - 3)]
     return [
         start
@@ -187,55 +168,31 @@ def course_of(state: Array, names: Sequence[str]) -> Array:
     return course
 
 
-def _turn_nearest(action: Array, state: Array, names: Sequence[str]) -> None:
-    """Give the quaternions of actions (T, D), in place, the sign that brings them nearest to the state's."""
-    for place in quaternion_places(names):
-        turn = slice(place, place + 4)
-        action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-
-
-def quaternions(features: Mapping[str, NDArray[Any]], described: Mapping[str, Sequence[str] | None]) -> Iterator[Named]:
-    """(what, (T, 4)) of all quaternions, by the names of their elements."""
-    for feature, names in described.items():
-        for place in quaternion_places(names or ()):
-            assert names is not None
-            table = features[feature].reshape(-1, len(names)).astype(np.float64)
-            yield f"{feature}, {names[place][:-1]}", table[:, place : place + 4]
-
-
 def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:
-    """Of a recording that demorec simulated: all is known."""
+    """The motion of a recording that demorec simulated, of which everything is known."""
     robot = info.robot
     n = len(robot.arm_joints)
-    nothing, inf = np.full((c.num_frames, 1), np.nan), (math.inf,)
-    sensors = {
-        "velocities": c.joint_velocity[:, :n],
-        "efforts": c.joint_effort[:, :n],
-        "EE pose": c.base_from_tcp,
-        **c.sensed,
-    }
     return Motion(
         where="",
         fps=info.fps,
         steps_s=np.full(max(c.num_frames - 1, 0), 1 / info.fps),
         names=(*robot.arm_joints, GRIPPER),
         state=np.column_stack([c.joint_position[:, :n], c.gripper_width]),
-        velocity=np.column_stack([c.joint_velocity[:, :n], nothing]),
+        velocity=np.column_stack([c.joint_velocity[:, :n], np.full(c.num_frames, np.nan)]),
         action=np.column_stack([c.action_joint_target, c.action_gripper]),
-        effort=np.column_stack([c.joint_effort[:, :n], nothing]),
-        lower=np.array([*robot.position_lower, -1e-3]),  # fingers have mass, and overshoot by a millimetre
-        upper=np.array([*robot.position_upper, robot.gripper.max_width + 1e-3]),
-        speed=np.array([*robot.velocity_limit, *inf]),
+        lower=np.array([*robot.position_lower, 0.0]),
+        upper=np.array([*robot.position_upper, robot.gripper.max_width]),
         joints=(*robot.arm_joints, ""),
         urdf=urdf,
-        commands={
-            "action": np.column_stack([c.action_joint_target, c.action_gripper]),
-            "command": np.column_stack([c.command_joint_target, c.command_gripper]),
-        },
         ee_pose=c.base_from_tcp,
-        sensors=sensors,
-        contact=c.contact_force,
-        stroke_s=robot.gripper.stroke_seconds(),
+        tcp_link=robot.tcp_link,
+        sensors={
+            "velocities": c.joint_velocity[:, :n],
+            "efforts": c.joint_effort[:, :n],
+            "EE pose": c.base_from_tcp,
+            "contact force": c.contact_force[:, None],
+            **{name: table.reshape(len(table), -1) for name, table in c.sensed.items()},
+        },
     )
 
 
@@ -246,14 +203,14 @@ def motion_of_features(
     urdf: str = "",
     time_ns: NDArray[np.int64] | None = None,
 ) -> Motion | None:
-    """Of arrays (T, D) by their names, each of which is described; None without a state.
+    """The motion in arrays (T, D) by their names; None without a state.
 
     Args:
-        features: Name -> what was recorded of it, (T, D).
-        described: What is known of each of them.
+        features: Name -> recorded values, (T, D).
+        described: Names, units and joints of each.
         fps: Frames per second.
         urdf: Text of the robot's description; "" for the robot whose joints the state's names are.
-        time_ns: (T,) of the frames, where they have times of their own.
+        time_ns: (T,) of the frames, where they have timestamps of their own.
     """
     known = {feature.name: feature for feature in described}
     if STATE not in known or not len(features[STATE]):
@@ -265,7 +222,7 @@ def motion_of_features(
 def motions_of_dataset(
     info: DatasetInfo, rows_of: Sequence[Mapping[str, NDArray[Any]]], robots: Mapping[int, DatasetRobot], urdf: str
 ) -> Iterator[Motion]:
-    """Of every episode of a dataset that has a state; by its own robot, or else by the URDF that the user names."""
+    """The motion of every episode that has a state; by its own robot, otherwise by the URDF that the user names."""
     features = info.features
     if STATE not in features or features[STATE].dtype not in ("float32", "float64"):
         return
@@ -274,35 +231,32 @@ def motions_of_dataset(
         for name, feature in features.items()
         if feature.is_numeric and len(feature.shape) == 1
     }
-    stranger: _Arm | None = None  # what its robot is takes time to find out
+    unnamed: _Arm | None = None  # recognising a robot takes time
     for number, rows in enumerate(rows_of):
         robot = robots.get(number)
         where = f"episode {number}"
         if robot is None:
-            stranger = stranger or _arm(described[STATE].names, urdf)
-            yield _motion(where, info.fps, rows, described, arm=stranger)
+            unnamed = unnamed or _arm(described[STATE].names, urdf)
+            yield _motion(where, info.fps, rows, described, arm=unnamed)
             continue
-        spec, arm = robot.record.spec, _Arm.of(robot)
+        spec = robot.record.spec
         opening = math.inf if spec is None else spec.gripper.max_width
         known = {name: robot.record.described(feature) for name, feature in described.items()}
-        motion = _motion(where, info.fps, rows, known, arm=arm, opening=opening)
+        motion = _motion(where, info.fps, rows, known, arm=_Arm.of(robot), opening=opening)
         yield motion if spec is None else replace(motion, tcp_link=spec.tcp_link)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Arm:
-    """What is known of the robot: its joint tree, the joints of the state's elements, a model with its masses."""
+    """The joint tree of a robot as far as it is known, and the joints of the state's elements."""
 
     urdf: Urdf | None = None
     joints: Sequence[str] = ()
-    model: str = ""
 
     @classmethod
     def of(cls, robot: DatasetRobot) -> _Arm:
-        """Of a dataset's robot, whose own URDF has no masses."""
-        record = robot.record
-        model = record.spec.urdf if record.spec else ROBOTS.load(record.name).urdf if record.name in ROBOTS.rows else ""
-        return cls(urdf=robot.model, joints=record.joints.get(STATE, ()), model=model)
+        """The arm of a dataset's robot."""
+        return cls(urdf=robot.model, joints=robot.record.joints.get(STATE, ()))
 
 
 def _arm(names: Sequence[str], urdf: str, joints: Sequence[str] = ()) -> _Arm:
@@ -314,11 +268,10 @@ def _arm(names: Sequence[str], urdf: str, joints: Sequence[str] = ()) -> _Arm:
         if not any(joints):
             joints = [stem if stem in movable else "" for stem in stems]
         if not any(joints) and len(movable) >= len(names) - 1 and len(movable) - len(names) in (-1, 0):
-            joints = [*movable, ""][: len(names)]  # in the order of the tree; what is left is a gripper
-        return _Arm(urdf=tree, joints=joints, model=urdf)
-    if (robot := recognised_robot(tuple(names))) is None:
-        return _Arm()
-    return _Arm.of(robot)
+            joints = [*movable, ""][: len(names)]  # in the order of the tree; the last one is a gripper
+        return _Arm(urdf=tree, joints=joints)
+    robot = recognised_robot(tuple(names))
+    return _Arm() if robot is None else _Arm.of(robot)
 
 
 def _motion(
@@ -340,26 +293,9 @@ def _motion(
     if opening < math.inf and GRIPPER in elements:
         place = list(elements).index(GRIPPER)
         lower[place], upper[place] = 0.0, opening
-
-    def in_si(feature: str) -> Array:
-        """By the feature's own units: a leader may tell degrees of an arm that tells rad."""
-        return described[feature].in_si(features[feature])
-
-    state = course_of(in_si(STATE), elements)
-
-    def alike(feature: str) -> Array | None:
-        """The elements of another feature that have the names of the state's, or all of as many without names."""
-        if feature not in features or feature not in names:
-            return None
-        values, theirs = in_si(feature), names[feature]
-        places = {_SUFFIX.sub("", name): index for index, name in enumerate(theirs)}
-        columns = [places.get(_SUFFIX.sub("", name)) for name in elements]
-        if all(column is None for column in columns):
-            return None
-        missing = np.full(len(state), np.nan)
-        return np.stack([missing if column is None else values[:, column] for column in columns], axis=1)
-
-    if (action := alike(ACTION)) is not None:
+    state = course_of(described[STATE].in_si(features[STATE]), elements)
+    action = _same_elements(ACTION, features, described)
+    if action is not None:
         _turn_nearest(action, state, elements)
     return Motion(
         where=where,
@@ -367,34 +303,67 @@ def _motion(
         steps_s=np.full(len(state) - 1, 1 / fps) if time_ns is None else np.maximum(np.diff(time_ns) / 1e9, 0.5 / fps),
         names=tuple(elements),
         state=state,
-        velocity=alike(VELOCITY),
+        velocity=_same_elements(VELOCITY, features, described),
         action=action,
-        effort=alike(EFFORT),
         lower=lower,
         upper=upper,
-        speed=np.array([math.inf if joint is None else joint.max_speed for joint in found]),
         joints=tuple(arm.joints),
         urdf=arm.urdf if any(arm.joints) else None,
-        model=arm.model,
         ee_pose=_poses(features, names),
         sensors=_sensors(features, names),
     )
 
 
+def _same_elements(
+    feature: str, features: Mapping[str, NDArray[Any]], described: Mapping[str, Feature]
+) -> Array | None:
+    """(T, D) of a feature's elements that are named as those of the state, NaN for others; None where none is."""
+    if feature not in features or feature not in described:
+        return None
+    values = described[feature].in_si(features[feature])  # by its own units: a leader may record degrees
+    places = {_SUFFIX.sub("", name): index for index, name in enumerate(described[feature].names)}
+    columns = [places.get(_SUFFIX.sub("", name)) for name in described[STATE].names]
+    if all(column is None for column in columns):
+        return None
+    missing = np.full(len(values), np.nan)
+    return np.stack([missing if column is None else values[:, column] for column in columns], axis=1)
+
+
+def _turn_nearest(action: Array, state: Array, names: Sequence[str]) -> None:
+    """Give the quaternions of actions (T, D), in place, the sign that brings them nearest to the state's."""
+    for place in quaternion_places(names):
+        turn = slice(place, place + 4)
+        action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+
+
 def _sensors(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> dict[str, NDArray[Any]]:
-    """What is observed beside the state, and is no truth of the simulator's."""
+    """The observations other than the state, without the simulator's truth."""
     others = (STATE, ENVIRONMENT_STATE)
     return {
-        name: values
+        name: values.reshape(len(values), -1)
         for name, values in features.items()
         if name.startswith("observation.") and name in names and name not in others
     }
 
 
 def _poses(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> Array | None:
-    """(T, 7) position and quaternion xyzw of the EE pose, whose names may say that it has another order."""
-    if EE_POSE not in features or features[EE_POSE].shape[1:] != (7,):
-        return None
-    last = [name.rpartition(".")[2].rpartition("_")[2] for name in names[EE_POSE]]
-    order = [last.index(word) for word in _QUATERNION] if set(_QUATERNION) <= set(last) else [3, 4, 5, 6]
-    return np.asarray(features[EE_POSE].astype(np.float64)[:, [0, 1, 2, *order]])
+    """(T, 7) position and quaternion xyzw of the EE pose, or of a pose at the end of the state."""
+    for feature in (EE_POSE, STATE):
+        if feature not in features or features[feature].shape[1] < len(_POSE):
+            continue
+        words = [name.rpartition(".")[2].rpartition("_")[2] for name in names[feature][-7:]]
+        is_ordered = set(_POSE[3:]) <= set(words[3:])
+        is_pose = features[feature].shape[1] == 7 if feature == EE_POSE else words[:3] == [*_POSE[:3]] and is_ordered
+        if is_pose:
+            order = [0, 1, 2, *(words.index(word) if is_ordered else 3 + k for k, word in enumerate(_POSE[3:]))]
+            return np.asarray(features[feature].astype(np.float64)[:, -7:][:, order])
+    return None
+
+
+def motion_vector(joint_position: Array) -> Array:
+    """A motion as one row of fixed length: joint positions at 32 moments, evenly spread."""
+    joint_position = without_gaps(joint_position)
+    if not len(joint_position):
+        return np.zeros(32)
+    moments = np.linspace(0, len(joint_position) - 1, 32).round().astype(int)
+    return np.asarray(joint_position[moments], dtype=np.float64).reshape(-1)

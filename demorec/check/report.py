@@ -1,31 +1,28 @@
-"""Runs the checks over whatever a user names and tells what was found."""
+"""Run the checks over recordings, runs and datasets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.base import Check, Form, Group, Level, Result
+from demorec.check.base import Check, Form, Level, Result
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
-from demorec.core.errors import check_option, resource_error
+from demorec.core.errors import check_option
 from demorec.core.processes import process_pool
-from demorec.core.registry import is_allowed
 from demorec.core.tables import CHECKS
-from demorec.episode.info import EpisodeInfo
-from demorec.robots.assets import allow_models, modules_of_models
 from demorec.robots.motors import Motors
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
-_OF_THE_FILE: tuple[Group, ...] = ("file", "time")
-"""Groups of the checks that look at the file itself, not at what was recorded."""
 _WORTH_PROCESSES = {"with images": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
+OPENS_IN_LEROBOT = "dataset_opens"
+"""The check that starts LeRobot, which takes seconds: by request, or where another check failed."""
 SubjectKind = Literal["recording", "run", "dataset"]
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
@@ -38,7 +35,7 @@ class CheckOptions:
         images: Whether images are decoded.
         only: Names of checks; empty for all.
         workers: Processes; 1 works in this one.
-        allowed: The user's own modules beside which models of robots may be read.
+        lerobot: Whether LeRobot opens each dataset; otherwise only those in which another check failed.
         urdf: Text of the description of the robot, for recordings and datasets that do not have one; "" for none.
         motors: The servos whose values LeRobot recorded in datasets with elements of their names.
     """
@@ -46,7 +43,7 @@ class CheckOptions:
     images: bool = True
     only: tuple[str, ...] = ()
     workers: int = 1
-    allowed: tuple[str, ...] = ()
+    lerobot: bool = False
     urdf: str = ""
     motors: Motors | None = None
 
@@ -77,13 +74,10 @@ class Subject:
     Attributes:
         path: Where it is.
         kind: What it is.
-        is_failed_attempt: Whether it is a failed attempt that a run keeps, found there and not named by the user: it
-            is judged apart from what the run made.
     """
 
     path: Path
     kind: SubjectKind
-    is_failed_attempt: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,11 +86,9 @@ class SubjectReport(Subject):
 
     Attributes:
         results: In the order of the table.
-        needs_allow: The user's own modules that must be allowed for the checks that were skipped for lack of them.
     """
 
     results: tuple[Result, ...]
-    needs_allow: tuple[str, ...] = ()
 
     @property
     def level(self) -> Level:
@@ -104,18 +96,8 @@ class SubjectReport(Subject):
         return max((result.level for result in self.results), key=lambda level: _SEVERITY[level], default="skip")
 
     def is_bad(self, *, strict: bool = False) -> bool:
-        """Whether it must not be as it is: a check failed, or with `strict` warned.
-
-        A failed attempt that a run keeps may have dropped its cube or hit the table, that is why it failed; bad is one
-        whose file is damaged, which the checks of file and time find.
-        """
-        limit = _SEVERITY["warn" if strict else "fail"]
-        return any(_SEVERITY[result.level] >= limit for result in self.judged)
-
-    @property
-    def judged(self) -> tuple[Result, ...]:
-        """The results that count: all, or of a failed attempt those about its file."""
-        return tuple(r for r in self.results if not self.is_failed_attempt or r.group in _OF_THE_FILE)
+        """Whether a check failed, or with `strict` warned."""
+        return _SEVERITY[self.level] >= _SEVERITY["warn" if strict else "fail"]
 
     def count(self, level: Level) -> int:
         """How many results have a level."""
@@ -135,8 +117,7 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
             found.append(Subject(path=path, kind="dataset"))
         elif there.kind == "run":
             found.append(Subject(path=path, kind="run"))
-            found += [Subject(path=file, kind="recording") for file in there.recordings]
-            found += [Subject(path=file, kind="recording", is_failed_attempt=True) for file in there.failed]
+            found += [Subject(path=file, kind="recording") for file in (*there.recordings, *there.failed)]
             if find(path / DATASET).kind == "dataset":
                 found.append(Subject(path=path / DATASET, kind="dataset"))
         else:
@@ -158,7 +139,7 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
             yield check_subject(subject, options)
         return
     with process_pool(min(options.workers, len(subjects))) as pool:
-        # Datasets take longest, since LeRobot has to load for them: they begin first.
+        # Datasets take longest: they begin first.
         order = sorted(subjects, key=lambda subject: subject.kind != "dataset")
         begun = {subject: pool.submit(check_subject, subject, options) for subject in order}
         for subject in subjects:
@@ -167,74 +148,42 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """All checks of one recording, run or dataset."""
-    allow_models(options.allowed)
-    infos: Sequence[EpisodeInfo] = ()
-    scene: tuple[Form, ...] = ()  # what is asked of others that have a scene
     if subject.kind == "recording":
         with CheckedEpisode(subject.path, options.urdf) as episode:
-            found = _run(options, episode, ("opens", "readable"), lambda: episode.columns)
-            scene = ("simulated",) if episode.form == "external" else ()
-            if any(result.needs_allow for result in found):
-                infos = [episode.info]
+            found = _run(options, episode)
     elif subject.kind == "run":
-        run = CheckedRun(subject.path)
-        found = _run(options, run, (), lambda: None)
-        scene = ("run",) if run.form == "external run" else ()
+        found = _run(options, CheckedRun(subject.path))
     else:
-        dataset = Dataset(subject.path, options.urdf, options.motors)
-        found = _run(options, dataset, ("dataset_readable",), lambda: dataset.rows)
-        if any(result.needs_allow for result in found):
-            infos = [info for info in dataset.infos if info]
-    known = {result.check for result in found}
-    found += [
-        check.not_applicable()
-        for check in options.checks(*scene)
-        if check.name not in known and (options.images or not check.needs_images)
-    ]
-    models = [name for info in infos for name in (info.robot.urdf, *(body.shape.file for body in info.scene.bodies))]
-    modules = tuple(name for name in modules_of_models(models) if not is_allowed(name, options.allowed))
+        found = _run(options, Dataset(subject.path, options.urdf, options.motors))
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
-    return SubjectReport(**vars(subject), results=results, needs_allow=modules)
+    return SubjectReport(**vars(subject), results=results)
 
 
 Checked = CheckedEpisode | Dataset | CheckedRun
 
 
 def _within(path: Path, detail: str) -> str:
-    """What a check says, without the path of its subject, which the report has above it."""
+    """The detail of a result without the path of its subject, which the report prints above it."""
     return detail.removesuffix(f": {path}").replace(f"{path}/", "")
 
 
-def _run(options: CheckOptions, subject: Checked, gates: tuple[str, ...], read: Callable[[], object]) -> list[Result]:
-    """Run the checks of a subject in order; what needs something damaged is skipped, not failed once more.
-
-    The checks of file and time look at the file itself and are run as far as it can be opened.
-    """
+def _run(options: CheckOptions, subject: Checked) -> list[Result]:
+    """Run the checks of a subject in order. One that fails for the same unreadable part as another is blocked."""
     checks = [check for check in options.checks(subject.form) if options.images or not check.needs_images]
     results: list[Result] = []
-    printed: set[str] = set()
-    unreadable = ""
-    try:
-        read()
-    except Exception as error:
-        if (lack := resource_error(error)) is not None:
-            raise lack from error
-        unreadable = str(error) or "the numbers cannot be read"
+    unreadable: set[str] = set()
     for check in checks:
-        if unreadable and check.group not in _OF_THE_FILE and check.name not in gates:
-            results.append(check.blocked())
+        if check.name == OPENS_IN_LEROBOT and not (
+            options.lerobot or check.name in options.only or any(result.level == "fail" for result in results)
+        ):
             continue
         result = check.run(subject)
-        if result.level == "fail" and result.value is None:  # something could not be read
-            if result.detail in printed:
+        if result.level == "fail" and result.value is None:
+            if result.detail in unreadable:
                 result = check.blocked()
-            printed.add(result.detail)
+            unreadable.add(result.detail)
         results.append(result)
         if check.name == "opens" and result.level == "fail":
             results += [other.blocked() for other in checks if other is not check]
             break
-    if gates and unreadable and all(result.level in ("pass", "skip") for result in results):
-        # No chosen check looks at what is broken; it must not pass for that.
-        gate = CHECKS.load(gates[-1])
-        results.append(gate.run(subject))
     return results

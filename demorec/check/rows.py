@@ -1,6 +1,6 @@
 """Rigid transforms over all frames at once: forward kinematics, distances and angles of (T, ...) arrays.
 
-Written apart from `demorec.robots.kinematics` on purpose: that code made the recorded poses, this one judges them.
+Independent of `demorec.robots.kinematics` on purpose: that code made the recorded poses, this one judges them.
 """
 
 from __future__ import annotations
@@ -27,16 +27,6 @@ def matrices(poses: Array) -> Array:
     return out
 
 
-def inverse(transforms: Array) -> Array:
-    """(T, 4, 4) of the inverse rigid transforms."""
-    out = np.zeros_like(transforms)
-    rotation = np.swapaxes(transforms[:, :3, :3], 1, 2)
-    out[:, :3, :3] = rotation
-    out[:, :3, 3] = -np.einsum("tij,tj->ti", rotation, transforms[:, :3, 3])
-    out[:, 3, 3] = 1.0
-    return out
-
-
 class LinkMatrices:
     """Forward kinematics of some joint positions: each link's poses are computed once, when they are asked for.
 
@@ -55,18 +45,18 @@ class LinkMatrices:
         """(T, 4, 4) base_from_link; KeyError when there is no such link."""
         if link not in self._known:
             joint = self._above[link]
-            self._known[link] = self[joint.parent] @ self.parent_from_child(joint)
+            self._known[link] = self[joint.parent] @ self._parent_from_child(joint)
         return self._known[link]
 
-    def parent_from_child(self, joint: UrdfJoint) -> Array:
+    def _parent_from_child(self, joint: UrdfJoint) -> Array:
         """(T, 4, 4), or (4, 4) where a joint does not move."""
         position = self._joint_position.get(joint.name)
         if position is None or joint.kind == "fixed":
             return joint.parent_from_joint.matrix()
-        return joint_matrices(joint, position)
+        return _joint_matrices(joint, position)
 
 
-def joint_matrices(joint: UrdfJoint, position: Array) -> Array:
+def _joint_matrices(joint: UrdfJoint, position: Array) -> Array:
     """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m); turns are by Rodrigues' formula."""
     at_zero, along = joint.parent_from_joint.matrix(), position[:, None, None]
     x, y, z = joint.axis
@@ -79,19 +69,12 @@ def joint_matrices(joint: UrdfJoint, position: Array) -> Array:
     return np.asarray(at_zero + np.sin(along) * turned + (1 - np.cos(along)) * (turned @ cross))
 
 
-def displacement(a: Array, b: Array, *, lever: float = 0.1) -> Array:
-    """(T,) metres: how far apart two transforms (T, 4, 4) are: of the origins, plus what the rotation does at `lever`.
-
-    One number for position and rotation: a turn by an angle moves a point at the lever's end by lever times angle.
-    """
-    return np.asarray(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1) + lever * angle_between(a, b))
-
-
-def angle_between(a: Array, b: Array) -> Array:
-    """(T,) rad between the rotations of transforms (T, 4, 4)."""
+def displacement(a: Array, b: Array, *, lever_m: float = 0.1) -> Array:
+    """(T,) metres between two transforms (T, 4, 4): of the origins, plus what the rotation moves at a lever's end."""
     # |R - S| (Frobenius) = 2 sqrt(2) sin(angle / 2): exact for small angles, unlike the arc cosine of the trace.
     chord = np.sqrt(((a[:, :3, :3] - b[:, :3, :3]) ** 2).sum(axis=(1, 2)))
-    return np.asarray(2 * np.arcsin(np.minimum(chord / (2 * np.sqrt(2)), 1.0)))
+    angle = 2 * np.arcsin(np.minimum(chord / (2 * np.sqrt(2)), 1.0))
+    return np.asarray(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1) + lever_m * angle)
 
 
 def finest_lag(lags: Sequence[int], errors: Sequence[float]) -> float:
@@ -102,14 +85,6 @@ def finest_lag(lags: Sequence[int], errors: Sequence[float]) -> float:
     low, middle, high = errors[best - 1 : best + 2]
     bend = low - 2 * middle + high
     return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0)
-
-
-def held_for(flags: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
-    """Each True lasts for `count` more entries."""
-    if not len(flags):
-        return flags
-    last = np.where(flags, np.arange(len(flags)), -(10**9))
-    return np.asarray(np.arange(len(flags)) - np.maximum.accumulate(last) <= count)
 
 
 def longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Is the dataset in a run's folder that of the run: every episode against the recording that it comes from."""
+"""The dataset in a run's folder against the recordings that it comes from."""
 
 from __future__ import annotations
 
@@ -21,23 +21,28 @@ from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transco
 from demorec.datasets.lerobot.sidecar import EXPORT_PATH, EpisodeRecord
 from demorec.datasets.lerobot.videos import PacketReader
 from demorec.mcap import open_recording
+from demorec.runs.run_file import DATASET
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """What the sidecar keeps that is not of the recording."""
 
 
-@run_check(measures="episodes of the run's dataset that are not what was recorded")
-def run_dataset_content(run: CheckedRun) -> Measurement | None:
-    """Every number and coded image of each episode is that of its recording, exported with the same options."""
-    path = run.path / "dataset"
+@run_check(measures="episodes of the run's dataset that are missing, surplus, or not what was recorded")
+def run_dataset(run: CheckedRun) -> Measurement | None:
+    """Compare every number and encoded image of each episode with its recording, exported with the same options."""
+    path = run.path / DATASET
     if not is_dataset(path):
         return None
     dataset = Dataset(path)
     if not all("source" in row for row in dataset.sidecar) or not dataset.sidecar:
-        return Measurement(value=1, detail="the dataset does not say which recordings it comes from")
+        return Measurement(value=1, detail="the dataset does not state which recordings it comes from")
     dataset.check_simulated()
     options = export_options(path)
     wrong: list[str] = []
+    successes = len(run.run.successes)
+    found = sum(bool(row["success"]) for row in dataset.sidecar)
+    if found != successes:
+        wrong.append(f"it has {found} successes, the run {successes}")
     for episode, videos in with_videos(dataset):
         folder = run.path / ("episodes" if episode.kept["success"] else "failed")
         file = folder / Path(str(episode.kept["source"])).name

@@ -1,4 +1,4 @@
-"""`demorec check`: every check over recordings, runs and datasets."""
+"""`demorec check`: the checks over recordings, runs and datasets."""
 
 from __future__ import annotations
 
@@ -9,19 +9,17 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.cli.replay import demonstrations, describe_replay
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
-from demorec.core.errors import ConfigError, OptionError, describe_error
+from demorec.core.errors import ConfigError, describe_error
 from demorec.robots.motors import MotorUnits
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
-    from demorec.check.report import CheckOptions, Subject, SubjectReport
-    from demorec.replay import ReplayReport
+    from demorec.check.report import Subject, SubjectReport
     from demorec.replay.deep import DeepReport
 
 
@@ -31,11 +29,10 @@ _SHOWN = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Check recordings, runs and datasets: files, time, physics, alignment, calibration, images.
+    """Check recordings, runs and datasets: files, times, numbers, motion, images.
 
-    Exit code 0: everything passed (warnings allowed); 1: a check failed. The failed attempts that a run keeps are
-    judged apart: their own failures are reported, but only a damaged file counts. `demorec list checks` says what is
-    measured and with which limits.
+    Exit code 0: everything passed (warnings allowed); 1: a check failed. `demorec list checks` prints what is measured
+    and the limits.
 
     Examples:
       demorec check recordings/cubes
@@ -43,7 +40,7 @@ class Check:
       demorec check datasets/cubes --json
       demorec check monday.mcap --mapping robot.toml
       demorec check datasets/so101_cups --motor-units degrees
-      demorec check recordings/cubes --replay 5
+      demorec check datasets/cubes --lerobot
       demorec check recordings/cubes/episodes/episode_000007.mcap --deep
     """
 
@@ -64,8 +61,8 @@ class Check:
     says)."""
     strict: bool = False
     """Warnings count as failures."""
-    replay: int = 0
-    """Also replay this many episodes of each run or dataset, spread evenly, and every recording given by itself."""
+    lerobot: bool = False
+    """Also let the installed LeRobot open each dataset, which takes seconds; always done where another check fails."""
     deep: bool = False
     """Also make every recording, and every episode of a dataset, again from config and seed, and compare every number
     and image; takes about as long as generating them."""
@@ -74,16 +71,14 @@ class Check:
     verbose: bool = False
     """List what passed, too: every recording, run and dataset, and each of their checks."""
     allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name, and
-    beside which their models may be read."""
+    """With --deep: a module or package of your own that may be imported for the tasks, robots and cameras that the
+    files name, and beside which their models may be read."""
     json: bool = False
     """Print JSON: a list with one object for each recording, run and dataset."""
 
     def run(self) -> int:
         """Check and report."""
         need_paths(self.paths, "check")
-        if self.replay < 0:
-            raise OptionError("replay", f"is {self.replay}, it must be 0 or more.")
         with reading(self.paths, self.mapping) as paths:
             return replace(self, paths=paths)._check()
 
@@ -91,7 +86,6 @@ class Check:
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
         from demorec.core.processes import available_cores
 
-        allowed = allowed_modules(self.allow)
         subjects = find_subjects(self.paths)
         workers = self.workers
         if workers is None:
@@ -100,12 +94,12 @@ class Check:
             images=self.images,
             only=self.only,
             workers=workers,
-            allowed=allowed,
+            lerobot=self.lerobot,
             urdf=self._description(),
             motors=named_motors(self.motor_units, self.calibration),
         )
         options.validate()
-        reports, replays = [], []
+        reports = []
         with ProgressBar("checking", total=len(subjects), unit="item", at_once=workers) as bar:
             for report in check_subjects(subjects, options):
                 reports.append(report)
@@ -114,23 +108,15 @@ class Check:
                     say(*_lines(report, verbose=self.verbose))
         if not (self.json or self.verbose):
             say(*_passed([report for report in reports if report.level == "pass"]))
-        if self.replay:
-            for replayed, is_as_recorded in _replays(self.paths, self.replay, allowed):
-                replays.append((replayed, is_as_recorded))
-                if not self.json:
-                    say(describe_replay(replayed))
-        remade = list(self._remade(subjects, options)) if self.deep else []
+        remade = list(self._remade(subjects, workers)) if self.deep else []
         failed = [report for report in reports if report.is_bad(strict=self.strict)]
-        diverged = [replayed for replayed, is_as_recorded in replays if not is_as_recorded]
         different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
         if self.json:
-            plain = [_plain(report) for report in reports] + [_plain_replay(*replayed) for replayed in replays]
-            say_json(plain + [plain_deep(report) for report in remade])
+            say_json([_plain(report) for report in reports] + [plain_deep(report) for report in remade])
         else:
-            summary = _summary(reports, len(failed), len(replays), len(diverged))
-            say(summary + deep_summary(remade, different), *_lacking(reports))
+            say(_summary(reports, len(failed)) + deep_summary(remade, different))
         tell_unfinished(self.paths)
-        return 1 if failed or diverged or different else 0
+        return 1 if failed or different else 0
 
     def _description(self) -> str:
         """Text of the URDF that the user names, "" for none; ConfigError for what is none."""
@@ -146,12 +132,13 @@ class Check:
             raise ConfigError(f"--urdf is no robot's description ({describe_error(error)}): {self.urdf}") from error
         return text
 
-    def _remade(self, subjects: Sequence[Subject], options: CheckOptions) -> Iterator[DeepReport]:
+    def _remade(self, subjects: Sequence[Subject], workers: int) -> Iterator[DeepReport]:
         from demorec.replay.deep import deep_checks, deep_dataset_checks
 
+        allowed = allowed_modules(self.allow)
         paths, datasets = _split(subjects)
-        found = [deep_checks(paths, workers=options.workers, allowed=options.allowed)]
-        found += [deep_dataset_checks(path, allowed=options.allowed) for path in datasets]
+        found = [deep_checks(paths, workers=workers, allowed=allowed)]
+        found += [deep_dataset_checks(path, allowed=allowed) for path in datasets]
         with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
             for report in chain.from_iterable(found):
                 bar.advance()
@@ -167,16 +154,6 @@ def _split(subjects: Sequence[Subject]) -> tuple[list[Path], list[Path]]:
     return [subject.path for subject in subjects if subject.kind == "recording"], datasets
 
 
-def _replays(paths: Sequence[Path], count: int, allowed: tuple[str, ...]) -> Iterator[tuple[ReplayReport, bool]]:
-    """Replays, and whether each is as recorded: bit for bit, or for float32 actions of a dataset in its outcome."""
-    from demorec.replay import ReplayOptions, is_as_recorded, replay_all
-
-    options = ReplayOptions(allowed=allowed)
-    for path in paths:
-        found = demonstrations([path], options, limit=count)
-        yield from ((report, is_as_recorded(report)) for report, _ in replay_all(found, options))
-
-
 def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
     words: tuple[tuple[Level, str], ...] = (
         ("pass", "passed"),
@@ -185,53 +162,28 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
         ("skip", "not measured"),
     )
     blocked = sum(result.is_blocked for result in report.results)
-    lacking = sum(result.needs_allow for result in report.results)
-    absent = sum(bool(result.lacks) for result in report.results)
-    apart = blocked + lacking + absent
-    numbers = {level: report.count(level) - (apart if level == "skip" else 0) for level, _ in words}
+    numbers = {level: report.count(level) - (blocked if level == "skip" else 0) for level, _ in words}
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
-    if lacking:
-        counts += f", {lacking} {'needs' if lacking == 1 else 'need'} --allow"
-    if absent and counts:
-        counts += f", {absent} not applicable"
     counts = counts or f"none of the chosen checks is about a {report.kind}"
-    kind = "failed attempt" if report.is_failed_attempt else report.kind
-    yield f"{report.level:<4}  {kind} {report.path}: {counts}"
+    yield f"{report.level:<4}  {report.kind} {report.path}: {counts}"
     for result in report.results:
         if result.level in ("warn", "fail") or (verbose and not result.is_blocked):
             yield f"      {_result(result)}"
-    if counts and not verbose:
-        yield from _not_applicable([report])
+    if not verbose:
+        yield from _not_measured([report])
     if blocked:
         yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
 
 
-_FLAGS = {
-    "a robot whose URDF is known": "--urdf FILE",
-    "EE poses, and a robot whose URDF is known": "--urdf FILE",
-    "efforts of the joints, and their robot's masses": "--urdf FILE",
-}
-"""What a check needs -> the flag that may give it."""
+def _not_measured(reports: Sequence[SubjectReport]) -> Iterator[str]:
+    """One line for each reason why checks measured nothing."""
+    from demorec.check.base import NOTHING
 
-
-def _not_applicable(reports: Sequence[SubjectReport]) -> Iterator[str]:
-    """How many checks were not applicable, for lack of what, and what would change it."""
-    needs = Counter(result.lacks for report in reports for result in report.results if result.lacks)
-    if not needs:
-        return
-    reasons = [f"{count} {'needs' if count == 1 else 'need'} {need}" + (f" ({_FLAGS[need]})" if need in _FLAGS else "")
-               for need, count in needs.most_common()]  # fmt: skip
-    yield f"      Not applicable: {'; '.join(reasons)}."
-
-
-def _lacking(reports: Sequence[SubjectReport]) -> Iterator[str]:
-    """What was skipped, and the flags that it takes."""
-    lacking = sum(result.needs_allow for report in reports for result in report.results)
-    if modules := dict.fromkeys(name for report in reports for name in report.needs_allow):
-        yield (
-            f"{counted(lacking, 'check')} skipped, which need files beside code from outside of demorec: if you trust "
-            f"it, add {' '.join(f'--allow {name}' for name in modules)}."
-        )
+    results = [result for report in reports for result in report.results if result.level == "skip"]
+    reasons = Counter(f"{r.check}: {r.detail}" for r in results if not r.is_blocked and r.detail != NOTHING)
+    for reason, count in reasons.most_common():
+        times = "" if count == 1 else f" ({count} times)"
+        yield f"      not measured  {reason}{times}"
 
 
 def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
@@ -239,14 +191,12 @@ def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
     if len(reports) < 2:
         yield from (line for report in reports for line in _lines(report, verbose=False))
         return
-    kinds = Counter("failed attempt" if report.is_failed_attempt else report.kind for report in reports)
+    kinds = Counter(report.kind for report in reports)
     passed, skipped = (sum(report.count(level) for report in reports) for level in ("pass", "skip"))
-    absent = sum(bool(result.lacks) for report in reports for result in report.results)
-    unmeasured = f", {skipped - absent} not measured" if skipped - absent else ""
-    unmeasured += f", {absent} not applicable" if absent else ""
+    unmeasured = f", {skipped} not measured" if skipped else ""
     things = ", ".join(counted(number, kind) for kind, number in kinds.items())
     yield f"pass  {things}: {passed} checks passed{unmeasured}"
-    yield from _not_applicable(reports)
+    yield from _not_measured(reports)
 
 
 def _result(result: Result) -> str:
@@ -259,15 +209,13 @@ def _result(result: Result) -> str:
     return f"{result.level:<4}  {result.check}{value}{limit}{detail}"
 
 
-def _summary(reports: Sequence[SubjectReport], failed: int, replays: int, diverged: int) -> str:
+def _summary(reports: Sequence[SubjectReport], failed: int) -> str:
     warned = sum(report.level == "warn" for report in reports)
     unmeasured = sum(report.level == "skip" for report in reports)
     text = f"{len(reports) - unmeasured} checked, {failed} failed, {warned} with warnings."
     if unmeasured:
         text += f" Of {unmeasured} nothing was measured."
-    if apart := sum(report.is_failed_attempt and report.level == "fail" and not report.is_bad() for report in reports):
-        text += f" Not counted, since what they recorded fails checks: {counted(apart, 'failed attempt')}."
-    return text + (f" {replays} replayed, {diverged} not as recorded." if replays else "")
+    return text
 
 
 def _plain(report: SubjectReport) -> dict[str, Any]:
@@ -277,22 +225,7 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
     for result in results:
         if result["value"] is not None and abs(result["value"]) == float("inf"):
             result["value"] = None  # JSON has no infinity; the level and the detail tell
-    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results} | (
-        ({"failed_attempt": True} if report.is_failed_attempt else {})
-        | ({"needs_allow": list(report.needs_allow)} if report.needs_allow else {})
-    )
-
-
-def _plain_replay(report: ReplayReport, is_as_recorded: bool) -> dict[str, Any]:
-    from demorec.core.plain import to_plain
-
-    plain = to_plain(report)
-    return {
-        "path": plain.pop("name"),
-        "kind": "replay",
-        "level": "pass" if is_as_recorded else "fail",
-        "results": [plain],
-    }
+    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results}
 
 
 def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:

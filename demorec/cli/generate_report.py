@@ -29,8 +29,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
         progress: Called with how many things of how many are done.
 
     Returns:
-        What was found, for the closing table, and one line for each check that failed. A failed attempt that fails
-        checks of what it recorded is reported, but counts for nothing.
+        What was found, for the closing table, and one line for each check that failed.
     """
     from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
     from demorec.replay.deep import deep_checks
@@ -40,15 +39,11 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
     workers = useful_workers(subjects, images=False, cores=available_cores())
-    options = CheckOptions(images=False, workers=workers, allowed=result.run.config.modules)
+    options = CheckOptions(images=False, workers=workers)
     warnings = 0
     failures: list[str] = []
-    failed_attempts = 0
     for done, report in enumerate(check_subjects(subjects, options)):
         progress(done + 1, total)
-        if report.is_failed_attempt and not report.is_bad():
-            failed_attempts += report.level == "fail"
-            continue
         warnings += report.count("warn")
         failures += [f"{report.path.name}: {r.check}: {r.detail}" for r in report.results if r.level == "fail"]
     paths = [result.folder / file for file in sample]
@@ -59,8 +54,6 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
             first = again.error or str(again.differences[0])
             failures.append(f"{again.path.name}: made again, it is not the same: {first}")
     found = [f"{len(failures)} failed" if failures else "none failed", f", {counted(warnings, 'warning')}"]
-    if failed_attempts:
-        found.append(f" (not counted: those of {counted(failed_attempts, 'failed attempt')})")
     if sample:
         found.append(f"; {counted(len(sample), 'episode')} made again and compared")
     return "".join(found), failures

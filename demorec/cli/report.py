@@ -8,7 +8,6 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, size_in_words
 from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
@@ -47,8 +46,6 @@ class Report:
     """Also run the checks that decode all images."""
     workers: int = 1
     """Processes that read and check recordings."""
-    allow: Allow = ()
-    """A module or package of your own; models of robots and objects beside it may be read."""
     overwrite: bool = False
     """Replace an existing report."""
 
@@ -75,7 +72,7 @@ class Report:
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
-        checks = CheckOptions(images=self.images, allowed=allowed_modules(self.allow)) if self.checks else None
+        checks = CheckOptions(images=self.images) if self.checks else None
         with (
             reading([self.path], self.mapping) as (path,),
             ProgressBar("reading", unit="item") as bar,

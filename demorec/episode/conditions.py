@@ -15,8 +15,6 @@ MAX_DISTURBANCE = 0.02
 MIN_OPENING = 0.875
 """Share of the gripper's full opening that counts as open."""
 
-PLACED = ("distance_to_goal", "height_error", "on_support", "tilt", "speed", "spin", "touched_by_robot")
-"""Of each goal."""
 DISTURBED, OPEN = "disturbed", "gripper_width"
 LIMITS: dict[str, tuple[Literal["at most", "at least"], float]] = {
     "distance_to_goal": ("at most", MAX_DISTANCE),

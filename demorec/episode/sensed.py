@@ -87,7 +87,6 @@ class Sensed:
         meaning: In words, with units and coordinate frame.
         names: Of the D elements that datasets have: the first ones of the quantity.
         plots: Of all D elements, in order.
-        may_rest: Whether it stays zero as long as nothing happens to it, while the arm moves.
         topic: Where its own messages are.
         components: Names of their elements, as tables of frames have them.
         layout: Of them: "wrench" is a force and a torque on the hand, along the axes of its link
@@ -98,7 +97,6 @@ class Sensed:
     meaning: str
     names: Callable[[RobotSpec], tuple[str, ...]]
     plots: tuple[Plot, ...]
-    may_rest: bool = False
     topic: str = ""
     components: Callable[[RobotSpec], tuple[str, ...]] = lambda robot: ()
     layout: Literal["wrench", "array"] = "array"
@@ -121,7 +119,6 @@ SENSED: Mapping[str, Sensed] = {
         meaning="sum of the normal forces on the fingers (N)",
         names=lambda robot: ("gripper.force",),
         plots=(Plot(curves="force", title="contact force (N)", names=("contact force",)),),
-        may_rest=True,
     ),
     # As a force-torque sensor at the hand's mount feels it: about the origin of the hand's link, nothing taken off; the
     # weight and the inertia of hand, fingers and what they hold are in it.
@@ -142,6 +139,3 @@ SENSED: Mapping[str, Sensed] = {
 
 STREAMS: Mapping[str, Sensed] = {row.quantity: row for row in SENSED.values() if row.topic}
 """Quantity -> the row of one that has messages of its own."""
-
-MAY_REST = frozenset(name for feature, row in SENSED.items() if row.may_rest for name in (feature, row.quantity))
-"""Features and quantities that stay zero as long as nothing happens to them."""

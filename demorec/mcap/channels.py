@@ -88,8 +88,6 @@ _VIDEO_STREAMS = {
     "16UC1": "depth",
     "32FC1": "depth",
 }
-IMAGE_STREAMS = (*(_VIDEO_STREAMS[codec] for codec in ("h264", "av1", "jpeg")), "depth", "segmentation", "histogram")
-"""Streams of a camera that come from its images; H.265 is only kept, in external episodes."""
 
 
 def video_topic(camera: str, codec: str) -> str:

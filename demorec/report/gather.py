@@ -92,8 +92,7 @@ def _recordings_report(
     if later:
         missing.append(f"{len(later)} recordings of episodes beyond the number last asked for are left out.")
     subjects = [
-        *(Subject(path=file, kind="recording") for file in found.recordings if file not in later),
-        *(Subject(path=file, kind="recording", is_failed_attempt=True) for file in found.failed if file not in later),
+        Subject(path=file, kind="recording") for file in (*found.recordings, *found.failed) if file not in later
     ]
     if not subjects:
         expect_recordings(found, ())
@@ -107,7 +106,7 @@ def _recordings_report(
         for feature, (names, values) in vectors.items():
             count(components, feature, names, values)
         if checked is not None:
-            summaries.add(checked.judged, episode.name)
+            summaries.add(checked.results, episode.name)
         advance(len(episodes), total)
     if checks is None:
         missing.append("No checks were run (--no-checks).")
@@ -138,7 +137,7 @@ def _read_all(
 ) -> Iterator[_Read]:
     stride = -(-len(subjects) // MAX_SHOWN)
     budget = strip_budget(len(subjects))
-    strips = [0 if number % stride and not s.is_failed_attempt else budget for number, s in enumerate(subjects)]
+    strips = [0 if number % stride and s.path.parent.name != FAILED else budget for number, s in enumerate(subjects)]
     return in_turn(
         partial(_read, root, camera, checks), list(zip(subjects, strips, strict=True)), workers, ahead=_AHEAD
     )

@@ -21,7 +21,6 @@ from jinja2.environment import TemplateStream
 from markupsafe import Markup
 
 from demorec.check.base import Result
-from demorec.check.coverage import MIN_VALUES, drawn_columns, randomised, with_unit
 from demorec.core.errors import ConfigError
 from demorec.core.replacing import REPORT, REPORT_MARK, written_whole
 from demorec.core.text import printable
@@ -30,6 +29,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.report import charts
 from demorec.report.charts import Chart, css_color
 from demorec.report.content import LEVELS, Report, ReportedEpisode, State, success_rate
+from demorec.report.coverage import MIN_VALUES, drawn_columns, randomised, with_unit
 from demorec.report.filmstrip import MAX_SHOWN
 from demorec.report.histogram import Histogram
 from demorec.view.style import phase_colors

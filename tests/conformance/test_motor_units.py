@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 JAW = (-0.174533, 1.74533)
 """Limits of the URDF, rad: LeRobot's 0 and 100."""
 UNITS = ("degrees", "range_m100_100")
-KINEMATIC = ("joint_limits", "joint_speed", "joint_acceleration", "state_follows_action", "state_reaches_action")
+KINEMATIC = ("joint_limits", "action_lag")
 OF_THE_URDF = CALIBRATIONS / "so101_urdf.json"
 OWN = {
     "shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -81, "range_min": 721, "range_max": 3389},

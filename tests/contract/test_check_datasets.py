@@ -1,10 +1,9 @@
-"""Faults in runs and datasets, one at a time, and the checks that are meant for them."""
+"""Faults of datasets, one at a time, and the checks that are meant for them."""
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,246 +11,214 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.check import checked, copy, edit_column, edit_json, level_of, simulate_run
+from support.check import checked, copy, edit_column, edit_json, edit_parquet, level_of, simulate, simulate_run
+from support.export import rewrite_video
 from support.external import make_external, write_external
+from support.mcap import rewritten
 
-from demorec.check.coverage import largest_gap
-from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.core.tables import TASKS
+from demorec.check.dataset import Dataset
+from demorec.check.run_dataset import with_videos
+from demorec.cli import main
+from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.episode.info import EpisodeInfo
-from demorec.loop import prepare
+from demorec.mcap import channels
 
+CAMERA = "observation.images.front"
+STATE = "observation.state"
+Fault = Callable[[Path], None]
 Rows = np.ndarray[Any, Any]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulate_run(tmp_path_factory.mktemp("check") / "run", 3, seed=3)
-
-
-@pytest.fixture(scope="session")
-def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("check_ds") / "ds"
-    export_lerobot([run], folder, ExportOptions(verify=False))
+    """Three filmed episodes and their dataset."""
+    folder = simulate_run(tmp_path_factory.mktemp("faults") / "run", 3, seed=3, cameras=("front",), width=64, height=64)
+    export_lerobot([folder], folder / "dataset", ExportOptions(verify=False))
     return folder
 
 
-@pytest.fixture(scope="session")
-def filmed_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("check_filmed")
-    run = simulate_run(folder / "run", 2, seed=3, cameras=("front",))
-    export_lerobot([run], folder / "ds", ExportOptions(verify=False))
-    return folder / "ds"
+@pytest.fixture
+def dataset(run: Path, tmp_path: Path) -> Path:
+    """A copy to be spoilt."""
+    return copy(run / "dataset", tmp_path / "dataset")
 
 
-def test_the_good_ones_pass_without_a_warning(run: Path, dataset: Path, filmed_dataset: Path) -> None:
-    for path, kind in ((run, "run"), (dataset, "dataset")):
-        report = checked(path, kind, images=False)
-        assert [r for r in report.results if r.level in ("warn", "fail")] == []
-        assert report.count("pass") >= 3
-    assert level_of(filmed_dataset, "dataset_image_statistics", "dataset") == "pass"
-    assert level_of(filmed_dataset, "dataset_videos", "dataset") == "pass"
+def of_info(change: Callable[[Any], Any]) -> Fault:
+    return lambda dataset: edit_json(dataset / "meta/info.json", change)
 
 
-# ------------------------------------------------------------------------------------------------- runs
+def of_feature(name: str, **values: Any) -> Fault:
+    return of_info(lambda data: data["features"][name].update(values))
 
 
-@pytest.mark.parametrize("complete", [True, False])
-def test_what_a_killed_run_has_not_listed_yet(run: Path, tmp_path: Path, complete: bool) -> None:
-    spoilt = copy(run, tmp_path / "run")
-    shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000007.mcap")
-    told = json.loads((spoilt / "run.json").read_text())
-    (spoilt / "run.json").write_text(json.dumps({**told, "complete": complete}))
-    results = checked(spoilt, "run", images=False).results
-    (found,) = [result for result in results if result.check == "run_files"]
-    assert "episode_000007.mcap is not in run.json" in found.detail
-    assert ("the command that began the run takes it in" in found.detail) != complete
+def of_video(**values: Any) -> Fault:
+    return of_info(lambda data: data["features"][CAMERA]["info"].update({f"video.{k}": v for k, v in values.items()}))
 
 
-def test_a_dataset_that_lacks_an_episode(run: Path, tmp_path: Path) -> None:
-    spoilt = copy(run, tmp_path / "run")
-    export_lerobot([spoilt], spoilt / "dataset", ExportOptions(verify=False))
-    assert level_of(spoilt, "run_dataset", "run") == "pass"
-    edit_json(spoilt / "dataset/meta/info.json", lambda data: data.update(total_episodes=2))
-    assert level_of(spoilt, "run_dataset", "run") == "fail"
+def of_stats(name: str, quantity: str, value: Callable[[Any], Any]) -> Fault:
+    return lambda dataset: edit_json(
+        dataset / "meta/stats.json", lambda data: data[name].update({quantity: value(data[name][quantity])})
+    )
 
 
-def _infos(count: int) -> list[EpisodeInfo]:
-    return [prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=i)).info for i in range(count)]
-
-
-def test_coverage() -> None:
-    infos = _infos(60)
-    full = largest_gap(infos)
-    assert full is not None
-    assert full.value < 0.35
-    # The middle half of the table left out, as a sampler with a bug would.
-    x = [info.scene.body("red_cube").world_from_body.position[0] for info in infos]
-    low, high = np.quantile(x, [0.1, 0.9])
-    outer = [info for info, value in zip(infos, x, strict=True) if not low < value < high]
-    halved = largest_gap(outer * 5)
-    assert halved is not None
-    assert halved.value > 0.35
-    same = largest_gap([infos[0]] * 60)
-    assert same is not None
-    assert same.value == 1.0
-    # Five starts ten times each and five single ones: too few are drawn to be judged alone, and it is no coverage.
-    few = largest_gap([info for info in infos[:5] for _ in range(10)] + infos[5:10])
-    assert few is not None
-    assert few.value > 0.35
-    assert largest_gap(infos[:40]) is None  # too few to judge
-
-
-@pytest.mark.parametrize("task", TASKS.names())
-def test_what_is_chosen_from_a_few_is_no_gap(task: str) -> None:
-    """Which tray, which slot in it: 50 episodes of every task are judged to cover their ranges."""
-    for seed in (0, 9):
-        config = GenerateConfig(task=task, cameras=(), seed=seed)
-        found = largest_gap([prepare(EpisodePlan(config=config, episode_index=i)).info for i in range(50)])
-        assert found is not None
-        assert found.value < 0.35, found.detail
-
-
-# ------------------------------------------------------------------------------------------------- datasets
-
-
-def of_column(name: str, change: Callable[[Rows], Any]) -> Callable[[Path], None]:
+def of_column(name: str, change: Callable[[Rows], Any]) -> Fault:
     return lambda dataset: edit_column(dataset, name, change)
 
 
-def of_json(file: str, change: Callable[[Any], None]) -> Callable[[Path], None]:
-    return lambda dataset: edit_json(dataset / file, change)
+def of_table(place: str, change: Callable[[pa.Table], pa.Table]) -> Fault:
+    def spoil(dataset: Path) -> None:
+        path = next(dataset.glob(f"{place}/*/*.parquet"))
+        table = pq.read_table(path)
+        changed = change(table)
+        assert not changed.equals(table)
+        pq.write_table(changed, path)
+
+    return spoil
 
 
-def nudged(rows: Rows) -> Rows:
-    rows[100, 3] += 1e-5
-    return rows
+def value_of(name: str, row: int, value: Any, place: str = "data") -> Fault:
+    """One value of one row becomes another."""
+
+    def change(values: list[Any]) -> list[Any]:
+        if isinstance(values[row], list) and not isinstance(value, list):
+            values[row][1] = value
+        else:
+            values[row] = value
+        return values
+
+    return lambda dataset: edit_parquet(next(dataset.glob(f"{place}/*/*.parquet")), name, change)
 
 
-STATE, RANDOM = "observation.state", np.random.default_rng(0)
-FAULTS: dict[str, tuple[Callable[[Path], None], Sequence[str]]] = {
-    "shifted actions": (of_column("action", lambda r: np.concatenate([r[:1], r[:-1]])), ("dataset_action_lag",)),
-    # A third-party dataset doctor gave full marks to these.
-    "random actions": (
-        of_column("action", lambda r: RANDOM.uniform(r.min(axis=0), r.max(axis=0), r.shape)), ("dataset_action_lag",)
+def of_rows(name: str) -> Fault:
+    """A counter that jumps by one."""
+    return of_column(name, lambda rows: np.concatenate([rows[:50], rows[50:] + 1]))
+
+
+def rows_exchanged(table: pa.Table) -> pa.Table:
+    return table.take([*range(40), 41, 40, *range(42, table.num_rows)])
+
+
+def half_a_video(dataset: Path) -> None:
+    video = next(dataset.glob("videos/*/*/*.mp4"))
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+
+
+ALONE: dict[str, tuple[Fault, str]] = {
+    "a column that is not a feature": (of_info(lambda data: data["features"].pop("next.reward")), "dataset_schema"),
+    "a feature without a column": (of_table("data", lambda t: t.drop_columns(["next.reward"])), "dataset_readable"),
+    "another type": (of_feature("next.reward", dtype="float64"), "dataset_schema"),
+    "a name too few": (of_info(lambda d: d["features"]["action"]["names"].pop()), "dataset_schema"),
+    "another shape": (of_feature("action", shape=[7]), "dataset_readable"),
+    "another codec": (of_video(codec="av1"), "dataset_schema"),
+    "another height": (of_video(height=128), "dataset_schema"),
+    "another shape of the images": (of_feature(CAMERA, shape=[32, 32, 3]), "dataset_schema"),
+    "another rate": (of_info(lambda data: data.update(fps=20)), "dataset_schema"),
+    "rows in another order": (of_table("data", rows_exchanged), "dataset_counts"),
+    "a wrong index": (of_rows("index"), "dataset_counts"),
+    "a wrong frame_index": (of_rows("frame_index"), "dataset_counts"),
+    "a wrong timestamp": (of_rows("timestamp"), "dataset_counts"),
+    "an unknown task": (value_of("task_index", 20, 7), "dataset_counts"),
+    "a video's range that ends early": (
+        value_of(f"videos/{CAMERA}/to_timestamp", 1, 1.0, "meta/episodes"), "dataset_counts"
     ),
-    "joints exchanged": (of_column(STATE, lambda r: r[:, [1, 0, *range(2, r.shape[1])]]), ("forward_kinematics",)),
-    "degrees": (of_column(STATE, np.degrees), ("joint_limits",)),
-    "scalar first": (
-        of_column("observation.ee_pose", lambda r: r[:, [0, 1, 2, 6, 3, 4, 5]]), ("forward_kinematics",)
+    "rows of no episode": (of_table("data", lambda t: pa.concat_tables([t, t.slice(0, 5)])), "dataset_counts"),
+    "a null in an index": (value_of("task_index", 20, None), "dataset_readable"),
+    "an episode that ends late": (value_of("length", 2, 10_000, "meta/episodes"), "dataset_readable"),
+    "a missing table": (lambda dataset: next(dataset.glob("data/*/*.parquet")).unlink(), "dataset_readable"),
+    "a NaN in the state": (value_of(STATE, 20, float("nan")), "finite_numbers"),
+    "an infinity in the action": (value_of("action", 20, float("inf")), "finite_numbers"),
+    "a wrong deviation": (of_stats("action", "std", lambda v: [*v[:2], 1.0, *v[3:]]), "dataset_statistics"),
+    "a wrong quantile": (of_stats("action", "q10", lambda v: [0.5 * number for number in v]), "dataset_statistics"),
+    "a wrong count": (of_stats("action", "count", lambda v: [v[0] - 1]), "dataset_statistics"),
+    "an episode's mean": (value_of("stats/action/mean", 1, 0.7, "meta/episodes"), "dataset_statistics"),
+    "statistics that are gone": (lambda dataset: (dataset / "meta/stats.json").unlink(), "dataset_statistics"),
+    "colours of 0 to 255": (of_stats(CAMERA, "mean", lambda v: [[[140.0]]] * 3), "dataset_image_statistics"),
+    "an episode's colours": (
+        value_of(f"stats/{CAMERA}/mean", 1, [[[0.1]], [[0.9]], [[0.1]]], "meta/episodes"), "dataset_image_statistics"
     ),
-    "another fps": (
-        of_json("meta/info.json", lambda d: d.update(fps=20)), ("velocity_matches_position", "dataset_counts")
-    ),
-    "wrong statistics": (
-        of_json("meta/stats.json", lambda d: d["action"]["std"].__setitem__(2, 1.0)), ("dataset_statistics",)
-    ),
-    **{
-        f"wrong {name}": (of_column(name, lambda r: np.concatenate([r[:50], r[50:] + 1])), ("dataset_counts",))
-        for name in ("index", "frame_index", "timestamp")
-    },
-    "a changed number": (of_column(STATE, nudged), ("dataset_sidecar",)),
-    "another outcome": (of_column("next.success", np.zeros_like), ("dataset_sidecar",)),
-    "a missing table": (lambda dataset: next(dataset.glob("data/*/*.parquet")).unlink(), ("dataset_readable",)),
+    "half a video": (half_a_video, "dataset_videos"),
+    "an image too few": (lambda dataset: rewrite_video(dataset, CAMERA, lambda images: images[:-1]), "images_decode"),
 }  # fmt: skip
+"""Name -> what is done to the files of a dataset without sidecar, and the check that fails."""
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_of_a_dataset(fault: str, dataset: Path, tmp_path: Path) -> None:
-    change, checks = FAULTS[fault]
-    spoilt = copy(dataset, tmp_path / "ds")
-    change(spoilt)
-    for check in checks:
-        assert level_of(spoilt, check, "dataset") == "fail"
+@pytest.mark.parametrize("name", ALONE)
+def test_a_fault_of_the_files(name: str, dataset: Path) -> None:
+    fault, check = ALONE[name]
+    shutil.rmtree(dataset / "demorec")
+    fault(dataset)
+    assert level_of(dataset, check, "dataset") == "fail"
 
 
-def _copied(source: str, target: str) -> Callable[[Path], None]:
-    def fault(run: Path) -> None:
-        shutil.copy(run / f"episodes/episode_00000{source}.mcap", run / f"episodes/episode_00000{target}.mcap")
-
-    return fault
+def second_video(dataset: Path) -> None:
+    path = next(dataset.glob("videos/*/*/*.mp4"))
+    shutil.copy(path, path.with_name("file-001.mp4"))
 
 
-RUN_FAULTS: dict[str, tuple[Callable[[Path], None], Sequence[str]]] = {
-    "an episode twice": (_copied("1", "7"), ("duplicates", "run_files")),
-    "a changed file": (_copied("1", "2"), ("run_files", "run_agrees")),
-    "a missing file": (lambda run: (run / "episodes/episode_000001.mcap").unlink(), ("run_files",)),
+WARNED: dict[str, tuple[Fault, str]] = {
+    "a video without an episode": (second_video, "dataset_strays"),
+    "statistics of an unknown feature": (
+        lambda dataset: edit_json(dataset / "meta/stats.json", lambda data: data.update(force=data["action"])),
+        "dataset_statistics",
+    ),
 }
 
 
-@pytest.mark.parametrize("fault", RUN_FAULTS)
-def test_a_fault_of_a_run(fault: str, run: Path, tmp_path: Path) -> None:
-    change, checks = RUN_FAULTS[fault]
-    spoilt = copy(run, tmp_path / "run")
-    change(spoilt)
-    for check in checks:
-        assert level_of(spoilt, check, "run") == "fail"
+@pytest.mark.parametrize("name", WARNED)
+def test_a_warning(name: str, dataset: Path) -> None:
+    fault, check = WARNED[name]
+    fault(dataset)
+    assert level_of(dataset, check, "dataset") == "warn"
 
 
-@pytest.mark.parametrize("action", ["joint_increment", "ee", "ee_delta"])
-def test_shifted_actions_of_every_kind(action: str, run: Path, tmp_path: Path) -> None:
-    export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
-    assert level_of(tmp_path / "ds", "dataset_action_lag", "dataset") == "pass"
-    late = 1 if action == "ee" else 6  # noise is taken back in increments, which blurs their time
-    edit_column(tmp_path / "ds", "action", lambda rows: np.concatenate([np.zeros_like(rows[:late]), rows[:-late]]))
-    assert level_of(tmp_path / "ds", "dataset_action_lag", "dataset") == "fail"
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_the_good_one_passes(is_ours: bool, dataset: Path) -> None:
+    if not is_ours:
+        shutil.rmtree(dataset / "demorec")
+    report = checked(dataset, "dataset")
+    assert [result for result in report.results if result.level in ("warn", "fail")] == []
+    skipped = {result.check for result in report.results if result.level == "skip"}
+    assert skipped == (set() if is_ours else {"dataset_sidecar"})
 
 
-def test_wrong_image_statistics(filmed_dataset: Path, tmp_path: Path) -> None:
-    spoilt = copy(filmed_dataset, tmp_path / "ds")
-    # Levels of 0..255 instead of 0..1.
-    key = "observation.images.front"
-    edit_json(spoilt / "meta/stats.json", lambda data: data[key].update(mean=[[[140.0]], [[139.0]], [[138.0]]]))
-    assert level_of(spoilt, "dataset_image_statistics", "dataset") == "fail"
+def test_a_nan_spoils_its_rows_and_not_the_other_checks(dataset: Path) -> None:
+    shutil.rmtree(dataset / "demorec")
+    value_of(STATE, 20, float("nan"))(dataset)
+    edit_column(dataset, "observation.ee_pose", lambda rows: rows[:, [0, 1, 2, 6, 3, 4, 5]])
+    found = {result.check: result.level for result in checked(dataset, "dataset", images=False).results}
+    failed = {check for check, level in found.items() if level == "fail"}
+    assert failed == {"finite_numbers", "forward_kinematics", "dataset_statistics"}
+    assert "skip" not in {found["joint_limits"], found["velocity_matches_position"], found["action_lag"]}
 
 
-def test_a_cut_video(filmed_dataset: Path, tmp_path: Path) -> None:
-    spoilt = copy(filmed_dataset, tmp_path / "ds")
-    video = next(spoilt.glob("videos/*/*/*.mp4"))
-    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
-    assert level_of(spoilt, "dataset_videos", "dataset") == "fail"
+def test_a_missing_video_leaves_the_other_checks(dataset: Path) -> None:
+    next(dataset.glob("videos/*/*/*.mp4")).unlink()
+    found = {result.check: result.level for result in checked(dataset, "dataset", only=MEASURED).results}
+    assert found == dict.fromkeys(MEASURED[:-1], "pass") | {"images_decode": "fail"}
 
 
-def test_episodes_that_the_sidecar_does_not_know(dataset: Path, tmp_path: Path) -> None:
-    """As after LeRobot's resume: those that it knows are judged by their own rows."""
-    spoilt = copy(dataset, tmp_path / "ds")
-    path = next((spoilt / "demorec" / "episodes").glob("*/*.parquet"))
-    pq.write_table(pq.read_table(path).slice(1), path)
-    before, after = (checked(each, "dataset", images=False).results for each in (dataset, spoilt))
-    differing = [(b.check, b.level, a.level) for b, a in zip(before, after, strict=True) if b.level != a.level]
-    # What is not known to be ours is judged as anybody's.
-    assert differing == [("pose_follows_joints", "skip", "pass"), ("dataset_sidecar", "pass", "fail")]
-    (sidecar,) = [result for result in after if result.check == "dataset_sidecar"]
-    assert sidecar.detail.startswith("of episode 0 it knows nothing: LeRobot recorded 1 of 3 into the dataset, or")
+MEASURED = ("joint_limits", "dataset_counts", "dataset_statistics", "images_decode")
 
 
-def test_a_sidecar_of_other_episodes(dataset: Path, tmp_path: Path) -> None:
-    spoilt = copy(dataset, tmp_path / "ds")
-    path = next((spoilt / "demorec" / "episodes").glob("*/*.parquet"))
-    table = pq.read_table(path)
-    numbers = pa.array([0, 1, 7], table.schema.field("episode_index").type)
-    pq.write_table(table.set_column(table.schema.get_field_index("episode_index"), "episode_index", numbers), path)
-    (result,) = checked(spoilt, "dataset", only=["dataset_sidecar"]).results
-    assert (result.level, result.detail) == ("fail", "its rows are of the episodes [0, 1, 7], the dataset has 3")
+# ------------------------------------------------------------------------------------------------- the sidecar
+
+CHANGED: dict[str, Fault] = {
+    "a changed number": value_of(STATE, 20, 0.123),
+    "another outcome": of_column("next.success", np.zeros_like),
+    "a swapped image": lambda dataset: rewrite_video(
+        dataset, CAMERA, lambda images: [*images[:40], images[10], *images[41:]]
+    ),
+}
 
 
-def test_statistics_of_numbers_of_rows_are_nobodys_business(dataset: Path, tmp_path: Path) -> None:
-    """LeRobot's delete and split number rows anew and keep the statistics of the old numbers."""
-    spoilt = copy(dataset, tmp_path / "ds")
-
-    def renumbered(stats: dict[str, Any]) -> None:
-        stats["index"]["max"] = [10**6]
-        stats["episode_index"]["mean"] = [17.0]
-
-    edit_json(spoilt / "meta" / "stats.json", renumbered)
-    assert level_of(spoilt, "dataset_statistics", "dataset") == "pass"
-    edit_json(spoilt / "meta" / "stats.json", lambda stats: stats["timestamp"].update(max=[10**6]))
-    assert level_of(spoilt, "dataset_statistics", "dataset") == "fail"
+@pytest.mark.parametrize("name", CHANGED)
+def test_an_episode_that_the_sidecar_contradicts(name: str, dataset: Path) -> None:
+    CHANGED[name](dataset)
+    assert level_of(dataset, "dataset_sidecar", "dataset") == "fail"
 
 
-def test_a_number_of_a_external_episode_that_was_changed(tmp_path: Path) -> None:
+def test_an_external_episode_that_was_changed(tmp_path: Path) -> None:
     path = write_external(tmp_path / "e.mcap", make_external(cameras=(), num_frames=12))
     export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False))
     assert level_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "pass"
@@ -259,29 +226,73 @@ def test_a_number_of_a_external_episode_that_was_changed(tmp_path: Path) -> None
     assert level_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "fail"
 
 
-def test_an_episode_twice_in_a_dataset(run: Path, tmp_path: Path) -> None:
+def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> None:
+    """As after LeRobot's resume: those that it knows are judged by their own rows."""
     spoilt = copy(run, tmp_path / "run")
+    path = next((spoilt / "dataset/demorec/episodes").glob("*/*.parquet"))
+    pq.write_table(pq.read_table(path).slice(1), path)
+    assert [episode.number for episode, _ in with_videos(Dataset(spoilt / "dataset"))] == [1, 2]
+    (result,) = checked(spoilt / "dataset", "dataset", only=["dataset_sidecar"]).results
+    assert (result.level, result.detail) == ("fail", "episode 0 is unknown, as one that LeRobot recorded with resume")
+    assert level_of(spoilt / "dataset", "forward_kinematics", "dataset") == "pass"
+
+
+def test_a_sidecar_of_other_episodes(dataset: Path) -> None:
+    edit_parquet(next((dataset / "demorec/episodes").glob("*/*.parquet")), "episode_index", lambda _: [0, 1, 7])
+    (result,) = checked(dataset, "dataset", only=["dataset_sidecar"]).results
+    assert (result.level, result.detail) == ("fail", "its rows are of the episodes [0, 1, 7], there are 3")
+
+
+def test_an_episode_twice(run: Path, tmp_path: Path) -> None:
+    spoilt = copy(run, tmp_path / "run")
+    shutil.rmtree(spoilt / "dataset")
     shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000009.mcap")
     export_lerobot([spoilt], tmp_path / "ds", ExportOptions(verify=False))
     assert level_of(tmp_path / "ds", "duplicates", "dataset") == "fail"
 
 
-def test_coverage_of_a_dataset_comes_from_its_sidecar(dataset: Path) -> None:
-    from demorec.check.dataset import Dataset
+def test_statistics_of_row_numbers_are_not_judged(dataset: Path) -> None:
+    """LeRobot's delete and split renumber rows and keep the statistics of the old numbers."""
 
-    infos = Dataset(dataset).infos
-    assert [info.episode_index for info in infos] == [0, 1, 2]
-    renamed = [info.with_simulation(task="another") for info in infos]
-    assert largest_gap(renamed) is None
+    def renumbered(stats: dict[str, Any]) -> None:
+        stats["index"]["max"] = [10**6]
+        stats["episode_index"]["mean"] = [17.0]
+
+    edit_json(dataset / "meta" / "stats.json", renumbered)
+    assert level_of(dataset, "dataset_statistics", "dataset") == "pass"
 
 
 @pytest.mark.slow
-def test_what_lerobot_cannot_open(filmed_dataset: Path, tmp_path: Path) -> None:
-    assert level_of(filmed_dataset, "dataset_opens", "dataset") == "pass"
-    spoilt = copy(filmed_dataset, tmp_path / "ds")
-    path = next(spoilt.glob("meta/episodes/*/*.parquet"))
-    pq.write_table(pq.read_table(path).drop_columns(["length"]), path)
-    for data in spoilt.glob("data/*/*.parquet"):
-        data.unlink()
-    # Without these columns the tables themselves cannot be read, which is said instead of starting LeRobot.
-    assert checked(spoilt, "dataset").level == "fail"
+def test_deep_makes_the_episodes_of_a_dataset_again(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def told(*flags: str) -> tuple[object, list[str]]:
+        with pytest.raises(SystemExit) as ended:
+            main(["check", str(dataset), "--deep", "--only", "dataset_readable", *flags])
+        return ended.value.code, capsys.readouterr().out.splitlines()
+
+    code, lines = told()
+    assert code in (0, None)
+    assert len([line for line in lines if "the same to the bit" in line]) == 3
+    value_of("observation.velocity", 20, 0.123)(dataset)
+    value_of("failure_reason", 1, "bad luck", "demorec/episodes")(dataset)
+    code, lines = told()
+    assert code == 1
+    assert [line.split()[0] for line in lines if "made again" in line][:3] == ["fail", "fail", "pass"]
+    assert any("observation.velocity at frame 20" in line for line in lines)
+    assert any("sidecar's failure_reason" in line for line in lines)
+
+
+def test_a_recording_with_nan_is_not_exported(tmp_path: Path) -> None:
+    source, seen = simulate(tmp_path / "a.mcap", fps=10), 0
+
+    def spoil(topic: str, data: bytes) -> bytes:
+        nonlocal seen
+        seen += topic == channels.GRIPPER
+        if topic != channels.GRIPPER or seen != 12:
+            return data
+        return data[:-40] + np.float64(np.nan).tobytes() + data[-32:]  # position, then two sequences of one number
+
+    (tmp_path / "b.mcap").write_bytes(rewritten(source, messages=spoil))
+    assert level_of(tmp_path / "b.mcap", "finite_numbers") == "fail"
+    with pytest.raises(ExportError, match=r"observation.state is not finite in frame 11"):
+        export_lerobot([tmp_path / "b.mcap"], tmp_path / "ds", ExportOptions(verify=False))
+    assert not (tmp_path / "ds").exists()

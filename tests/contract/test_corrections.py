@@ -278,5 +278,4 @@ def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Arr
         phase not in (POLICY_PHASE, "halt") for phase in columns.phase
     ]
     checked = check_subject(Subject(path=path, kind="recording"), CheckOptions())
-    failed = [result.check for result in checked.results if result.level == "fail"]
-    assert failed == ["action_acceleration"]  # the wanderer jumps to where it would be, once it is handed back to
+    assert [result.check for result in checked.results if result.level == "fail"] == []

@@ -24,7 +24,6 @@ from demorec.core.geometry import Pose
 from demorec.episode.camera_error import error_values
 from demorec.episode.episode import Event, SuccessCheck
 from demorec.mcap import Recording, channels, messages
-from demorec.mcap.images import pixel_statistics, read_pixel_statistics
 from demorec.mcap.streams import frame_streams
 from demorec.replay.deep import deep_check
 from demorec.robots.panda import PANDA
@@ -125,14 +124,6 @@ def stamped(topic: str, second: int, *, at: int | None = None) -> Edit:
         return [(m[0], m[1], m[2][:8] + struct.pack("<iI", second, 0) + m[2][16:], m[3])] if chosen else [m]
 
     return edit
-
-
-def counted_twice(m: Message) -> list[Message]:
-    """The histogram of twice as many images."""
-    if m[0] != channels.camera_topic("front", "histogram"):
-        return [m]
-    told = read_pixel_statistics(m[2])
-    return [(m[0], m[1], pixel_statistics(replace(told, num_images=2 * told.num_images)), m[3])]
 
 
 def event_at(change: Callable[[Event], list[Event]]) -> Edit:
@@ -382,7 +373,6 @@ IMAGES: list[tuple[str, Edit, str]] = [
     ("a depth image that is cut off",
      lambda m: [(m[0], m[1], m[2][:-40], m[3])] if (m[0], m[3]) == (DEPTH, 2 * SECOND) else [m], "images_decode"),
     ("an image of labels that is none", bytes_for(LABELED, b"IHDR", b"IHOR", at=2 * SECOND), "images_decode"),
-    ("a histogram of more images", counted_twice, "pixel_statistics"),
 ]  # fmt: skip
 
 

@@ -161,7 +161,7 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     assert exit_code("check", bag, "--mapping", mapping, "--verbose") == 0
     printed = capsys.readouterr().out
     assert f"warn  run {bag}: " in printed
-    (judged,) = [line for line in printed.splitlines() if "  import_times 1" in line]
+    (judged,) = [line for line in printed.splitlines() if "  import_findings 1" in line]
     assert judged.lstrip().startswith("warn")
     assert "gap" in judged
     assert f"recording {bag}: episode 0: " in printed

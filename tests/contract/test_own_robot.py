@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import sys
@@ -10,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.check import simulate
 from support.commands import exit_code
 from support.generate import inspect
 
@@ -91,31 +89,6 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     assert "holds another run (the source of my_robots has changed)" in capsys.readouterr().err
     assert exit_code("replay", recording, "--allow", "my_robots") == 0
     assert "Note: the source of my_robots has changed since this was recorded." in capsys.readouterr().err
-
-
-def test_check_says_what_it_skips_for_lack_of_the_model_and_names_the_flag(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = simulate(tmp_path / "e.mcap", robot=XARM6)
-    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
-    forget("my_robots")
-
-    assert exit_code("check", recording) == 0
-    told = capsys.readouterr().out
-    assert exit_code("check", recording, "--json") == 0
-    (report,) = json.loads(capsys.readouterr().out)
-    assert "my_robots" not in sys.modules  # nothing of it has run
-    skipped = {result["check"] for result in report["results"] if "--allow" in result["detail"]}
-    assert "effort_matches_dynamics" in skipped
-    assert f", {len(skipped)} need --allow" in told
-    assert told.endswith("if you trust it, add --allow my_robots.\n")
-    assert f"\n{len(skipped)} checks skipped" in told
-    assert report["needs_allow"] == ["my_robots"]
-
-    assert exit_code("check", recording, "--allow", "my_robots", "--json") == 0
-    (report,) = json.loads(capsys.readouterr().out)
-    assert skipped <= {result["check"] for result in report["results"] if result["level"] == "pass"}
-    assert "needs_allow" not in report
 
 
 def test_a_link_without_a_mass_is_refused_before_anything_is_made(

@@ -70,7 +70,7 @@ def test_such_a_dataset_passes_every_check(dataset: Path, small: Path) -> None:
     for path in (dataset, small):
         report = checked(path, "dataset", images=False)
         assert [r for r in report.results if r.level in ("warn", "fail")] == []
-    for check in ("dataset_action_lag", "forward_kinematics", "dataset_description", "joint_limits"):
+    for check in ("forward_kinematics", "joint_limits"):
         assert level_of(small, check, "dataset") == "pass"
 
 
@@ -79,11 +79,6 @@ def test_a_wrong_pose_in_the_state_is_found(small: Path) -> None:
     edit_column(small, STATE, lambda rows: rows[:, [*range(11), 14, 11, 12, 13]])  # scalar first
     assert not np.array_equal(states(small), before)
     assert level_of(small, "forward_kinematics", "dataset") == "fail"
-
-
-def test_late_actions_are_found_by_the_pose_in_the_state(small: Path) -> None:
-    edit_column(small, "action", lambda rows: np.concatenate([np.zeros_like(rows[:6]), rows[:-6]]))
-    assert level_of(small, "dataset_action_lag", "dataset") == "fail"
 
 
 def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path) -> None:

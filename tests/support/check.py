@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -209,17 +210,26 @@ def flip_bits(source: Path, target: Path, *, offset: int) -> Path:
     return target
 
 
-def edit_column(dataset: Path, name: str, change: Callable[[np.ndarray[Any, Any]], Any]) -> None:
-    """Change one column of the first data file, all rows together; everything else stays."""
-    path = next((dataset / "data").glob("*/*.parquet"))
+def edit_parquet(path: Path, name: str, change: Callable[[list[Any]], list[Any]]) -> None:
+    """Change one column of a table, all rows together; everything else stays."""
     table = pq.read_table(path)
+    before = table.column(name).to_pylist()
+    after = change(deepcopy(before))
+    assert repr(after) != repr(before), f"{name} was not changed"
     field = table.schema.field(name)
-    values = np.array(table.column(name).to_pylist())
-    changed = np.asarray(change(values.copy())).astype(values.dtype)
-    assert not np.array_equal(values, changed)
-    column = pa.array(changed.tolist(), type=field.type)
-    table = table.set_column(table.schema.get_field_index(name), field, column)
-    pq.write_table(table, path)
+    place = table.schema.get_field_index(name)
+    pq.write_table(table.set_column(place, field, pa.array(after, type=field.type)), path)
+
+
+def edit_column(dataset: Path, name: str, change: Callable[[np.ndarray[Any, Any]], Any]) -> None:
+    """Change one column of the first data file as an array, all rows together."""
+
+    def of_array(rows: list[Any]) -> list[Any]:
+        values = np.array(rows)
+        changed: list[Any] = np.asarray(change(values.copy())).astype(values.dtype).tolist()
+        return changed
+
+    edit_parquet(next((dataset / "data").glob("*/*.parquet")), name, of_array)
 
 
 def edit_json(path: Path, change: Callable[[Any], object]) -> None:

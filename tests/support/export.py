@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from demorec.check import dataset_files
+from demorec.check import lerobot_opens
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.tables import EXPORTERS
@@ -78,7 +78,7 @@ def export(sources: Path | Sequence[Path], out: Path, exporter: str = "lerobot",
 
 def without_verification(patch: pytest.MonkeyPatch) -> None:
     """As if LeRobot, which takes seconds to load, were not there to open a dataset."""
-    for module in (lerobot_export, dataset_files):
+    for module in (lerobot_export, lerobot_opens):
         patch.setattr(module, "lerobot_is_installed", lambda: False)
 
 

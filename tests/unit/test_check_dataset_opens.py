@@ -10,7 +10,7 @@ import pytest
 from support.commands import exit_code
 from support.export import export
 
-from demorec.check import dataset_files
+from demorec.check import lerobot_opens
 from demorec.check.base import Measurement
 from demorec.check.dataset import Dataset
 
@@ -27,9 +27,9 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
     def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, 1, stdout="loaded\n", stderr=_OF_LEROBOT)
 
-    monkeypatch.setattr(dataset_files, "lerobot_is_installed", lambda: True)
+    monkeypatch.setattr(lerobot_opens, "lerobot_is_installed", lambda: True)
     monkeypatch.setattr(subprocess, "run", run)
-    found = dataset_files.dataset_opens.measure(Dataset(tmp_path / "d"))
+    found = lerobot_opens.dataset_opens.measure(Dataset(tmp_path / "d"))
     assert isinstance(found, Measurement)
     assert found.value == 1
     assert str(video.relative_to(tmp_path / "d")) in found.detail
@@ -73,6 +73,27 @@ def test_a_dataset_that_lerobot_refuses_fails(tmp_path: Path, monkeypatch: pytes
         "class LeRobotDataset:\n    def __init__(self, **_): raise ValueError('no')"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
-    found = dataset_files.dataset_opens.measure(Dataset(tmp_path / "d"))
+    found = lerobot_opens.dataset_opens.measure(Dataset(tmp_path / "d"))
     assert isinstance(found, Measurement)
     assert found.value == 1
+
+
+def test_lerobot_opens_a_dataset_by_request_or_where_another_check_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = []
+
+    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        asked.append(command[-1])
+        return subprocess.CompletedProcess(command, 0, stdout='loaded\n{"episodes": 1, "frames": 30}\n', stderr="")
+
+    monkeypatch.setattr(lerobot_opens, "lerobot_is_installed", lambda: True)
+    monkeypatch.setattr(subprocess, "run", run)
+    export(SAMPLE, tmp_path / "d")
+    assert exit_code("check", tmp_path / "d") == 0
+    assert asked == []
+    exit_code("check", tmp_path / "d", "--lerobot")
+    assert len(asked) == 1
+    (tmp_path / "d" / "meta" / "stats.json").unlink()
+    assert exit_code("check", tmp_path / "d") == 1
+    assert len(asked) == 2

@@ -85,11 +85,11 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
     "a gap": (moved(lambda i: 6 * 10**7 if i >= 20 else 0), "gaps", "warn"),
     "another rate": (moved(lambda i: i * 5_000_000), "rate", "warn"),
     "half the rate": (moved(lambda i: i * 40_000_000), "rate", "fail"),
-    "a late sensor": (older("observation.force", 2 * 10**8), "sample_age", "warn"),
+    "a late sensor": (older("observation.force", 3 * 10**8), "sample_age", "warn"),
     "a clock offset": (older("action", 3 * 10**9), "sample_age", "fail"),
     "late images": (
         lambda e: replace(e, images={**e.images, "top": [(s - 3 * 10**8, p) for s, p in e.images["top"]]}),
-        "image_age",
+        "sample_age",
         "warn",
     ),
     "a missing image": (
@@ -102,33 +102,15 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str, str]] = {
         "joint_limits",
         "fail",
     ),
-    "a stuck sensor": (
+    "a constant sensor": (
         each(lambda i, f: replace(f, samples={**f.samples, "observation.force": held(f, "observation.force")})),
-        "stuck_sensors",
+        "frozen_sensors",
         "warn",
     ),
-    "a dead encoder": (state(lambda i, v: [0.1, *v[1:]]), "elements_alive", "fail"),
-    "a joint too fast": (state(lambda i, v: [v[0] + 0.9 * (i % 2), *v[1:]]), "joint_speed", "fail"),
     "drops": (lambda e: replace(e, outcome=replace(e.outcome, drops={"frames": 3})), "drops", "warn"),
     "a covered camera": (
         lambda e: replace(e, images={**e.images, "side": [(s, p * 0) for s, p in e.images["side"]]}),
-        "images_show_something",
-        "fail",
-    ),
-    "cameras that change places": (
-        lambda e: replace(
-            e,
-            images={
-                "top": [*e.images["top"][:15], *e.images["side"][15:]],
-                "side": [*e.images["side"][:15], *e.images["top"][15:]],
-            },
-        ),
-        "exchanged_cameras",
-        "fail",
-    ),
-    "one camera twice": (
-        lambda e: replace(e, images={**e.images, "side": e.images["top"]}),
-        "distinct_cameras",
+        "frozen_images",
         "fail",
     ),
 }
@@ -141,12 +123,10 @@ def levels(path: Path) -> dict[str, str]:
 
 def test_a_good_episode_passes(tmp_path: Path) -> None:
     found = levels(write_external(tmp_path / "a.mcap", steady()))
-    clocks = {"opens", "checksums", "readable", "complete", "drops", "rate", "gaps", "sample_age", "image_age"}
-    assert {found[check] for check in (*clocks, "missing_images", "distinct_cameras", "stuck_sensors")} == {"pass"}
-    assert (found["joint_limits"], found["joint_speed"]) == ("pass", "pass")
-    assert "fail" not in found.values()
-    assert "warn" not in found.values()
-    assert found["penetration"] == "skip"
+    assert set(found.values()) <= {"pass", "skip"}
+    measured = {"opens", "checksums", "readable", "complete", "drops", "rate", "gaps", "sample_age", "missing_images"}
+    measured |= {"images_decode", "finite_numbers", "joint_limits", "frozen_sensors", "frozen_images"}
+    assert {found[check] for check in measured} == {"pass"}
 
 
 @pytest.mark.parametrize(("force_n", "level"), [(0.0, "pass"), (5.0, "warn")])
@@ -160,29 +140,14 @@ def test_a_contact_sensor_may_stay_at_zero(force_n: float, level: str, tmp_path:
         samples[touch.name] = replace(force, vector=np.array([force_n]))
         frames.append(replace(frame, samples=samples))
     episode = replace(episode, info=replace(episode.info, features=(*episode.info.features[:2], touch)), frames=frames)
-    assert levels(write_external(tmp_path / "a.mcap", episode))["stuck_sensors"] == level
-
-
-def test_a_label_that_never_changes_is_no_stuck_sensor(tmp_path: Path) -> None:
-    """LeRobot's `intervention` is false in most episodes."""
-    episode = steady()
-    features = (*episode.info.features[:2], replace(FORCE, name="intervention"))
-    frames = []
-    for frame in episode.frames:
-        samples = dict(frame.samples)
-        force = samples.pop(FORCE.name)
-        samples["intervention"] = replace(force, vector=np.zeros(3))
-        frames.append(replace(frame, samples=samples))
-    episode = replace(episode, info=replace(episode.info, features=features), frames=frames)
-    assert levels(write_external(tmp_path / "a.mcap", episode))["stuck_sensors"] == "skip"
+    assert levels(write_external(tmp_path / "a.mcap", episode))["frozen_sensors"] == level
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_by_its_check_alone(tmp_path: Path, fault: str) -> None:
     change, check, level = FAULTS[fault]
     found = levels(write_external(tmp_path / "a.mcap", change(steady())))
-    jumps = {"image_cuts": "warn"} if fault == "cameras that change places" else {}
-    assert {name: found for name, found in found.items() if found not in ("pass", "skip")} == {check: level, **jumps}
+    assert {name: found for name, found in found.items() if found not in ("pass", "skip")} == {check: level}
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, str]:

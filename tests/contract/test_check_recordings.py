@@ -1,0 +1,303 @@
+"""Faults, one at a time, in good recordings: each is caught by the check that is meant for it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
+from support.commands import exit_code
+from support.tasks import QUICK_TASKS
+
+from demorec.core.config import VideoConfig
+from demorec.core.tables import ROBOTS
+from demorec.mcap import channels, recover
+
+Fault = Callable[[Spoilt], None]
+Rows = np.ndarray[Any, Any]
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="session")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One pick-and-place without images."""
+    return simulate(tmp_path_factory.mktemp("good") / "good.mcap", seed=7)
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One pick-and-place with two cameras."""
+    return simulate(tmp_path_factory.mktemp("filmed") / "filmed.mcap", seed=7, cameras=("front", "wrist"))
+
+
+def findings(path: Path) -> list[tuple[str, str]]:
+    """The checks that do not pass."""
+    return [(result.check, result.level) for result in checked(path).results if result.level in ("warn", "fail")]
+
+
+# ------------------------------------------------------------------------------------------------- good ones
+
+
+def test_the_good_ones_pass(good: Path, filmed: Path) -> None:
+    assert findings(good) == findings(filmed) == []
+    assert {result.level for result in checked(filmed).results} == {"pass"}
+
+
+@pytest.mark.parametrize("task", QUICK_TASKS)
+def test_every_task_passes(task: str, tmp_path: Path) -> None:
+    assert findings(simulate(tmp_path / "e.mcap", task=task, seed=22)) == []
+
+
+@pytest.mark.parametrize("robot", ROBOTS.names())
+@pytest.mark.parametrize("variation", ["none", "full"])
+def test_every_robot_and_variation_passes(robot: str, variation: str, tmp_path: Path) -> None:
+    assert findings(simulate(tmp_path / "e.mcap", robot=robot, variation=variation, seed=23)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"variation": "full", "depth": True, "segmentation": True},
+        {"task": "tutorial", "video": VideoConfig(codec="av1", crf=35)},
+        {"task": "unstack", "video": VideoConfig(codec="jpeg", jpeg_quality=60), "width": 64, "height": 48},
+        {"task": "line_up", "robot": "so101", "variation": "full", "fps": 60},
+        {"task": "line_up", "robot": "iiwa", "variation": "full", "fps": 10},
+    ],
+    ids=str,
+)
+def test_images_of_every_kind_pass(config: dict[str, Any], tmp_path: Path) -> None:
+    assert findings(simulate(tmp_path / "e.mcap", seed=24, cameras=("front", "wrist"), **config)) == []
+
+
+def test_an_attempt_of_one_frame_passes(tmp_path: Path) -> None:
+    config: dict[str, Any] = {"task": "support.odd_tasks:FarAway", "fps": 10, "cameras": ("front",)}
+    assert findings(simulate(tmp_path / "e.mcap", **config)) == []
+
+
+# ------------------------------------------------------------------------------------------------- numbers
+
+
+def column(name: str, change: Callable[[Rows], Rows]) -> Fault:
+    return lambda s: s.set(**{name: change(getattr(s.columns, name).copy())})
+
+
+def plus(where: Any, by: Any) -> Callable[[Rows], Rows]:
+    def change(rows: Rows) -> Rows:
+        rows[where] += by
+        return rows
+
+    return change
+
+
+def late(frames: int) -> Callable[[Rows], Rows]:
+    return lambda rows: np.concatenate([np.repeat(rows[:1], frames, axis=0), rows[:-frames]])
+
+
+def frozen(rows: Rows) -> Rows:
+    """As it was after a third, from then on."""
+    rows[len(rows) // 3 :] = rows[len(rows) // 3]
+    return rows
+
+
+def frozen_wrench(s: Spoilt) -> None:
+    s.set(sensed={**s.columns.sensed, "wrench": frozen(s.columns.sensed["wrench"].copy())})
+
+
+def wrong_fps(s: Spoilt) -> None:
+    s.info = replace(s.info, fps=24)
+
+
+def scalar_first(rows: Rows) -> Rows:
+    return rows[:, [0, 1, 2, 6, 3, 4, 5]]
+
+
+NUMBERS: dict[str, tuple[Fault, str]] = {
+    "a NaN": (column("joint_velocity", plus((40, 2), np.nan)), "finite_numbers"),
+    "an infinity": (column("gripper_width", plus(40, np.inf)), "finite_numbers"),
+    "degrees": (column("joint_position", np.degrees), "joint_limits"),
+    "another rate": (wrong_fps, "velocity_matches_position"),
+    "velocities in degrees": (column("joint_velocity", np.degrees), "velocity_matches_position"),
+    "velocities of another joint": (
+        column("joint_velocity", lambda r: r[:, [1, 0, *range(2, r.shape[1])]]),
+        "velocity_matches_position",
+    ),
+    "an EE pose elsewhere": (column("base_from_tcp", plus((slice(60, 70), 0), 0.005)), "forward_kinematics"),
+    "quaternions with the scalar first": (column("base_from_tcp", scalar_first), "forward_kinematics"),
+    "a joint off by a hundredth": (
+        column("joint_position", plus((slice(None), 1), 0.01)), "forward_kinematics"
+    ),
+    "frozen efforts": (column("joint_effort", frozen), "frozen_sensors"),
+    "a frozen wrench": (frozen_wrench, "frozen_sensors"),
+    "a frozen encoder": (
+        column("joint_position", lambda r: np.concatenate([r[:, :1], frozen(r[:, 1:2]), r[:, 2:]], axis=1)),
+        "frozen_sensors",
+    ),
+    "actions ten frames early": (
+        column("action_joint_target", lambda r: np.concatenate([r[10:], np.repeat(r[-1:], 10, axis=0)])), "action_lag"
+    ),
+    "late actions": (column("action_joint_target", late(2)), "action_lag"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_spoilt_numbers(name: str, good: Path, tmp_path: Path) -> None:
+    fault, check = NUMBERS[name]
+    spoilt = Spoilt(good)
+    fault(spoilt)
+    assert level_of(spoilt.write(tmp_path / "spoilt.mcap"), check) == "fail"
+
+
+def test_a_nan_spoils_its_frame_and_not_the_other_checks(good: Path, tmp_path: Path) -> None:
+    spoilt = Spoilt(good)
+    spoilt.set(joint_position=plus((40, 2), np.nan)(spoilt.columns.joint_position.copy()))
+    path = spoilt.write(tmp_path / "spoilt.mcap")
+    assert findings(path) == [("finite_numbers", "fail")]
+    (found,) = checked(path, only=["finite_numbers"]).results
+    assert (found.value, found.frame, found.detail) == (1, 40, "joint_position")
+    spoilt.set(base_from_tcp=plus((60, 0), 0.005)(spoilt.columns.base_from_tcp.copy()))
+    assert findings(spoilt.write(tmp_path / "twice.mcap")) == [
+        ("finite_numbers", "fail"),
+        ("forward_kinematics", "fail"),
+    ]
+
+
+# ------------------------------------------------------------------------------------------------- the file
+
+
+def test_a_truncated_file(good: Path, tmp_path: Path) -> None:
+    data = good.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    report = checked(tmp_path / "cut.mcap")
+    assert [(result.check, result.level) for result in report.results[:1]] == [("opens", "fail")]
+    assert all(result.level == "skip" for result in report.results[1:])
+
+
+@pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
+def test_flipped_bits(place: float, good: Path, tmp_path: Path) -> None:
+    spoilt = flip_bits(good, tmp_path / "flipped.mcap", offset=int(good.stat().st_size * place))
+    assert checked(spoilt, only=["opens", "checksums"]).level == "fail"
+
+
+def test_an_index_with_flipped_bits(good: Path, tmp_path: Path) -> None:
+    assert level_of(flip_bits(good, tmp_path / "flipped.mcap", offset=-200), "opens") == "fail"
+
+
+def dropped(topic: str, at: int | None = None) -> Callable[[Message], list[Message]]:
+    return lambda m: [] if m[0] == topic and at in (None, m[3]) else [m]
+
+
+def exchanged_messages(m: Message) -> list[Message]:
+    """The messages of two frames in each other's place."""
+    times = {2 * SECOND: 3 * SECOND, 3 * SECOND: 2 * SECOND}
+    return [(m[0], m[1], m[2], times[m[3]])] if m[0] == channels.EE_POSE and m[3] in times else [m]
+
+
+def a_millisecond_late(m: Message) -> list[Message]:
+    is_late = m[0] == channels.GRIPPER and m[3] > SECOND
+    return [(m[0], m[1], m[2], m[3] + 1_000_000)] if is_late else [m]
+
+
+def old_stamp(m: Message) -> list[Message]:
+    if m[0] != channels.EE_POSE or m[3] < SECOND:
+        return [m]
+    return [(m[0], m[1], m[2][:4] + struct.pack("<iI", 1, 0) + m[2][12:], m[3])]
+
+
+def other_joint_names(m: Message) -> list[Message]:
+    return [(m[0], m[1], m[2].replace(b"panda_joint3", b"panda_jointX"), m[3])]
+
+
+FILES: dict[str, tuple[Callable[[Message], list[Message]], set[str]]] = {
+    "a missing topic": (dropped(channels.ACTION), {"topics", "readable"}),
+    "a lost message": (dropped(channels.COMMAND, 2 * SECOND), {"topics", "readable"}),
+    "messages in another order": (exchanged_messages, {"stamps"}),
+    "another clock": (a_millisecond_late, {"frame_times"}),
+    "stale stamps": (old_stamp, {"stamps"}),
+    "other joint names": (other_joint_names, {"readable"}),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_spoilt_file(name: str, good: Path, tmp_path: Path) -> None:
+    edit, checks = FILES[name]
+    spoilt = rewrite_messages(good, tmp_path / "s.mcap", edit)
+    assert checks <= {check for check, level in findings(spoilt) if level == "fail"}
+
+
+@pytest.mark.parametrize("share", [1 / 3, 2 / 3])
+def test_a_recovered_recording_is_a_warning(share: float, good: Path, tmp_path: Path) -> None:
+    part = tmp_path / "cut.mcap.part"
+    part.write_bytes(good.read_bytes()[: int(good.stat().st_size * share)])
+    recover(part, tmp_path / "cut.mcap")
+    assert findings(tmp_path / "cut.mcap") == [("complete", "warn")]
+    for args, code in (((), 0), (("--strict",), 1)):
+        assert exit_code("check", tmp_path / "cut.mcap", *args) == code
+
+
+# ------------------------------------------------------------------------------------------------- images
+
+
+def test_a_frozen_camera(filmed: Path, tmp_path: Path) -> None:
+    spoilt = Spoilt(filmed)
+    front = [images["front"].color for images in spoilt.images]
+    spoilt.image("front", lambda t, p: front[40] if 40 < t < 90 else p)
+    assert findings(spoilt.write(tmp_path / "spoilt.mcap")) == [("frozen_images", "fail")]
+
+
+def test_a_black_camera(filmed: Path, tmp_path: Path) -> None:
+    spoilt = Spoilt(filmed)
+    spoilt.image("front", lambda t, p: p * 0)
+    assert level_of(spoilt.write(tmp_path / "spoilt.mcap"), "frozen_images") == "fail"
+
+
+def test_a_lost_packet(filmed: Path, tmp_path: Path) -> None:
+    spoilt = rewrite_messages(filmed, tmp_path / "s.mcap", dropped(channels.video_topic("front", "h264"), 2 * SECOND))
+    assert level_of(spoilt, "video_frames") == "fail"
+
+
+def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
+    topic = channels.video_topic("front", "h264")
+    rng = np.random.default_rng(0)
+
+    def edit(m: Message) -> list[Message]:
+        if m[0] != topic or m[3] < 3 * SECOND:
+            return [m]
+        # The bytes of the image come last; its head stays.
+        return [(m[0], m[1], m[2][:-300] + rng.integers(0, 255, 300, dtype=np.uint8).tobytes(), m[3])]
+
+    assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "images_decode") == "fail"
+
+
+# ------------------------------------------------------------------------------------------------- the command
+
+
+def test_the_command(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cases = [
+        ((good,), 0),
+        ((good, "--strict", "--json"), 0),
+        ((good, "--only", "opens", "joint_limits"), 0),
+        ((good, "--only", "joint_limit"), 2),
+        ((tmp_path / "nothing",), 2),
+        ((), 2),
+    ]
+    for args, code in cases:
+        capsys.readouterr()
+        assert exit_code("check", *args) == code, args
+        if "--json" in args:
+            (report,) = json.loads(capsys.readouterr().out)
+            assert report["level"] == "pass"
+            assert {"opens", "action_lag", "frozen_images"} <= {result["check"] for result in report["results"]}
+
+
+def test_what_is_not_measured_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = simulate(tmp_path / "e.mcap", task="support.odd_tasks:FarAway", fps=10)
+    assert exit_code("check", path) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "action_lag" in line)
+    assert line.strip().startswith("not measured  action_lag: there are no actions that are targets")

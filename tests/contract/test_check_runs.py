@@ -1,0 +1,187 @@
+"""Faults of a run's folder, each caught by the check that compares run.json, recordings and dataset."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.check import checked, copy, edit_column, edit_json, edit_parquet, level_of, simulate_run
+from support.commands import exit_code
+
+from demorec.check.report import CheckOptions, check_subjects, find_subjects
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.inspect import episode_digests
+from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.options import ExportOptions
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two filmed episodes and their dataset."""
+    run = simulate_run(tmp_path_factory.mktemp("runs") / "good", 2, seed=3, fps=10, cameras=("front",))
+    export_lerobot([run], run / "dataset", ExportOptions(verify=False))
+    return run
+
+
+@pytest.fixture
+def run(good: Path, tmp_path: Path) -> Path:
+    """A copy to be spoilt."""
+    return copy(good, tmp_path / "run")
+
+
+def first_line(key: str, value: Any) -> Callable[[Any], None]:
+    def change(data: Any) -> None:
+        assert data["episodes"][0][key] != value
+        data["episodes"][0][key] = value
+
+    return change
+
+
+def exchanged(key: str) -> Callable[[Any], None]:
+    def change(data: Any) -> None:
+        a, b = data["episodes"][:2]
+        a[key], b[key] = b[key], a[key]
+
+    return change
+
+
+LINES: dict[str, Callable[[Any], None]] = {
+    "another seed": first_line("seed", 9),
+    "another attempt": first_line("attempt", 1),
+    "a failure that was a success": first_line("success", False),
+    "a phase of a failure": first_line("phase", "lift"),
+    "more frames": first_line("num_frames", 999),
+    "another digest": first_line("digest", "0" * 64),
+    "lengths exchanged": exchanged("num_bytes"),
+    "numbers exchanged": exchanged("episode_index"),
+    "another value of the config": lambda data: data["config"].update(depth=not data["config"]["depth"]),
+    "other versions": lambda data: data.update(versions={"demorec": "9.9"}),
+}
+
+
+def test_the_good_one_passes(good: Path) -> None:
+    assert {(result.check, result.level) for result in checked(good, "run").results} == {
+        (check, "pass") for check in ("run_files", "run_agrees", "run_dataset", "duplicates")
+    }
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_a_line_that_lies(name: str, run: Path) -> None:
+    edit_json(run / "run.json", LINES[name])
+    assert level_of(run, "run_agrees", "run") == "fail"
+
+
+def recordings_exchanged(run: Path) -> None:
+    first, second = (run / f"episodes/episode_00000{number}.mcap" for number in (0, 1))
+    first.rename(run / "aside")
+    second.rename(first)
+    (run / "aside").rename(second)
+
+
+def an_episode_twice(run: Path) -> None:
+    shutil.copy(run / "episodes/episode_000001.mcap", run / "episodes/episode_000007.mcap")
+
+
+FOLDERS: dict[str, tuple[Callable[[Path], None], set[str]]] = {
+    "recordings exchanged": (recordings_exchanged, {"run_agrees", "run_files"}),
+    "an episode twice": (an_episode_twice, {"duplicates", "run_files"}),
+    "a missing file": (lambda run: (run / "episodes/episode_000001.mcap").unlink(), {"run_files"}),
+}
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_fault_of_the_folder(name: str, run: Path) -> None:
+    change, checks = FOLDERS[name]
+    change(run)
+    assert checks <= {result.check for result in checked(run, "run").results if result.level == "fail"}
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_a_recording_that_a_killed_run_has_not_listed_yet(run: Path, complete: bool) -> None:
+    an_episode_twice(run)
+    if not complete:
+        edit_json(run / "run.json", lambda data: data.update(num_episodes=9))
+    (found,) = checked(run, "run", only=["run_files"]).results
+    assert "episode_000007.mcap is not in run.json" in found.detail
+    assert ("the command that began the run takes it in" in found.detail) != complete
+
+
+def test_a_fixed_layout_is_no_duplicate(tmp_path: Path) -> None:
+    run = simulate_run(tmp_path / "run", 2, seed=3, task="tutorial", fixed=True, variation="none")
+    (result,) = checked(run, "run", only=["duplicates"]).results
+    assert result.level == "skip"
+    assert "--fixed" in result.detail
+
+
+# ------------------------------------------------------------------------------------------------- its dataset
+
+
+def with_its_digest(dataset: Path) -> None:
+    """A number that an exporter with a fault changed: only the recording has the right one."""
+    edit_column(dataset, "observation.velocity", lambda rows: rows * (1 + 1e-5))
+    digests = episode_digests(dataset, DatasetInfo.load(dataset))
+    edit_parquet(next(dataset.glob("demorec/episodes/*/*.parquet")), "content_digest", lambda _: digests)
+    assert level_of(dataset, "dataset_sidecar", "dataset") == "pass"
+
+
+def an_episode_less(dataset: Path) -> None:
+    other = dataset.parent / "other"
+    export_lerobot([dataset.parent / "episodes/episode_000000.mcap"], other, ExportOptions(verify=False))
+    shutil.rmtree(dataset)
+    other.rename(dataset)
+
+
+DATASETS = {"changed with its digest": with_its_digest, "an episode less": an_episode_less}
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_a_dataset_that_differs_from_its_recordings(name: str, run: Path) -> None:
+    DATASETS[name](run / "dataset")
+    assert level_of(run, "run_dataset", "run") == "fail"
+
+
+def test_a_dataset_of_another_run(good: Path, tmp_path: Path) -> None:
+    other = simulate_run(tmp_path / "other", 2, seed=4, fps=10, cameras=("front",))
+    copy(good / "dataset", other / "dataset")
+    assert level_of(other, "run_dataset", "run") == "fail"
+
+
+# ------------------------------------------------------------------------------------------------- several subjects
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_one_bad_recording_leaves_the_reports_of_the_others(workers: int, run: Path) -> None:
+    bad = run / "episodes" / "episode_000000.mcap"
+    bad.write_bytes(bad.read_bytes()[:-1000])
+    reports = list(check_subjects(find_subjects([run]), CheckOptions(workers=workers, images=False)))
+    assert [(report.path.name, report.level) for report in reports] == [
+        ("run", "fail"),
+        ("episode_000000.mcap", "fail"),
+        ("episode_000001.mcap", "pass"),
+        ("dataset", "pass"),
+    ]
+
+
+def test_an_unexpected_error_is_one_finding(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from demorec.check.episode import CheckedEpisode
+
+    def broken(self: CheckedEpisode) -> Iterator[None]:
+        raise IndexError("list index out of range")
+
+    monkeypatch.setattr(CheckedEpisode, "motions", property(broken))
+    report = checked(good / "episodes" / "episode_000000.mcap")
+    ((check, detail),) = [(result.check, result.detail) for result in report.results if result.level == "fail"]
+    assert check == "joint_limits"
+    assert "cannot be computed" in detail
+    assert "index" not in detail
+    assert {"opens", "checksums", "finite_numbers"} <= {r.check for r in report.results if r.level == "pass"}
+
+
+def test_the_command_goes_on_after_a_bad_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "episodes" / "episode_000000.mcap").write_bytes(b"")
+    assert exit_code("check", run, "--json", "--no-images") == 1
+    assert [row["level"] for row in json.loads(capsys.readouterr().out)] == ["fail", "fail", "pass", "pass"]
