@@ -1,7 +1,7 @@
 """Images of bodies whose shapes and poses are plain data: colour, depth, segmentation, by any of several renderers.
 
-Where shapes and poses come from does not matter to a renderer: from the simulator (`demorec.sim.world.World`) or from a
-recording (`demorec.render.recorded.RecordedWorld`). `demorec.render.painter` brings the two together.
+Where shapes and poses come from does not matter to a renderer: the simulator (`demorec.sim.world.World`) provides them,
+and `demorec.render.painter` brings the two together.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Recorded states, new images: any camera, size, renderer or looks, without simulating anything.
+"""Recorded states, new images: any camera, size, renderer or looks, without physics.
 
 A new recording keeps every number of the old one and names it as its origin. With the recording's own cameras and
 looks the images come out again as they were before coding, so the coded packets are equal, byte for byte.
@@ -7,7 +7,7 @@ looks the images come out again as they were before coding, so the coded packets
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,13 @@ from demorec.episode.episode import Columns, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
-from demorec.loop import prepare
+from demorec.loop import SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.mcap.frames import frames_of
 from demorec.render import Renderer
-from demorec.render.painter import Painter, WarmRenderer
-from demorec.render.recorded import RecordedWorld
+from demorec.render.painter import Painter
 from demorec.robots.assets import allow_models
+from demorec.sim.recorded_states import RecordedStates
 from demorec.tasks.vary import vary_looks
 
 
@@ -239,7 +239,7 @@ def rerender(
     options: RerenderOptions,
     *,
     overwrite: bool = False,
-    renderers: WarmRenderer | None = None,
+    simulators: SimulatorCache | None = None,
 ) -> RerenderReport:
     """Draw a recording anew, unless `out` is what the same call has made before.
 
@@ -248,7 +248,7 @@ def rerender(
         out: The file to be made.
         options: What is to change.
         overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
-        renderers: The caller's, warm from one recording to the next; None makes and frees one.
+        simulators: Gives world and renderer, warm from one recording to the next; None makes and frees them.
 
     Raises:
         RecordingError: The source is damaged or empty.
@@ -277,11 +277,13 @@ def rerender(
         if not was_there:
             make_folder(out.parent)
             with (
-                nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
+                nullcontext(simulators) if simulators is not None else closing(SimulatorCache()) as warm,
                 EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
-                painter = view_painter(warm.of(str(config.get("renderer", "raster"))), view, config)
-                _write_drawn(writer, recording, columns, painter, view.scene)
+                world, renderer = warm.acquire(new_info)
+                assert renderer is not None, "a view has cameras"
+                painter = view_painter(renderer, view, config)
+                _write_drawn(writer, recording, columns, painter, RecordedStates(world, view.scene, columns))
         compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,
@@ -294,14 +296,13 @@ def rerender(
     )
 
 
-def _write_drawn(writer: EpisodeWriter, recording: Recording, columns: Columns, painter: Painter, scene: Scene) -> None:
-    """All frames of a recording with new images of the scene, and its outcome."""
-    world = RecordedWorld(
-        recording.info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses
-    )
-    painter.setup(world)
+def _write_drawn(
+    writer: EpisodeWriter, recording: Recording, columns: Columns, painter: Painter, states: RecordedStates
+) -> None:
+    """Write all frames of a recording with new images, and its outcome."""
+    painter.setup(states)
     for frame in frames_of(columns, recording.events(), recording.joint_samples()):
-        world.frame = frame.frame_index
+        states.frame = frame.frame_index
         writer.write(replace(frame, images=painter.images()))
     writer.finish(_outcome(recording))
 

@@ -194,10 +194,11 @@ def _differences(
             made.cut_off(found)
         differences, images = content_differences(found, made, remade.info, recording.info.fps)
         if images:
-            painter = _recorded_painter(remade.info, simulators.acquire(remade.info)[1], allowed)
+            world, renderer = simulators.acquire(remade.info)
+            painter = _recorded_painter(remade.info, renderer, allowed)
             assert painter is not None, "images were drawn"
             cameras = coded_topics(remade.info)
-            differences += image_differences(found, made, remade, painter, cameras, images)
+            differences += image_differences(found, made, remade, world, painter, cameras, images)
     yield from sorted(differences, key=lambda difference: difference.first_frame)
 
 
