@@ -48,8 +48,8 @@ class Generate:
     check: bool = True
     """Check run, recordings and dataset at the end, without decoding images (demorec check does)."""
     deep_every: int = 50
-    """At the end, make every Nth episode again from config and seed and compare every number and image with the
-    recording (demorec check --deep does so for all); 0: none."""
+    """At the end, make the first episode and one in N again from config and seed, and compare every number and image
+    with the recording (demorec check --deep does so for all); 0: none."""
     dry_run: bool = False
     """Make a few pilot episodes in a temporary folder and estimate time, size and success rate of the whole run."""
     view: bool = False

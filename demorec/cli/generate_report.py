@@ -25,7 +25,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
 
     Args:
         result: Of the run.
-        deep_every: One of so many episodes is made again; 0 for none.
+        deep_every: The first episode and one in so many are made again; 0 for none.
         progress: Called with how many things of how many are done.
 
     Returns:
@@ -36,7 +36,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
 
     beyond = {result.folder / attempt.file for attempt in result.run.beyond}
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
-    sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
+    sample = [a.file for a in result.run.successes[::deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
     workers = useful_workers(subjects, images=False, cores=available_cores())
     options = CheckOptions(images=False, workers=workers)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.config import EpisodePlan, GenerateConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, to_plain
@@ -126,6 +126,7 @@ def prepare(plan: EpisodePlan) -> Episode:
             robot=robot,
             scene=scene,
             physics_hz=config.physics_hz,
+            cpu=cpu_type(),
             behaviour=behaviour.as_mapping() | error_values(errors),
             config=to_plain(config),
             config_digest=digest(config),
