@@ -6,26 +6,26 @@ looks the images come out again as they were before coding, so the coded packets
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.core.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, RecordingError
 from demorec.core.files import make_folder
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, from_plain, to_json
 from demorec.core.registry import nearest_match, split_name
 from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
-from demorec.episode.camera_error import stated_error, true_camera
+from demorec.episode.camera_error import true_cameras
 from demorec.episode.episode import Columns, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
-from demorec.loop import SimulatorCache, prepare
+from demorec.loop import SimulatorCache
 from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.mcap.frames import frames_of
 from demorec.render import Renderer
@@ -99,38 +99,10 @@ class SceneView:
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
 
 
-def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
-    """The view of a recording.
-
-    Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
-    from the seed, to the bit. If the scene cannot be drawn again from it (another version, new looks, a scene of
-    somebody else's), it follows from the error that the recording tells. Older recordings do not tell it: there the
-    recorded cameras are taken for the true ones.
-
-    Raises:
-        NotAllowedError: The scene cannot be drawn again without a module that is not among those `allowed`.
-    """
-    if not info.origin and any(name.startswith("calibration_") for name in info.behaviour):
-        try:
-            config = config_as(info.config, GenerateConfig)
-            config.check_names(allowed)
-            plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
-            episode = prepare(plan)
-        except NotAllowedError:
-            raise  # else the images would be taken from wrong places without a word
-        except (ValueError, DemorecError):
-            episode = None
-        if episode is not None and episode.info.scene == info.scene:
-            return SceneView(
-                scene=info.scene, true_cameras=episode.cameras, true_from_recorded=episode.true_from_recorded
-            )
-    cameras, errors = [], dict[str, Pose]()
-    for camera in info.scene.cameras:
-        error = stated_error(camera.name, info.behaviour)
-        if error is not None:
-            errors[camera.name] = error
-        cameras.append(camera if error is None else true_camera(camera, error))
-    return SceneView(scene=info.scene, true_cameras=tuple(cameras), true_from_recorded=errors)
+def recorded_view(info: EpisodeInfo) -> SceneView:
+    """Return the view of a recording, whose extrinsics may be off on purpose, as those of a real camera are."""
+    cameras, errors = true_cameras(info.scene.cameras, info.behaviour)
+    return SceneView(scene=info.scene, true_cameras=cameras, true_from_recorded=errors)
 
 
 def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
@@ -139,7 +111,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     Raises:
         ConfigError: An unknown camera, or an image size that cannot be coded.
     """
-    old = recorded_view(info, options.allowed)
+    old = recorded_view(info)
     names = options.cameras or tuple(camera.name for camera in info.scene.cameras)
     if not names:
         raise ConfigError("The recording has no cameras: name some with --cameras.")

@@ -174,7 +174,7 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     info = recording.info.with_simulation(config_digest=digest(recording.info.config))
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
-    painter = _recorded_painter(info, renderer, allowed)
+    painter = _recorded_painter(info, renderer)
     with EpisodeWriter(path, info, video=config_as(info.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
@@ -189,11 +189,11 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
         writer.finish(outcome)
 
 
-def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
+def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter | None:
     """Draws what the recording shows, from where its cameras really were; None without cameras."""
     if renderer is None:
         return None
-    return view_painter(renderer, recorded_view(info, allowed), info.config)
+    return view_painter(renderer, recorded_view(info), info.config)
 
 
 def _differences(
@@ -207,7 +207,7 @@ def _differences(
         differences, images = content_differences(found, made, remade.info, recording.info.fps)
         if images:
             world, renderer = simulators.acquire(remade.info)
-            painter = _recorded_painter(remade.info, renderer, allowed)
+            painter = _recorded_painter(remade.info, renderer)
             assert painter is not None, "images were drawn"
             cameras = coded_topics(remade.info)
             differences += image_differences(found, made, remade, world, painter, cameras, images)
