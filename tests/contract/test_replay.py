@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import Spoilt, level_of, simulate, simulate_run
+from support.check import Spoilt, simulate, simulate_run
 from support.commands import exit_code
 from support.recording import make_episode
 
@@ -101,7 +101,6 @@ def test_an_outcome_that_was_changed_is_found(
     spoilt.outcome = replace(outcome, success=False, failure_phase="lift", failure_reason="drop")
     assert exit_code("replay", spoilt.write(tmp_path / "relabelled.mcap")) == 1
     assert "identical, succeeds where the recording failed" in capsys.readouterr().out
-    assert level_of(tmp_path / "relabelled.mcap", "outcome_consistent") == "fail"
     tilt = next(check for check in outcome.checks if check.name == "tilt")
     others = tuple(replace(check, limit=2 * check.limit) if check is tilt else check for check in outcome.checks)
     spoilt.outcome = replace(outcome, checks=others)
@@ -117,7 +116,6 @@ def test_an_expert_that_gave_up_is_a_failure_whatever_the_conditions_say(recorde
     spoilt.events[spoilt.frames[-1]] = (Event(name="misplaced_speed", message="", level="warning"),)
     path = spoilt.write(tmp_path / "s.mcap")
     assert exit_code("replay", path) == 0
-    assert level_of(path, "outcome_consistent") == "pass"
 
 
 @pytest.mark.long
@@ -199,7 +197,10 @@ def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path
     export_lerobot([quiet_run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
     from demorec.cli.replay import demonstrations
 
-    found = [report for report, _ in replay_all(demonstrations([tmp_path / "ds"], ReplayOptions()), ReplayOptions())]
+    found = [
+        report
+        for report, _ in replay_all(demonstrations([tmp_path / "ds"], ReplayOptions(), episodes=""), ReplayOptions())
+    ]
     assert [report.success for report in found] == [True, True]
     assert all(report.unreachable == 0 for report in found)
     # Inverse kinematics may bend the elbow another way; the joints themselves come back to rounding and drift.
@@ -213,7 +214,6 @@ def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
     run = simulate_run(tmp_path / "run", 2, seed=3)
     export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, fps=10))
     assert exit_code("replay", tmp_path / "ds") == 0
-    assert exit_code("check", tmp_path / "ds", "--no-images", "--replay", "2") == 0
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from support.commands import exit_code
 
 from demorec.loop import SimulatorCache
 from demorec.mcap import Recording
+from demorec.replay.deep import deep_check
 from demorec.replay.rerender import RerenderOptions, rerender
 
 pytestmark = pytest.mark.slow
@@ -67,7 +68,7 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
             np.abs(a.astype(int) - b.astype(int)).max()
             for a, b in zip(first.images("front"), last.images("front"), strict=True)
         ]
-    assert max(off) <= 2  # poses may differ in their last bit
+    assert max(off) == 0
 
 
 def test_other_cameras_sizes_and_looks_pass_the_checks(
@@ -79,8 +80,8 @@ def test_other_cameras_sizes_and_looks_pass_the_checks(
     assert exit_code("render", filmed, "--out", out, *args, "--looks", 3, "--depth", "--segmentation") == 0
     report = checked(out / "filmed.mcap")
     assert [r for r in report.results if r.level in ("warn", "fail")] == []
-    passed = {r.check for r in report.results if r.level == "pass"}
-    assert {"projection", "depth_matches_scene", "segmentation_matches_scene"} <= passed
+    deep = deep_check(out / "filmed.mcap")
+    assert (deep.level, deep.differences, deep.error) == ("pass", (), "")
     with Recording(filmed) as a, Recording(out / "filmed.mcap") as b:
         assert b.cameras == ("side", "front")
         assert next(b.images("side")).shape == (96, 128, 3)
