@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from demorec.check.run_dataset import export_options
 from demorec.core.config import GenerateConfig, parse_config
-from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
+from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.datasets.lerobot.files import read_json, read_table
 from demorec.datasets.lerobot.inspect import episode_digests
@@ -72,19 +73,9 @@ def export_as_original(original: Original, result: RunResult) -> None:
     assert original.export is not None
     target = result.folder / DATASET
     there = os.path.lexists(target)
-    if there and not _is_such_a_copy(target, original, result.run.config_digest):
+    if there and not is_dataset_of_run(target, result.run.config_digest):
         raise ConfigError(f"Something else is where the copy of the dataset would be, choose another --out: {target}")
     export_lerobot([result.folder], target, replace(original.export, overwrite=there))
-
-
-def _is_such_a_copy(target: Path, original: Original, config_digest: str) -> bool:
-    """Whether a dataset holds episodes of this run alone, none beyond those that are exported anew."""
-    try:
-        return is_dataset_of_run(target, config_digest) and _dataset_digests(target).keys() <= original.digests.keys()
-    except (DemorecError, OSError, ValueError, KeyError, TypeError) as error:
-        if (lack := resource_error(error)) is not None:
-            raise lack from error
-        return False
 
 
 def read_original(path: Path) -> Original:
@@ -161,7 +152,6 @@ def _read_recording(source: Path) -> Original:
 def _read_dataset(source: Path) -> Original:
     try:
         configs = read_json(source / CONFIGS_PATH)
-        made_with = read_json(source / EXPORT_PATH)
         rows = _rows(source)
         if any(row["episode_info"] is None for row in rows):
             raise ConfigError(
@@ -182,17 +172,7 @@ def _read_dataset(source: Path) -> Original:
             num_episodes=1 + max(row["run_episode_index"] for row in rows),
             versions=(read_episode_info(rows[0]["episode_info"]).versions,),
             digests=_digests(source, rows),
-            export=ExportOptions(
-                action=made_with["action"],
-                state=made_with.get("state", "joint"),
-                privileged=made_with["privileged"],
-                features=tuple(made_with.get("features", ())),
-                include_failures=made_with["include_failures"],
-                episodes=made_with["episodes"],
-                fps=made_with["fps"],
-                depth=made_with["depth"],
-                verify=False,
-            ),
+            export=replace(export_options(source), episodes=read_json(source / EXPORT_PATH)["episodes"]),
         )
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ConfigError(
