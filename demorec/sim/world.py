@@ -102,7 +102,7 @@ class World:
             self._bodies[body.name] = add_body(self.client, body)
         self.inertial_poses = {name: base_from_inertial(self.client, index) for name, index in self._bodies.items()}
         self._constraint: int | None = None
-        self.arm.command(self.hold())
+        self.arm.command_gripper(self.arm.gripper_target)
         for _ in range(round(SETTLE_SECONDS * scene.physics.hz)):
             self.arm.drive(self.arm.target)
             self.client.stepSimulation()
@@ -116,7 +116,7 @@ class World:
         start, end = self.arm.target, np.asarray(command.joint_target, dtype=np.float64)
         if self.scene.hold == "constraint":
             self._hold_by_constraint(command)
-        self.arm.command(command)
+        self.arm.command_gripper(command.gripper_target)
         samples = []
         for substep in range(1, self._substeps + 1):
             self.arm.drive(start + (end - start) * (substep / self._substeps))
