@@ -51,7 +51,6 @@ COMMANDS: Registry[type[Command]] = Registry(
         "evaluate": "demorec.cli.evaluate:Evaluate",
         "correct": "demorec.cli.evaluate:Correct",
         "improve": "demorec.cli.train:Improve",
-        "reproduce": "demorec.cli.generate:Reproduce",
         "recover": "demorec.cli.recover:Recover",
         "list": "demorec.cli.list_rows:ListRows",
     },

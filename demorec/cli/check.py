@@ -231,7 +231,7 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
 def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:
     """One line about a recording, below it the versions that differ, then what differs, the first frames first."""
     yield f"{report.level:<4}  made again {report.path}: {_verdict(report)}"
-    details = [*report.versions]
+    details = [f"Not provable here: {line}" for line in report.versions]
     if report.error:
         details.append(f"It cannot be made again: {report.error}")
     shown = report.differences if verbose else report.differences[:_SHOWN]

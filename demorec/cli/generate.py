@@ -1,4 +1,4 @@
-"""`demorec generate`, also called `generate-dataset`: the main job. `demorec reproduce`: the same data once more."""
+"""`demorec generate`, also called `generate-dataset`: the main job."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.output import counted, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, read_toml
@@ -20,8 +20,10 @@ from demorec.core.errors import ConfigError
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.registry import nearest_match
 from demorec.generate.options import RunObserver, RunOptions
+from demorec.runs.run_file import RUN_NAME
 
 if TYPE_CHECKING:
+    from demorec.generate.reproduce import Original
     from demorec.runs.run_file import Attempt, RunFile
 
 
@@ -39,17 +41,22 @@ class Generate:
       generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
       generate-dataset --num-episodes 1000 --dry-run   (time, size and success rate)
       generate-dataset --executor ray --address auto --out /shared/cubes
+      generate-dataset --config recordings/cubes/run.json --out again   (the same episodes, compared bit for bit)
     """
 
     config: Path | None = None
-    """TOML file with any of the options below, without the dashes: num_episodes = 50."""
+    """TOML file with any of the options below, without the dashes: num_episodes = 50. Or a run's run.json, a dataset's
+    folder or a recording: the run is made again, up to the last episode that it holds, and compared with it."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras that --config's run,
+    dataset or recording names."""
     options: Annotated[RunOptions, arg(name="run")] = field(default_factory=RunOptions)
     """How the run is carried out; does not affect the data."""
     check: bool = True
     """Check run, recordings and dataset at the end, without decoding images (demorec check does)."""
     deep_every: int = 50
-    """At the end, make every Nth episode again from config and seed and compare every number and image with the
-    recording (demorec check --deep does so for all); 0: none."""
+    """At the end, make the first episode and one in N again from config and seed, and compare every number and image
+    with the recording (demorec check --deep does so for all); 0: none."""
     dry_run: bool = False
     """Make a few pilot episodes in a temporary folder and estimate time, size and success rate of the whole run."""
     view: bool = False
@@ -59,45 +66,57 @@ class Generate:
 
     @classmethod
     def defaults(cls, args: Sequence[str]) -> Generate:
-        """The values of --config, if there is one, are the defaults of the flags."""
+        """Read the defaults of the flags from the file of options that --config names, if it does."""
         path = config_path(args)
-        return cls() if path is None else replace(with_file_values(cls(), path), config=path)
+        if path is None or _is_original(path):
+            return cls()
+        return replace(with_file_values(cls(), path), config=path)
 
     def run(self) -> int:
         """Generate, export, check, report."""
-        self.episodes.validate()
-        self.options.validate()
+        original = self._original()
+        episodes, options = self.episodes, self.options
+        if original is not None:
+            episodes, options = original.config, replace(options, num_episodes=original.num_episodes)
+        episodes.validate()
+        options.validate()
         if self.deep_every < 0:
             raise ConfigError(f"deep-every is {self.deep_every}, allowed are 0 (none) and more.")
-        name = self.episodes.task.rpartition(":")[2]  # of somebody else's "package.module:Name", its name
+        name = episodes.task.rpartition(":")[2]  # of somebody else's "package.module:Name", its name
         options = replace(
-            self.options,
-            out=self.options.out or Path("recordings") / name,
-            repo_id=self.options.repo_id or f"local/{name}",
+            options,
+            out=options.out or Path("recordings") / name,
+            repo_id=options.repo_id or f"local/{name}",
         )
         assert options.out is not None
         refuse_inside([options.out])
+        if original is not None:
+            _prepare_comparison(original, options.out)
         if self.dry_run:
             from demorec.cli.generate_report import print_estimate
             from demorec.generate.estimate import estimate
 
-            print_estimate(*estimate(self.episodes, options), options)
+            print_estimate(*estimate(episodes, options), options)
             return 0
 
-        from demorec.cli.generate_report import check_run, print_result
+        from demorec.cli.generate_report import check_run, print_comparison, print_result
         from demorec.core.processes import terminate_as_interrupt
         from demorec.generate.run import generate
 
         with ExitStack() as stack:
             watch = stack.enter_context(_viewer(options.out)) if self.view else None
-            result = generate(self.episodes, options, progress=stack.enter_context(RunProgress(watch=watch)))
+            result = generate(episodes, options, progress=stack.enter_context(RunProgress(watch=watch)))
         if result.interrupted:
             done = f"{len(result.run.successes)} of {result.run.num_episodes}"
             tell(f"Interrupted: {done} episodes are complete; run the same command again to continue: {result.folder}")
             return 130
         export, report, checked = None, None, None
         with RunProgress() as progress, terminate_as_interrupt():
-            if options.export and result.run.successes:
+            if original is not None and original.export is not None:
+                from demorec.generate.reproduce import export_as_original
+
+                export_as_original(original, result)
+            elif options.export and result.run.successes:
                 from demorec.generate.export_step import export_run
 
                 assert options.repo_id is not None
@@ -109,7 +128,54 @@ class Generate:
         print_result(result, export, checked)
         if report is not None and report.not_verified:
             tell(f"Not verified: {report.not_verified}")
-        return 1 if result.run.given_up or (checked is not None and checked[1]) else 0
+        has_failed = checked is not None and bool(checked[1])
+        if original is not None:
+            return 0 if print_comparison(original, result) and not has_failed else 1
+        return 1 if result.run.given_up or has_failed else 0
+
+    def _original(self) -> Original | None:
+        """Read the run, dataset or recording that --config names; None without one.
+
+        Raises:
+            ConfigError: It cannot be made again, or flags ask for other episodes or for modules of nothing.
+            NotAllowedError: It names something of a module that is not allowed.
+        """
+        if self.config is None or not _is_original(self.config):
+            if self.allow:
+                raise ConfigError("--allow is for a --config that names a run, dataset or recording: leave it out.")
+            return None
+        from demorec.core.own_versions import plain_differences
+        from demorec.generate.reproduce import read_original
+
+        asked = {**to_plain(self.episodes), "num_episodes": self.options.num_episodes}
+        default = {**to_plain(GenerateConfig()), "num_episodes": RunOptions.num_episodes}
+        if different := plain_differences(default, asked):
+            flags = [f"--{line.partition(' is ')[0].split()[-1].replace('_', '-')}" for line in different]
+            raise ConfigError(
+                f"--config makes the episodes of {self.config} again as they are: leave out {', '.join(flags)}."
+            )
+        original = read_original(self.config)
+        original.config.check_names(allowed_modules(self.allow))
+        return original
+
+
+def _is_original(path: Path) -> bool:
+    """Check whether --config names something to be made again, and not a TOML file of options."""
+    return path.is_dir() or path.name == RUN_NAME or path.suffix == ".mcap"
+
+
+def _prepare_comparison(original: Original, out: Path) -> None:
+    """Refuse to write into the original, and print in which versions it differs from what is here."""
+    from demorec.core.config import deciding_versions
+    from demorec.core.own_versions import version_differences
+    from demorec.core.replacing import use_as_source
+
+    if overlap := use_as_source(out.resolve(), [original.source]):
+        raise ConfigError(f"The copy needs a place of its own, but {overlap}: choose another --out: {out}")
+    here = deciding_versions(original.config)
+    different = dict.fromkeys(line for there in original.versions for line in version_differences(there, here))
+    if different:
+        tell(f"Note: {'; '.join(different)}.")
 
 
 class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
@@ -225,62 +291,3 @@ def _replaced(owner: Any, above: tuple[str, ...], key: str, value: Any) -> Any:
     if isinstance(getattr(owner, key), tuple) and not isinstance(value, list):
         value = [value]  # cameras = "front" says what it means
     return dataclasses.replace(owner, **{key: getattr(from_plain({**to_plain(owner), key: value}, type(owner)), key)})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reproduce:
-    """Make a run or a dataset again and check that every episode is bit-exact.
-
-    Config and seed are read from run.json or from the dataset's own metadata. The new episodes are compared with what
-    the recordings, or the dataset's tables and videos, hold now. Exit code 1 if an episode differs or cannot be read.
-    Run the same command again to continue where it stopped.
-
-    Examples:
-      demorec reproduce recordings/cubes --out /tmp/cubes
-      demorec reproduce datasets/cubes --out /tmp/cubes --workers 8
-    """
-
-    source: Positional[Path]
-    """A run, or a dataset that was exported from one."""
-    out: Path
-    """Folder of the new run."""
-    workers: int | None = None
-    """Processes that simulate (auto: one per core)."""
-    executor: Literal["local", "ray"] = "local"
-    """Processes on this machine, or tasks on a Ray cluster."""
-    address: str = "local"
-    """Ray: the cluster, for example auto or HOST:6379; local: this machine only."""
-    allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras named in the source."""
-
-    def run(self) -> int:
-        """Generate again, compare, report."""
-        from demorec.generate.options import RunOptions
-        from demorec.generate.reproduce import reproduce
-
-        options = RunOptions(
-            out=self.out, workers=self.workers, executor=self.executor, address=self.address, export=False
-        )
-        options.validate()
-        refuse_inside([self.out])
-        with RunProgress() as progress:
-            result, same, faults = reproduce(
-                self.source, options, progress=progress, allowed=allowed_modules(self.allow)
-            )
-        if result.interrupted:
-            tell(f"Interrupted; run the same command again to continue: {self.out}")
-            return 130
-        say(f"{sum(same.values())} of {len(same)} episodes are bit-exact: {self.source} and {result.folder}")
-        before = len(same) - len(result.made)
-        if before > 0:
-            tell(
-                f"Note: {before} of them were in {self.out} already and were not made again: use a new --out to check "
-                "them too."
-            )
-        tell(*faults[:10])
-        if different := [
-            f"{episode} (attempt {attempt})" for (episode, attempt), is_same in same.items() if not is_same
-        ]:
-            tell(f"Different: {', '.join(different[:10])}{', ...' if len(different) > 10 else ''}")
-            return 1
-        return 0

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.progress import duration
@@ -19,13 +20,16 @@ from demorec.generate.executor import Made
 from demorec.generate.options import RunOptions, RunResult
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
+if TYPE_CHECKING:
+    from demorec.generate.reproduce import Original
+
 
 def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> tuple[str, list[str]]:
     """Every check of run, recordings and dataset that needs no decoded images; of the episodes asked for.
 
     Args:
         result: Of the run.
-        deep_every: One of so many episodes is made again; 0 for none.
+        deep_every: The first episode and one in so many are made again; 0 for none.
         progress: Called with how many things of how many are done.
 
     Returns:
@@ -36,7 +40,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
 
     beyond = {result.folder / attempt.file for attempt in result.run.beyond}
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
-    sample = [a.file for a in result.run.successes[deep_every - 1 :: deep_every]] if deep_every else []
+    sample = [a.file for a in result.run.successes[::deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
     workers = useful_workers(subjects, images=False, cores=available_cores())
     options = CheckOptions(images=False, workers=workers)
@@ -106,6 +110,27 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
             f"{len(run.given_up)} of {run.num_episodes} episodes failed at all {run.config.max_attempts} attempts and "
             f"were given up: {shown}. The attempts are in {folder / 'failed'}; raise --max-attempts in a new --out."
         )
+
+
+def print_comparison(original: Original, result: RunResult) -> bool:
+    """Print whether a run is the same as the original, or what differs; return whether it is."""
+    from demorec.generate.reproduce import compare
+
+    same = compare(original, result)
+    different = [f"{episode} (attempt {attempt})" for (episode, attempt), is_same in same.items() if not is_same]
+    before = len(same) - len(result.made)
+    if before > 0:
+        tell(
+            f"Note: {counted(before, 'episode')} of {result.folder} had been made before and were not made again: use "
+            "a new --out to compare them too."
+        )
+    tell(*original.faults[:10])
+    if not different:
+        say(f"The same as {original.source}: {counted(len(same), 'episode')}, bit for bit.")
+        return True
+    listed = ", ".join(different[:10]) + (", ..." if len(different) > 10 else "")
+    say(f"Not the same as {original.source}: {len(different)} of {counted(len(same), 'episode')} differ: {listed}.")
+    return False
 
 
 def next_commands(result: RunResult, export: ExportRecord | None) -> list[str]:

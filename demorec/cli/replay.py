@@ -148,10 +148,8 @@ def _check_out(paths: Sequence[Path], out: Path) -> None:
     refuse_sources(paths, targets or [out], do="replay")
 
 
-def demonstrations(
-    paths: Sequence[Path], options: ReplayOptions, *, episodes: str = "", limit: int | None = None
-) -> Iterator[Demonstration]:
-    """What there is to replay in some paths, in order; with a limit: so many of each path, spread evenly.
+def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
+    """Yield what there is to replay in some paths, in order.
 
     Tells, before each of them, in which versions what recorded it differs from what is here, and where modules of the
     user's own are not what they were.
@@ -163,7 +161,7 @@ def demonstrations(
     allow_models(options.allowed)
     noted: set[str] = set()
     here = deciding_versions()
-    for demonstration in _found(paths, options, episodes=episodes, limit=limit):
+    for demonstration in _found(paths, options, episodes=episodes):
         versions = demonstration.info.versions
         lines = [f"{line} since this was recorded" for line in changed_sources(versions, options.allowed)]
         lines += version_differences({name: versions[name] for name in versions if name in here}, here)
@@ -173,9 +171,7 @@ def demonstrations(
         yield demonstration
 
 
-def _found(
-    paths: Sequence[Path], options: ReplayOptions, *, episodes: str, limit: int | None
-) -> Iterator[Demonstration]:
+def _found(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
     from demorec.datasets.options import parse_episodes
     from demorec.replay import dataset_demonstrations, open_file
 
@@ -183,12 +179,9 @@ def _found(
     for path in paths:
         found = _replayable(path)
         if found.kind == "dataset":
-            yield from dataset_demonstrations(path, wanted, options, limit=limit)
+            yield from dataset_demonstrations(path, wanted, options)
             continue
-        files: Sequence[Path] = found.recordings
-        if limit is not None and len(files) > limit:
-            files = [files[number * len(files) // limit] for number in range(limit)]
-        for file in files:
+        for file in found.recordings:
             demonstration = open_file(file, options)
             if wanted(demonstration.info.episode_index):
                 yield demonstration

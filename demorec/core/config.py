@@ -7,8 +7,10 @@ run is carried out (workers, executor, output folder) is not in here.
 from __future__ import annotations
 
 import functools
+import platform
 import tomllib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -229,6 +231,28 @@ def _deciding_versions() -> tuple[tuple[str, str], ...]:
         ("pybullet", bullet),
         *((name, version(name)) for name in ("numpy", "numba", "av")),
     )
+
+
+_X86_LEVELS = {
+    "x86-64-v4": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
+    "x86-64-v3": {"avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"},
+    "x86-64-v2": {"cx16", "popcnt", "sse4_1", "sse4_2", "ssse3"},
+}
+"""Levels of the x86-64 psABI, highest first: the flags of /proc/cpuinfo that tell one from the level below."""
+
+
+@functools.cache
+def cpu_type() -> str:
+    """Return the CPU's architecture and, where known, its level: "x86-64-v3", "aarch64".
+
+    The C library and NumPy choose their functions by it, which may round differently.
+    """
+    machine = platform.machine() or "unknown"
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        flags = set(next((line for line in lines if line.startswith("flags")), "").split())
+        return next((level for level, needed in _X86_LEVELS.items() if needed <= flags), machine)
+    return machine
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -143,6 +143,38 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
     return None
 
 
+_UNUSABLE = frozenset(
+    {
+        errno.EACCES,
+        errno.EEXIST,
+        errno.EISDIR,
+        errno.ELOOP,
+        errno.ENAMETOOLONG,
+        errno.ENOENT,
+        errno.ENOTDIR,
+        errno.EPERM,
+        errno.EROFS,
+    }
+)
+"""Errors of a target that the user has to choose again; others are about the machine, such as a full disk."""
+
+
+def write_error(
+    what: str, error: OSError, target: Path, otherwise: type[DemorecError], *, reason: str = ""
+) -> DemorecError:
+    """Return the error to be raised for a target that cannot be written: ConfigError where another one must be chosen.
+
+    Args:
+        what: Subject of the sentence ("The dataset").
+        error: Raised while the target was written.
+        target: The path that the user named.
+        otherwise: Type for all other reasons.
+        reason: Why, in words; "" for those of the operating system.
+    """
+    kind = ConfigError if error.errno in _UNUSABLE else otherwise
+    return kind(f"{what} cannot be written ({reason or error.strerror or error}): {target}")
+
+
 _MAX_WORDS = 300
 """Characters: an error may quote what a file holds."""
 _PLAIN_WORDS: tuple[tuple[type[BaseException], str], ...] = (

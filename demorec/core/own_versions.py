@@ -1,36 +1,27 @@
-"""The versions that decide an episode, and how two runs differ; what modules of the user's own are made of.
+"""The versions that decide an episode, and how two runs differ; digests of the user's own modules and models.
 
-A module counts with its source and with that of what it imports of its own surroundings: modules of its own package
-and, unless it is installed, modules of the folder that it lies in. Imports are read, not carried out. The files beside
-a module that its source names in a string ("mug.obj", "data/heights.csv") count as well, and those that a model among
-them names; a name that is put together while the program runs is not seen. A robot counts with its URDF and the meshes
-that this names, too. What an installed distribution brings has its version as well.
+A module in a package counts with all files below its outermost package, any other module with its own file. A robot
+counts with its URDF and the meshes that the URDF names. A module of an installed distribution also has its version.
 """
 
 from __future__ import annotations
 
-import ast
 import functools
 import hashlib
 import importlib.metadata
-import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import DemorecError
-from demorec.core.registry import import_root, is_allowed, split_name
+from demorec.core.registry import import_root, is_allowed, module_file, split_name
 from demorec.core.tables import load_robot
 from demorec.robots.assets import allow_models, asset_path, mesh_path
 
 SOURCE = "source of "
-"""Begins the name of a digest among versions: "source of my_tasks"."""
-_INSTALLED = ("site-packages", "dist-packages")
-_LONGEST_NAME = 256
-_NAMES_IN_MODELS = {".urdf": [r'filename="([^"]+)"'], ".obj": [r"^mtllib (.+)$"], ".mtl": [r"^map_\w+ (.+)$"]}
-"""How models name other files: suffix -> patterns."""
+"""Prefix of a digest's name among versions: "source of my_tasks"."""
 
 
 def own_versions(modules: Sequence[str], *, robot: str = "") -> dict[str, str]:
@@ -128,27 +119,17 @@ def changed_sources(versions: Mapping[str, str], allowed: Collection[str]) -> tu
 
 @functools.cache
 def source_digest(module: str) -> str:
-    """SHA-256 (16 hex digits) of a module's source, of what it imports of its own surroundings, and of files they name.
+    """Return the SHA-256 (16 hex digits) of a module's file, or of all files below its outermost package.
 
-    Kept as it was at the first call in a process, since that is also what the process has imported.
+    A process keeps the digest of its first call, since that is also what the process has imported.
 
     Raises:
         ConfigError: The module cannot be found.
     """
-    top, root = module.partition(".")[0], import_root(module)
-    is_installed = root.name in _INSTALLED or root == Path(ast.__file__).parent
-    waiting, sources, data = [module], dict[str, Path](), dict[str, Path]()
-    while waiting:
-        name = waiting.pop()
-        if name in sources or (is_installed and name.partition(".")[0] != top):
-            continue
-        source = _file_of(name, root)
-        if source is not None:
-            sources[name] = source
-            data |= {path.relative_to(root).as_posix(): path for path in _files_named(source, root)}
-            waiting += _imports(source, name if source.stem == "__init__" else name.rpartition(".")[0])
-            waiting += name.rpartition(".")[:1]  # the package around it, which is run first
-    return _digest((name, path.read_bytes()) for name, path in (*sorted(sources.items()), *sorted(data.items())))
+    file, root = module_file(module), import_root(module)
+    package = root / module.partition(".")[0]
+    files = _files_below(package) if file.is_relative_to(package) else [file]
+    return _digest((path.relative_to(root).as_posix(), path.read_bytes()) for path in files)
 
 
 @functools.cache
@@ -157,51 +138,14 @@ def _distributions() -> Mapping[str, list[str]]:
     return importlib.metadata.packages_distributions()
 
 
-def _file_of(name: str, root: Path) -> Path | None:
-    """The source of a module or package below `root`."""
-    base = root.joinpath(*name.split("."))
-    candidates = (base / "__init__.py", base.with_name(f"{base.name}.py")) if name else ()
-    return next((path for path in candidates if path.is_file()), None)
+def _files_below(package: Path) -> list[Path]:
+    """List all files of a package in order, without hidden ones and compiled modules."""
+    files = [path for path in sorted(package.rglob("*")) if path.is_file()]
+    return [path for path in files if not any(_is_left_out(part) for part in path.relative_to(package).parts)]
 
 
-def _imports(source: Path, package: str) -> Iterator[str]:
-    """Every name that may be that of a module which the source imports; nothing where it is no Python."""
-    for node in _nodes(source):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            around = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            base = ".".join([*around, node.module] if node.module else around)
-            yield base
-            yield from (f"{base}.{alias.name}" for alias in node.names)
-
-
-def _files_named(source: Path, root: Path) -> Iterator[Path]:
-    """The files below `root` that a string in a source names, relative to it, and those that models among them name."""
-    names = {node.value for node in _nodes(source) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    waiting = [(source.parent, name) for name in names if 0 < len(name) < _LONGEST_NAME]
-    seen: set[Path] = set()
-    while waiting:
-        folder, name = waiting.pop()
-        path = Path(os.path.normpath(folder / name))
-        try:
-            is_new = path not in seen and path.is_relative_to(root) and path.is_file()
-        except (OSError, ValueError):  # no name of a file
-            continue
-        if is_new:
-            seen.add(path)
-            yield path
-            for pattern in _NAMES_IN_MODELS.get(path.suffix.lower(), ()):
-                found = re.findall(pattern, path.read_text(errors="replace"), re.MULTILINE)
-                waiting += [(path.parent, inner.strip()) for inner in found]
-
-
-def _nodes(source: Path) -> Iterator[ast.AST]:
-    """All of a source's syntax tree; nothing where it is no Python."""
-    try:
-        yield from ast.walk(ast.parse(source.read_bytes()))
-    except (SyntaxError, ValueError):
-        return
+def _is_left_out(name: str) -> bool:
+    return name.startswith(".") or name == "__pycache__"
 
 
 def _model_digest(urdf: Path) -> str:

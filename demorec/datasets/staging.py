@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from demorec.core.errors import ConfigError, ExportError
+from demorec.core.errors import ConfigError, ExportError, write_error
 from demorec.core.files import sync_path
 from demorec.core.replacing import ReplaceableKind, check_replaceable
 
@@ -45,8 +45,9 @@ def staged_folder(target: Path, kind: ReplaceableKind, *, replace: bool, sources
         sources: What the new folder is made from, which is never replaced.
 
     Raises:
-        ConfigError: The target is there and not to be replaced, or another export is writing to it.
-        ExportError: It cannot be written; the disk is full, for example.
+        ConfigError: The target is there and not to be replaced, another export is writing to it, or it is no place for
+            a folder.
+        ExportError: It cannot be written for another reason; the disk is full, for example.
     """
     target, sources = Path.cwd() / target, tuple(sources)
 
@@ -77,7 +78,7 @@ def staged_folder(target: Path, kind: ReplaceableKind, *, replace: bool, sources
                 if target.exists() or not (workshop / OLD).exists():
                     shutil.rmtree(workshop, ignore_errors=True)
     except OSError as error:
-        raise ExportError(f"The dataset cannot be written ({error.strerror or error}): {target}") from error
+        raise write_error("The dataset", error, target, ExportError) from error
 
 
 def _check_ours(workshop: Path) -> None:

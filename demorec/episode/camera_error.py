@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -58,3 +58,21 @@ def stated_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
 def true_camera(recorded: SceneCamera, true_from_recorded: Pose) -> SceneCamera:
     """The camera where it truly was."""
     return replace(recorded, mount_from_camera=recorded.mount_from_camera @ true_from_recorded.inverse())
+
+
+def true_cameras(
+    recorded: Sequence[SceneCamera], behaviour: Mapping[str, float]
+) -> tuple[tuple[SceneCamera, ...], dict[str, Pose]]:
+    """Return the cameras where they truly were, and camera name -> true_from_recorded of those that have an error.
+
+    Generation draws from these cameras, so that a recording alone gives the same images again.
+    """
+    errors: dict[str, Pose] = {}
+    cameras = []
+    for camera in recorded:
+        error = stated_error(camera.name, behaviour)
+        if error is not None:
+            errors[camera.name] = error
+            camera = true_camera(camera, error)
+        cameras.append(camera)
+    return tuple(cameras), errors

@@ -130,6 +130,7 @@ class Simulation:
         robot: The arm.
         scene: The world at the start, cameras with intrinsics and mounts included.
         physics_hz: Steps per second.
+        cpu: Type of the CPU that simulated it (`demorec.core.config.cpu_type`).
         behaviour: name -> value of everything else that was drawn for this episode (speed, approach height,
             noise level), for the card and for analysis.
         config: The resolved GenerateConfig as plain JSON data.
@@ -141,6 +142,7 @@ class Simulation:
     robot: RobotSpec
     scene: Scene
     physics_hz: int
+    cpu: str = ""
     behaviour: Mapping[str, float] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
     config_digest: str = ""
@@ -184,6 +186,7 @@ class EpisodeInfo:
     robot = PartValue[RobotSpec]("simulation", NotSimulatedError)
     scene = PartValue[Scene]("simulation", NotSimulatedError)
     physics_hz = PartValue[int]("simulation", NotSimulatedError)
+    cpu = PartValue[str]("simulation", NotSimulatedError)
     behaviour = PartValue[Mapping[str, float]]("simulation", NotSimulatedError)
     config = PartValue[Mapping[str, Any]]("simulation", NotSimulatedError)
     config_digest = PartValue[str]("simulation", NotSimulatedError)

@@ -11,7 +11,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.core.config import GenerateConfig, deciding_versions
+from demorec.core.config import GenerateConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, GenerationError, NotGeneratedError, resource_error
 from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.own_versions import differences
@@ -217,6 +217,7 @@ def machine() -> dict[str, str]:
         "host": platform.node(),
         "system": platform.platform(),
         "processor": _processor(),
+        "cpu": cpu_type(),
         "cores": str(available_cores()),
         "python": sys.version.split()[0],
     }

@@ -1,21 +1,20 @@
-"""The same data again, from what a run or a dataset says about itself, and whether it is the same.
+"""Compare a run with what it was to make again: a run, a recording or a dataset.
 
-A run is compared recording by recording: what its files hold now, whatever run.json says of them. A dataset is exported
-again with its own options and compared episode by episode, by what its tables and videos hold.
+The recordings of a run are read again, whatever run.json says of them. A dataset is exported again with its own options
+and compared episode by episode, by the content of its tables and videos.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.core.config import GenerateConfig, deciding_versions, parse_config
-from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
-from demorec.core.own_versions import version_differences
-from demorec.core.replacing import use_as_source
+from demorec.check.run_dataset import export_options
+from demorec.core.config import GenerateConfig, parse_config
+from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.datasets.lerobot.files import read_json, read_table
 from demorec.datasets.lerobot.inspect import episode_digests
@@ -24,8 +23,7 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
-from demorec.generate.options import RunObserver, RunOptions, RunResult
-from demorec.generate.run import generate
+from demorec.generate.options import RunResult
 from demorec.mcap import open_recording
 from demorec.runs.find import expect
 from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
@@ -39,83 +37,63 @@ class Original:
     """What is to be made again.
 
     Attributes:
+        source: The run's folder, the recording or the dataset.
         config: That decided the data.
         num_episodes: Of the run, as many as are needed to have all that is compared.
         versions: package -> version that episodes were made with, each such set once.
         digests: (episode, attempt) -> digest of the content that is there now; "" where `faults` tells of it.
         faults: One line for each recording that is missing, cannot be read, or is not what run.json says of it.
-        export: Options of the dataset; None for a run.
+        export: Options of the dataset; None for a run or a recording.
     """
 
+    source: Path
     config: GenerateConfig
     num_episodes: int
     versions: tuple[Mapping[str, str], ...]
     digests: Mapping[Key, str]
     faults: tuple[str, ...] = ()
-    export: ExportOptions | None
+    export: ExportOptions | None = None
 
 
-def reproduce(
-    source: Path, options: RunOptions, *, progress: RunObserver, allowed: Sequence[str] = ()
-) -> tuple[RunResult, dict[Key, bool], tuple[str, ...]]:
-    """Make the source's run again in `options.out` and compare, unless it was interrupted.
+def compare(original: Original, result: RunResult) -> dict[Key, bool]:
+    """Compare a finished run with the original; episode and attempt -> whether it has the same content bit for bit."""
+    made = {(a.episode_index, a.attempt): a.digest for a in result.run.attempts}
+    if original.export is not None:
+        made = _dataset_digests(result.folder / DATASET)
+    return {key: made.get(key) == value for key, value in original.digests.items()}
 
-    Args:
-        source: A run or a dataset.
-        options: How it is carried out.
-        progress: Is called with how it goes, and first of all in which versions the source differs from what is here.
-        allowed: The user's own modules that may be imported for what the source names.
 
-    Returns:
-        The run that was made; episode and attempt -> whether the copy has it with the same content bit for bit; and one
-        line for each recording of the source that is not as it should be.
+def export_as_original(original: Original, result: RunResult) -> None:
+    """Export a run to its dataset with the options of the original dataset.
 
     Raises:
-        ConfigError: The source is no run and no dataset, or was made from several runs; or `options.out` is, holds or
-            lies in the source, or holds another dataset.
-        NotAllowedError: It names something of a module that is not allowed.
+        ConfigError: Something else is where the dataset would be.
+        ExportError: The export failed.
     """
-    assert options.out is not None
-    original = read_original(source)
-    overlap = use_as_source(options.out.resolve(), [source])
-    if overlap:
-        raise ConfigError(f"The copy needs a place of its own, but {overlap}: choose another --out: {options.out}")
-    original.config.check_names(allowed)
-    here = deciding_versions(original.config)
-    different = dict.fromkeys(line for there in original.versions for line in version_differences(there, here))
-    if different:
-        progress.says(f"Note: {'; '.join(different)}.")
-    result = generate(original.config, replace(options, num_episodes=original.num_episodes), progress=progress)
-    if result.interrupted:
-        return result, {}, ()
-    if original.export is None:
-        made = {(a.episode_index, a.attempt): a.digest for a in result.run.attempts}
-    else:
-        target = result.folder / DATASET
-        there = os.path.lexists(target)
-        if there and not _is_such_a_copy(target, original, result.run.config_digest):
-            raise ConfigError(
-                f"Something else is where the copy of the dataset would be, choose another --out: {target}"
-            )
-        export_lerobot([result.folder], target, replace(original.export, overwrite=there))
-        made = _dataset_digests(target)
-    return result, {key: made.get(key) == value for key, value in original.digests.items()}, original.faults
+    assert original.export is not None
+    target = result.folder / DATASET
+    there = os.path.lexists(target)
+    if there and not is_dataset_of_run(target, result.run.config_digest):
+        raise ConfigError(f"Something else is where the copy of the dataset would be, choose another --out: {target}")
+    export_lerobot([result.folder], target, replace(original.export, overwrite=there))
 
 
-def _is_such_a_copy(target: Path, original: Original, config_digest: str) -> bool:
-    """Whether a dataset holds episodes of this run alone, none beyond those that are exported anew."""
-    try:
-        return is_dataset_of_run(target, config_digest) and _dataset_digests(target).keys() <= original.digests.keys()
-    except (DemorecError, OSError, ValueError, KeyError, TypeError) as error:
-        if (lack := resource_error(error)) is not None:
-            raise lack from error
-        return False
+def read_original(path: Path) -> Original:
+    """Read what a run, a recording or a dataset says about itself.
 
+    Args:
+        path: A run's folder or its run.json, a recording, or a dataset.
 
-def read_original(source: Path) -> Original:
-    """What a run or a dataset says about itself; ConfigError when that is not enough to make it again."""
-    if expect(source, "run", "dataset").kind == "run":
+    Raises:
+        ConfigError: It is none of these, or says too little to be made again.
+        RecordingError: The recording is damaged.
+    """
+    source = path.parent if path.name == RUN_NAME else path
+    kind = expect(source, "run", "recording", "dataset").kind
+    if kind == "run":
         return _read_run(source)
+    if kind == "recording":
+        return _read_recording(source)
     if not os.path.lexists(source / CONFIGS_PATH):
         raise ConfigError(f"The dataset does not say what it was made with ({CONFIGS_PATH} is missing): {source}")
     return _read_dataset(source)
@@ -146,19 +124,34 @@ def _read_run(source: Path) -> Original:
         if info.versions not in versions:
             versions.append(info.versions)
     return Original(
+        source=source,
         config=run.config,
         num_episodes=1 + max(a.episode_index for a in run.attempts),
         versions=tuple(there for there in versions if there),
         digests=digests,
         faults=tuple(faults),
-        export=None,
+    )
+
+
+def _read_recording(source: Path) -> Original:
+    with open_recording(source, simulated=True) as recording:
+        info, digest = recording.info, recording.digest()
+    if info.origin:
+        raise ConfigError(f"The recording is a {info.origin}, which generate-dataset did not make: {source}")
+    config = parse_config(dict(info.config), GenerateConfig, source=str(source))
+    config.validate()
+    return Original(
+        source=source,
+        config=config,
+        num_episodes=1 + info.episode_index,
+        versions=(info.versions,),
+        digests={(info.episode_index, info.attempt): digest},
     )
 
 
 def _read_dataset(source: Path) -> Original:
     try:
         configs = read_json(source / CONFIGS_PATH)
-        made_with = read_json(source / EXPORT_PATH)
         rows = _rows(source)
         if any(row["episode_info"] is None for row in rows):
             raise ConfigError(
@@ -166,8 +159,7 @@ def _read_dataset(source: Path) -> Original:
             )
         if len(configs) != 1:
             raise ConfigError(
-                f"The dataset was made from {len(configs)} different runs: reproduce each of them from its own folder: "
-                f"{source}"
+                f"The dataset was made from {len(configs)} runs: make each of them again from its own folder: {source}"
             )
         if any(row["origin"] for row in rows):
             raise ConfigError(f"The dataset holds replayed or rendered episodes, which no run makes: {source}")
@@ -175,21 +167,12 @@ def _read_dataset(source: Path) -> Original:
         original = parse_config(config, GenerateConfig, source=str(source / CONFIGS_PATH))
         original.validate()
         return Original(
+            source=source,
             config=original,
             num_episodes=1 + max(row["run_episode_index"] for row in rows),
             versions=(read_episode_info(rows[0]["episode_info"]).versions,),
             digests=_digests(source, rows),
-            export=ExportOptions(
-                action=made_with["action"],
-                state=made_with.get("state", "joint"),
-                privileged=made_with["privileged"],
-                features=tuple(made_with.get("features", ())),
-                include_failures=made_with["include_failures"],
-                episodes=made_with["episodes"],
-                fps=made_with["fps"],
-                depth=made_with["depth"],
-                verify=False,
-            ),
+            export=replace(export_options(source), episodes=read_json(source / EXPORT_PATH)["episodes"]),
         )
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ConfigError(

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.config import EpisodePlan, GenerateConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, to_plain
 from demorec.core.registry import modules_of
 from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
-from demorec.episode.camera_error import error_values
+from demorec.episode.camera_error import error_values, true_cameras
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
@@ -114,6 +114,8 @@ def prepare(plan: EpisodePlan) -> Episode:
     cameras = vary_cameras(tuple(_cameras(task, robot, config)), ranges, camera_rng)
     errors = calibration_errors(cameras, ranges, camera_rng)
     scene = replace(scene, cameras=tuple(moved_camera(camera, errors[camera.name]) for camera in cameras))
+    drawn = behaviour.as_mapping() | error_values(errors)
+    cameras, errors = true_cameras(scene.cameras, drawn)
     info = EpisodeInfo(
         episode_index=plan.episode_index,
         attempt=plan.attempt,
@@ -126,7 +128,8 @@ def prepare(plan: EpisodePlan) -> Episode:
             robot=robot,
             scene=scene,
             physics_hz=config.physics_hz,
-            behaviour=behaviour.as_mapping() | error_values(errors),
+            cpu=cpu_type(),
+            behaviour=drawn,
             config=to_plain(config),
             config_digest=digest(config),
         ),
@@ -137,7 +140,7 @@ def prepare(plan: EpisodePlan) -> Episode:
         task=task,
         behaviour=behaviour,
         cameras=cameras,
-        true_from_recorded={name: error for name, error in errors.items() if error != Pose()},
+        true_from_recorded=errors,
         interjection=draw_interjection(scene, _rng(plan, "interjection")) if config.interject else None,
     )
 

@@ -131,8 +131,9 @@ class EpisodeFile(Closing):
         return settings.height, settings.width
 
     def _digest_of_description(self) -> hashlib._Hash:
-        """That of the metadata, to go on with: not of what versions wrote them."""
-        described = to_plain(self.info)
+        """That of the metadata, to go on with: not of the versions and the CPU that made them."""
+        info = self.info if self.info.simulation is None else self.info.with_simulation(cpu="")
+        described = to_plain(info)
         del described["versions"]
         result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
         result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())

@@ -12,7 +12,7 @@ import foxglove
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CompressedVideo
 
-from demorec.core.errors import ConfigError, RecordingError, describe_error
+from demorec.core.errors import ConfigError, RecordingError, describe_error, write_error
 from demorec.core.files import sync_path
 from demorec.core.replacing import RECORDING, check_replaceable, lock_part
 from demorec.mcap import messages
@@ -79,7 +79,8 @@ class PartFile:
             so that it is replaced whether or not that is asked for.
 
     Raises:
-        ConfigError: A file of that name, or an unfinished one, is there already and not to be replaced.
+        ConfigError: A file of that name, or an unfinished one, is there already and not to be replaced; or no file can
+            be there.
         RecordingError: It cannot be written.
     """
 
@@ -108,7 +109,8 @@ class PartFile:
                 self._lock = None
                 raise
         except OSError as error:
-            raise self._unwritable(error) from error
+            reason = describe_error(error)
+            raise write_error("The recording", error, path, RecordingError, reason=reason) from error
         self._channels: dict[str, foxglove.Channel] = {}
         self._context = foxglove.Context()
         self._mcap = foxglove.open_mcap(

@@ -1,7 +1,7 @@
 """Images of bodies whose shapes and poses are plain data: colour, depth, segmentation, by any of several renderers.
 
-Where shapes and poses come from does not matter to a renderer: from the simulator (`demorec.sim.world.World`) or from a
-recording (`demorec.render.recorded.RecordedWorld`). `demorec.render.painter` brings the two together.
+Where shapes and poses come from does not matter to a renderer: the simulator (`demorec.sim.world.World`) provides them,
+and `demorec.render.painter` brings the two together.
 """
 
 from __future__ import annotations
@@ -86,8 +86,6 @@ class RenderSetup:
         light: Light and sky.
         depth, segmentation: Whether these are drawn beside colour.
         antialias: Whether edges are smoothed, where the renderer can.
-        detail: Camera name -> of which height images are whose level of detail is drawn, where a renderer has such;
-            its own for the others. For small images that shall show what a large one shows.
     """
 
     bodies: tuple[VisualBody, ...]
@@ -97,7 +95,6 @@ class RenderSetup:
     depth: bool = False
     segmentation: bool = False
     antialias: bool = True
-    detail: Mapping[str, int] = field(default_factory=dict)
 
 
 class Renderer(Protocol):

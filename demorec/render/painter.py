@@ -18,7 +18,7 @@ from demorec.render import Mount, Renderer, RenderSetup, VisualBody
 
 
 class Drawable(Protocol):
-    """What can be drawn: a simulated world, or a recorded one."""
+    """What can be drawn: a simulated world, or one at recorded states."""
 
     @property
     def scene(self) -> Scene:
@@ -43,7 +43,6 @@ class Painter:
         true_from_recorded: Camera name -> calibration error, of the cameras that have one.
         depth, segmentation: Whether these are drawn beside colour.
         antialias: Whether edges are smoothed, where the renderer can.
-        detail: As of `RenderSetup`.
     """
 
     def __init__(
@@ -55,7 +54,6 @@ class Painter:
         depth: bool = False,
         segmentation: bool = False,
         antialias: bool = True,
-        detail: Mapping[str, int] | None = None,
     ) -> None:
         self._renderer = renderer
         self._true_from_recorded = true_from_recorded or {}
@@ -66,7 +64,6 @@ class Painter:
             depth=depth,
             segmentation=segmentation,
             antialias=antialias,
-            detail=detail or {},
         )
 
     def setup(self, world: Drawable) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -200,7 +200,7 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
 
 
 def dataset_demonstrations(
-    path: Path, wanted: Callable[[int], bool], options: ReplayOptions, *, limit: int | None = None
+    path: Path, wanted: Callable[[int], bool], options: ReplayOptions
 ) -> Iterator[Demonstration]:
     """The episodes of an exported dataset, by what its sidecar keeps of their scenes.
 
@@ -208,7 +208,6 @@ def dataset_demonstrations(
         path: The dataset.
         wanted: Whether an episode, by its number in the dataset, is wanted.
         options: How it will be replayed.
-        limit: No more than this many, spread evenly.
 
     Raises:
         ConfigError: The dataset has no sidecar of ours, other actions, or the options make no sense for it; with a
@@ -221,7 +220,9 @@ def dataset_demonstrations(
         raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
     dataset = Dataset(path, motors=options.motors)
     if options.robot is not None:
-        for number, motion in _spread([each for each in enumerate(dataset.motions.all) if wanted(each[0])], limit):
+        for number, motion in enumerate(dataset.motions.all):
+            if not wanted(number):
+                continue
             name = f"{path.name}_episode_{number:06d}"
             yield demonstration_of(motion, options.robot, name=name, where=path, episode_index=number)
         return
@@ -231,7 +232,9 @@ def dataset_demonstrations(
             f"{path}"
         )
     dataset.check_simulated()
-    for each in _spread([each for each in dataset.described() if wanted(each.number)], limit):
+    for each in dataset.described():
+        if not wanted(each.number):
+            continue
         number, rows, row, info = each.number, each.rows, each.kept, each.info
         kind = dataset.action_kind(info)
         if kind is None:
@@ -248,13 +251,6 @@ def dataset_demonstrations(
             tolerance=1e-6,
             digest=str(row["content_digest"]),
         )
-
-
-def _spread[T](chosen: Sequence[T], limit: int | None) -> Sequence[T]:
-    """No more than so many of them, spread evenly."""
-    if limit is None or len(chosen) <= limit:
-        return chosen
-    return [chosen[k * len(chosen) // limit] for k in range(limit)]
 
 
 def demonstration_of(

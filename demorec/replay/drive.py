@@ -324,7 +324,7 @@ def record_replay(
     path = out / (d.name if d.source is not None else f"{d.name}.mcap")
     if d.source is not None and path.resolve() == d.source.resolve():
         raise ConfigError(f"The replay would replace the recording itself, choose another --out: {out}")
-    view = recorded_view(d.info, options.allowed)
+    view = recorded_view(d.info)
     make_folder(out)
     behaviour = view_behaviour(d.info, view)
     info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}").with_simulation(behaviour=behaviour)

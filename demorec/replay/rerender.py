@@ -1,4 +1,4 @@
-"""Recorded states, new images: any camera, size, renderer or looks, without simulating anything.
+"""Recorded states, new images: any camera, size, renderer or looks, without physics.
 
 A new recording keeps every number of the old one and names it as its origin. With the recording's own cameras and
 looks the images come out again as they were before coding, so the coded packets are equal, byte for byte.
@@ -6,32 +6,32 @@ looks the images come out again as they were before coding, so the coded packets
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from contextlib import nullcontext
+from collections.abc import Mapping
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
-from demorec.core.errors import ConfigError, DemorecError, NotAllowedError, RecordingError
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, RecordingError
 from demorec.core.files import make_folder
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, from_plain, to_json
 from demorec.core.registry import nearest_match, split_name
 from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
-from demorec.episode.camera_error import stated_error, true_camera
+from demorec.episode.camera_error import true_cameras
 from demorec.episode.episode import Columns, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.variation import Ranges, resolve
-from demorec.loop import prepare
+from demorec.loop import SimulatorCache
 from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.mcap.frames import frames_of
 from demorec.render import Renderer
-from demorec.render.painter import Painter, WarmRenderer
-from demorec.render.recorded import RecordedWorld
+from demorec.render.painter import Painter
 from demorec.robots.assets import allow_models
+from demorec.sim.recorded_states import RecordedStates
 from demorec.tasks.vary import vary_looks
 
 
@@ -99,38 +99,10 @@ class SceneView:
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
 
 
-def recorded_view(info: EpisodeInfo, allowed: Collection[str]) -> SceneView:
-    """The view of a recording.
-
-    Recorded extrinsics may be off on purpose, as those of a real camera are; where the cameras really were follows
-    from the seed, to the bit. If the scene cannot be drawn again from it (another version, new looks, a scene of
-    somebody else's), it follows from the error that the recording tells. Older recordings do not tell it: there the
-    recorded cameras are taken for the true ones.
-
-    Raises:
-        NotAllowedError: The scene cannot be drawn again without a module that is not among those `allowed`.
-    """
-    if not info.origin and any(name.startswith("calibration_") for name in info.behaviour):
-        try:
-            config = config_as(info.config, GenerateConfig)
-            config.check_names(allowed)
-            plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
-            episode = prepare(plan)
-        except NotAllowedError:
-            raise  # else the images would be taken from wrong places without a word
-        except (ValueError, DemorecError):
-            episode = None
-        if episode is not None and episode.info.scene == info.scene:
-            return SceneView(
-                scene=info.scene, true_cameras=episode.cameras, true_from_recorded=episode.true_from_recorded
-            )
-    cameras, errors = [], dict[str, Pose]()
-    for camera in info.scene.cameras:
-        error = stated_error(camera.name, info.behaviour)
-        if error is not None:
-            errors[camera.name] = error
-        cameras.append(camera if error is None else true_camera(camera, error))
-    return SceneView(scene=info.scene, true_cameras=tuple(cameras), true_from_recorded=errors)
+def recorded_view(info: EpisodeInfo) -> SceneView:
+    """Return the view of a recording, whose extrinsics may be off on purpose, as those of a real camera are."""
+    cameras, errors = true_cameras(info.scene.cameras, info.behaviour)
+    return SceneView(scene=info.scene, true_cameras=cameras, true_from_recorded=errors)
 
 
 def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
@@ -139,7 +111,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
     Raises:
         ConfigError: An unknown camera, or an image size that cannot be coded.
     """
-    old = recorded_view(info, options.allowed)
+    old = recorded_view(info)
     names = options.cameras or tuple(camera.name for camera in info.scene.cameras)
     if not names:
         raise ConfigError("The recording has no cameras: name some with --cameras.")
@@ -239,7 +211,7 @@ def rerender(
     options: RerenderOptions,
     *,
     overwrite: bool = False,
-    renderers: WarmRenderer | None = None,
+    simulators: SimulatorCache | None = None,
 ) -> RerenderReport:
     """Draw a recording anew, unless `out` is what the same call has made before.
 
@@ -248,7 +220,7 @@ def rerender(
         out: The file to be made.
         options: What is to change.
         overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
-        renderers: The caller's, warm from one recording to the next; None makes and frees one.
+        simulators: Gives world and renderer, warm from one recording to the next; None makes and frees them.
 
     Raises:
         RecordingError: The source is damaged or empty.
@@ -277,11 +249,13 @@ def rerender(
         if not was_there:
             make_folder(out.parent)
             with (
-                nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
+                nullcontext(simulators) if simulators is not None else closing(SimulatorCache()) as warm,
                 EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
-                painter = view_painter(warm.of(str(config.get("renderer", "raster"))), view, config)
-                _write_drawn(writer, recording, columns, painter, view.scene)
+                world, renderer = warm.acquire(new_info)
+                assert renderer is not None, "a view has cameras"
+                painter = view_painter(renderer, view, config)
+                _write_drawn(writer, recording, columns, painter, RecordedStates(world, view.scene, columns))
         compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,
@@ -294,14 +268,13 @@ def rerender(
     )
 
 
-def _write_drawn(writer: EpisodeWriter, recording: Recording, columns: Columns, painter: Painter, scene: Scene) -> None:
-    """All frames of a recording with new images of the scene, and its outcome."""
-    world = RecordedWorld(
-        recording.info.robot, scene, joint_position=columns.joint_position, object_poses=columns.object_poses
-    )
-    painter.setup(world)
+def _write_drawn(
+    writer: EpisodeWriter, recording: Recording, columns: Columns, painter: Painter, states: RecordedStates
+) -> None:
+    """Write all frames of a recording with new images, and its outcome."""
+    painter.setup(states)
     for frame in frames_of(columns, recording.events(), recording.joint_samples()):
-        world.frame = frame.frame_index
+        states.frame = frame.frame_index
         writer.write(replace(frame, images=painter.images()))
     writer.finish(_outcome(recording))
 

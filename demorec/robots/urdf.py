@@ -63,7 +63,6 @@ class UrdfJoint:
         parent_from_joint: Pose of the joint frame (= child link frame at position 0).
         axis: Unit vector in the joint frame.
         lower, upper: Position limits, rad or m; infinite where the URDF has none.
-        max_speed: rad/s or m/s; infinite where the URDF has none.
     """
 
     name: str
@@ -74,7 +73,6 @@ class UrdfJoint:
     axis: tuple[float, float, float]
     lower: float
     upper: float
-    max_speed: float = math.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +181,6 @@ def _joint(element: ET.Element, scale: float) -> UrdfJoint:
         axis=(1.0, 0.0, 0.0) if length == 0.0 else tuple(float(v) for v in axis / length),  # type: ignore[arg-type]
         lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
         upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
-        max_speed=math.inf if limit is None else unit * float(limit.get("velocity") or math.inf),
     )
 
 
@@ -229,19 +226,12 @@ class UrdfLink:
 
     Attributes:
         name: Unique in the URDF.
-        link_from_inertial: Pose of the centre of mass in the link's frame.
         visuals, collisions: Its shapes, in the order of the file; those of an unknown geometry are left out.
     """
 
     name: str
-    link_from_inertial: Pose
     visuals: tuple[UrdfShape, ...]
     collisions: tuple[UrdfShape, ...]
-
-    @property
-    def seen(self) -> tuple[UrdfShape, ...]:
-        """The shapes that PyBullet draws: the visual ones, of a link without any the collision shapes."""
-        return self.visuals or self.collisions
 
 
 def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
@@ -263,7 +253,6 @@ def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
         return tuple(
             UrdfLink(
                 name=link.attrib["name"],
-                link_from_inertial=_origin(link.find("inertial"), scale),
                 visuals=_shapes(link, "visual", scale, colors),
                 collisions=_shapes(link, "collision", scale, colors),
             )

@@ -120,10 +120,10 @@ class Arm:
         pose = self.kinematics.forward(joint_target)
         return Action(joint_target=joint_target, gripper_target=gripper_target, base_from_tcp_target=pose)
 
-    def command(self, action: Action) -> None:
-        """Begin a control step: the gripper's motors are set for all of it."""
+    def command_gripper(self, width: float) -> None:
+        """Begin a control step: the gripper's motors are set to an opening, in metres, for all of it."""
         gripper = self.spec.gripper
-        for joint, target in zip(self._fingers, gripper.joint_position(action.gripper_target).tolist(), strict=True):
+        for joint, target in zip(self._fingers, gripper.joint_position(width).tolist(), strict=True):
             self._client.setJointMotorControl2(
                 self.body,
                 joint,
@@ -132,7 +132,7 @@ class Arm:
                 force=gripper.force,
                 maxVelocity=gripper.joint_speed,
             )
-        self.gripper_target = action.gripper_target
+        self.gripper_target = width
 
     def drive(self, joint_target: Array) -> None:
         """Set the arm's motors to (n_arm,) targets for the next physics step."""

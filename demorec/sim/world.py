@@ -37,6 +37,9 @@ class World:
         robot: The arm.
         fps: Control steps per second; divides the scene's physics rate.
         sample_joints: Whether `apply` keeps the joint states of every physics step (see `joint_samples`).
+
+    Attributes:
+        inertial_poses: Body of the scene -> pose of its centre of mass in its own frame.
     """
 
     def __init__(self, robot: RobotSpec, *, fps: int = 30, sample_joints: bool = False) -> None:
@@ -49,6 +52,7 @@ class World:
         self._scene: Scene | None = None
         self._shape_rows: ShapeRows = ()
         self._visuals: tuple[VisualBody, ...] = ()
+        self.inertial_poses: dict[str, Pose] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -96,9 +100,9 @@ class World:
         self.arm = Arm(self.client, self.robot, scene.robot, finger_stiffness=scene.physics.finger_stiffness)
         for body in scene.movable:
             self._bodies[body.name] = add_body(self.client, body)
-        self._inertial = {name: base_from_inertial(self.client, index) for name, index in self._bodies.items()}
+        self.inertial_poses = {name: base_from_inertial(self.client, index) for name, index in self._bodies.items()}
         self._constraint: int | None = None
-        self.arm.command(self.hold())
+        self.arm.command_gripper(self.arm.gripper_target)
         for _ in range(round(SETTLE_SECONDS * scene.physics.hz)):
             self.arm.drive(self.arm.target)
             self.client.stepSimulation()
@@ -112,7 +116,7 @@ class World:
         start, end = self.arm.target, np.asarray(command.joint_target, dtype=np.float64)
         if self.scene.hold == "constraint":
             self._hold_by_constraint(command)
-        self.arm.command(command)
+        self.arm.command_gripper(command.gripper_target)
         samples = []
         for substep in range(1, self._substeps + 1):
             self.arm.drive(start + (end - start) * (substep / self._substeps))
@@ -226,7 +230,7 @@ class World:
         """`world_from_body` of a body of the scene."""
         position, quat = self.client.getBasePositionAndOrientation(self._bodies[name])
         centre = Pose(position=np.array(position), quat_xyzw=np.array(quat))
-        inertial = self._inertial[name]
+        inertial = self.inertial_poses[name]
         if inertial == Pose():
             return centre
         return centre @ inertial.inverse()
@@ -307,7 +311,7 @@ class World:
             self.arm.place_joints(np.asarray(joint_position, dtype=np.float64))
             self.arm.target = np.array(joint_position[: len(self.robot.arm_joints)], dtype=np.float64)
         for name, pose in (object_poses or {}).items():
-            centre = pose if self._inertial[name] == Pose() else pose @ self._inertial[name]
+            centre = pose if self.inertial_poses[name] == Pose() else pose @ self.inertial_poses[name]
             self.client.resetBasePositionAndOrientation(
                 self._bodies[name], centre.position.tolist(), centre.quat_xyzw.tolist()
             )

@@ -15,7 +15,6 @@ import numpy as np
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, Goal
-from demorec.robots.kinematics import WHOLE_POSE
 from demorec.sim.world import World
 from demorec.tasks.grasping import (
     clear_first,
@@ -47,7 +46,7 @@ still held the arm a centimetre off, a policy would learn that a centimetre off 
 LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
 ROCKING_SECONDS = 0.5
-"""How long what a small arm, which is soon away, has let go of may rock."""
+"""How long what the hand has let go of may rock."""
 CARRIED_ABOVE_M = 0.04
 """As `ABOVE_M` for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
 
@@ -86,8 +85,6 @@ class Expert:
         self._free, self._clear_height = False, -math.inf
         self._missing = self._has_missed = False
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
-        # Recordings of arms of six joints and more are made again byte for byte: what was learnt later is not for them.
-        self._keeps_bytes = self.reach.arm.freedom == WHOLE_POSE
         # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
         self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
 
@@ -97,11 +94,8 @@ class Expert:
         return self.world.robot.gripper.open_width
 
     def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> GaveUp:
-        """What is raised for something that cannot be reached, noted with what is wrong with the first of its poses.
-
-        Of arms that need no freedom the text stays as it was: recordings are made again byte for byte.
-        """
-        why = self.reach.why_not(poses[0], self.joint_target) if poses and not self._keeps_bytes else ""
+        """Note what is wrong with the first of the poses that cannot be reached, and return what is to be raised."""
+        why = self.reach.why_not(poses[0], self.joint_target) if poses else ""
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
         return GaveUp(self.phase, "unreachable")
 
@@ -145,11 +139,10 @@ class Expert:
                 return grasp
         return None
 
-    def _reachable(self, poses: Sequence[Pose], *, up_to: float, others: Sequence[Pose] = ()) -> Iterator[Pose]:
-        """Poses that are reached from where the arm is, `up_to` metres higher too; then those, and `others`, that are
-        reached at all."""
+    def _reachable(self, poses: Sequence[Pose], *, up_to: float) -> Iterator[Pose]:
+        """Yield poses that are reached from where the arm is, `up_to` metres higher too; then those reached at all."""
         yield from within(self.reaches, poses, up_to=up_to)
-        yield from within(self.reach.at_all, (*poses, *others), up_to=up_to)
+        yield from within(self.reach.at_all, poses, up_to=up_to)
 
     def move(
         self,
@@ -352,8 +345,7 @@ class Expert:
         except GaveUp:  # so much is enough to be clear of what was put down
             yield from self.move(least, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
-        rocking = 0 if self._keeps_bytes else round(ROCKING_SECONDS * world.fps)
-        for _ in range(rocking):  # holds still while it rocks
+        for _ in range(round(ROCKING_SECONDS * world.fps)):  # holds still while it rocks
             if all(check.passed for check in rest_checks(world, name)):
                 break
             yield self.step()
@@ -383,9 +375,7 @@ class Expert:
         world = self.world
         body, pose = world.body(name), world.pose(name)
         grasps = grasps_of(body, pose, now=hand_yaw(self.tcp()), robot=world.robot, behaviour=self.behaviour)
-        if body.shape.mesh or not self._keeps_bytes:
-            grasps = clear_first(grasps, self._others(name), world.robot)
-        return grasps
+        return clear_first(grasps, self._others(name), world.robot)
 
     def _others(self, name: str) -> list[tuple[Body, Pose]]:
         """All bodies but one, and their poses."""
@@ -399,15 +389,11 @@ class Expert:
             GaveUp: Out of reach at every allowed yaw.
         """
         body, pose = self.world.body(goal.object), self.world.pose(goal.object)
-        any_yaw = ANY_YAW if body.shape.mesh or not self._keeps_bytes else 0
-        symmetry = 0 if keep_yaw else goal.yaw_symmetry or any_yaw
+        symmetry = 0 if keep_yaw else goal.yaw_symmetry or ANY_YAW
         wanted, hand = goal_pose(self.world, goal), self.tcp()
         places = places_of(body, pose, wanted, hand=hand, yaw_symmetry=symmetry)
         height = self._transport_height(places[0]) - float(places[0].position[2])
-        others: list[Pose] = []
-        if not (keep_yaw or goal.yaw_symmetry):
-            others = places_of(body, pose, wanted, hand=hand, yaw_symmetry=ANY_YAW)
-        place = next(self._reachable(places, up_to=height, others=others), None)
+        place = next(self._reachable(places, up_to=height), None)
         if place is None:
             raise self._out_of_reach(f"the goal of {goal.object}", places)
         return place

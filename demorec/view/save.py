@@ -8,7 +8,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from demorec.core.errors import RecordingError
+from demorec.core.errors import RecordingError, write_error
 from demorec.core.replacing import RERUN_FILE, written_whole
 from demorec.view.layout import comparison_layout, episode_layout
 from demorec.view.scene import log_comparison, log_episode, new_comparison, new_recording
@@ -95,4 +95,4 @@ def _refusals_reported(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise RecordingError(f"The file cannot be written ({error.strerror or error}): {target}") from error
+        raise write_error("The file", error, target, RecordingError) from error

@@ -16,7 +16,7 @@ from urllib.request import urlopen
 
 from rerun.experimental import ViewerClient
 
-from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, write_error
 from demorec.core.processes import start_program
 from demorec.core.replacing import IMAGE, written_whole
 from demorec.view.paths import SECONDS
@@ -237,7 +237,7 @@ def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | Non
         try:
             viewer.save_image(target)
         except OSError as error:
-            raise RecordingError(f"The image cannot be written ({error.strerror}): {target}") from error
+            raise write_error("The image", error, target, RecordingError) from error
 
 
 @contextmanager

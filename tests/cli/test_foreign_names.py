@@ -112,16 +112,16 @@ def test_no_command_imports_what_a_file_names(
             assert code == 2, command
             assert not list((tmp_path / "out" / command).rglob("*")), "a refused request leaves nothing behind"
     expected = {
-        "recording": {"replay", "replay states", "render"},
-        "run": {"replay", "replay states", "render", "reproduce"},
-        "dataset": {"replay", "reproduce"},
+        "recording": {"replay", "generate"},
+        "run": {"replay", "generate"},
+        "dataset": {"replay", "generate"},
     }
     assert refused == expected[kind]
 
 
 @pytest.mark.parametrize(
     "words",
-    [["check", "--no-images", "--deep"], ["replay"], ["render", "--workers", "1", "--out", "new.mcap"]],
+    [["check", "--no-images", "--deep"], ["replay"]],
     ids=lambda words: words[0],
 )
 def test_allowed_modules_are_imported(
@@ -133,7 +133,7 @@ def test_allowed_modules_are_imported(
     assert "add --allow" not in capsys.readouterr().err
 
 
-def test_reproduce_goes_to_work_with_an_allowed_module(
+def test_generate_goes_to_work_with_an_allowed_module(
     tmp_path: Path, marker: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[GenerateConfig] = []
@@ -145,11 +145,11 @@ def test_reproduce_goes_to_work_with_an_allowed_module(
         asked.append(config)
         raise Reached
 
-    monkeypatch.setattr("demorec.generate.reproduce.generate", generate)
-    monkeypatch.setattr("demorec.generate.reproduce.deciding_versions", lambda config: {})  # the robot is none
+    monkeypatch.setattr("demorec.generate.run.generate", generate)
+    monkeypatch.setattr("demorec.core.config.deciding_versions", lambda config: {})  # the robot is none
     run = run_of(f"{MODULE}:Mine", tmp_path / "run")
     with pytest.raises(Reached):
-        exit_code("reproduce", run, "--out", tmp_path / "again", "--allow", MODULE)
+        exit_code("generate", "--config", run, "--out", tmp_path / "again", "--allow", MODULE)
     assert asked[0].task == f"{MODULE}:Mine"
 
 
@@ -163,7 +163,7 @@ def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_of(name, tmp_path / "run")
-    for call in (COMMANDS["replay"], COMMANDS["reproduce"]):
+    for call in (COMMANDS["replay"], COMMANDS["generate"]):
         assert exit_code(*words_of(call, run, tmp_path / "out")) == 2
         told = capsys.readouterr().err
         assert len(without_notes(told)) == 1, told
@@ -226,6 +226,6 @@ def test_models_that_a_file_names_lie_in_known_folders(file: str) -> None:
 def test_run_files_are_not_touched_by_being_refused(tmp_path: Path, marker: Path) -> None:
     run = run_of(f"{MODULE}:Mine", tmp_path / "run")
     before = (run / RUN_NAME).read_bytes()
-    assert exit_code("reproduce", run, "--out", tmp_path / "again") == 2
+    assert exit_code("generate", "--config", run / RUN_NAME, "--out", tmp_path / "again") == 2
     assert (run / RUN_NAME).read_bytes() == before
     assert not (tmp_path / "again").exists()

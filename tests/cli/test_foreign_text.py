@@ -114,7 +114,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plain["robot_type"] += HOSTILE
     plain["features"]["observation.state"]["names"][0] += HOSTILE
     file.write_text(json.dumps(plain))
-    file = folder / "dataset" / "demorec" / "configs.json"  # which reproduce refuses
+    file = folder / "dataset" / "demorec" / "configs.json"  # which generate refuses
     file.write_text(json.dumps(_everywhere(json.loads(file.read_text()))))
     shutil.copytree(folder / "dataset", folder / "damaged")
     file = folder / "damaged" / "meta" / "info.json"

@@ -10,6 +10,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ from demorec.core.replacing import (
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot import ExportOptions
 from demorec.generate import reproduce as reproducing
-from demorec.generate.options import RunObserver, RunOptions
+from demorec.generate.options import RunResult
 from demorec.learn.evaluate.rollouts import Settings, _open
 from demorec.mcap import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
@@ -639,45 +640,41 @@ def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
     assert target.read_bytes().endswith(b"1")
 
 
+def original(**changes: Any) -> reproducing.Original:
+    values: dict[str, Any] = {"source": Path(), "config": GenerateConfig(), "num_episodes": 1, "versions": ()}
+    return reproducing.Original(**values | {"digests": {(0, 0): "x"}} | changes)
+
+
 @pytest.mark.parametrize("out", ["runs/run", "runs/run/copy", "runs"])
-def test_reproduce_needs_a_place_beside_its_source(
+def test_a_copy_needs_a_place_beside_its_original(
     place: Path, out: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = SimpleNamespace(config=GenerateConfig(), num_episodes=1, versions={}, digests={(0, 0): "x"}, export=None)
-    monkeypatch.setattr(reproducing, "read_original", lambda source: original)
+    source = place / "runs" / "run"
+    monkeypatch.setattr(reproducing, "read_original", lambda path: original(source=source))
     before = files_of(place / "runs")
-    assert exit_code("reproduce", place / "runs" / "run", "--out", place / out) == 2
+    assert exit_code("generate", "--config", source, "--out", place / out) == 2
     assert "needs a place of its own" in capsys.readouterr().err
     assert files_of(place / "runs") == before
 
 
-def test_reproduce_says_whose_the_flags_are_that_it_does_not_have(
+def test_a_copy_does_not_go_on_with_another_run(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = GenerateConfig(seed=1, cameras=())
-    original = SimpleNamespace(config=config, num_episodes=1, versions={}, digests={(0, 0): "x"}, export=None)
-    monkeypatch.setattr(reproducing, "read_original", lambda source: original)
-    assert exit_code("reproduce", tmp_path / "original", "--out", run) == 2
-    said = capsys.readouterr().err
-    assert (
-        "holds another run (seed is 0 there and 1 here): choose another --out, or ask generate-dataset for the same"
-        in said
-    )
+    monkeypatch.setattr(reproducing, "read_original", lambda path: original(source=path, config=config))
+    (tmp_path / "original").mkdir()
+    assert exit_code("generate", "--config", tmp_path / "original", "--out", run) == 2
+    assert "holds another run (seed is 0 there and 1 here): choose another --out" in capsys.readouterr().err
 
 
-def test_reproduce_leaves_another_dataset_alone(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = SimpleNamespace(
-        config=GenerateConfig(), num_episodes=1, versions={}, digests={(0, 0): "x"}, export=ExportOptions(verify=False)
-    )
+def test_a_copy_leaves_another_dataset_alone(place: Path) -> None:
     copy = place / "copy"
     shutil.copytree(place / "dataset", copy / "dataset")
     before = files_of(copy)
-    result = SimpleNamespace(folder=copy, interrupted=False, run=SimpleNamespace(config_digest="another run's"))
-    monkeypatch.setattr(reproducing, "read_original", lambda source: original)
-    monkeypatch.setattr(reproducing, "generate", lambda *arguments, **options: result)
-    options = RunOptions(out=copy)
+    run: Any = SimpleNamespace(config_digest="another run's")
+    result = RunResult(folder=copy, run=run, made=(), interrupted=False)
     with pytest.raises(ConfigError, match="choose another --out"):
-        reproducing.reproduce(place / "dataset", options, progress=RunObserver())
+        reproducing.export_as_original(original(export=ExportOptions(verify=False)), result)
     assert files_of(copy) == before
 
 

@@ -18,7 +18,6 @@ from support.check import Spoilt, rewrite_messages, simulate, simulate_run
 from support.commands import exit_code
 from support.mcap import rewritten
 
-from demorec.cli import main
 from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
 from demorec.generate.options import RunResult
@@ -219,7 +218,7 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
             metadata = {**again.metadata[record], key: spoilt if isinstance(spoilt, str) else json.dumps(spoilt)}
             recorded = replace(again, metadata={**again.metadata, record: metadata})
             differences, images = content_differences(recorded, again, info, info.fps)
-            if name.startswith("info.versions"):  # told by themselves
+            if name.startswith(("info.versions", "info.cpu")):  # told by themselves
                 assert not differences
                 continue
             assert [(d.stream, d.field) for d in differences] == [(f"metadata {record}", name)]
@@ -228,23 +227,60 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
     assert count > (300 if record == EPISODE else 20)
 
 
-def test_other_versions_are_said_first(
-    blind: Path, tmp_path: Path, simulators: SimulatorCache, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"versions": {"pybullet": "3.2.5"}}, "version of pybullet is 3.2.5 there"),
+        ({"simulation": {"cpu": "riscv64"}}, "it was simulated on riscv64"),
+    ],
+)
+@pytest.mark.parametrize("also_differs", [False, True])
+def test_what_another_version_or_cpu_made_is_not_provable_here(
+    change: dict[str, Any],
+    line: str,
+    also_differs: bool,
+    blind: Path,
+    tmp_path: Path,
+    simulators: SimulatorCache,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """What differs beside it is named, and is a warning; without it the same difference is a failure."""
     with Recording(blind) as recording:
         info = to_plain(recording.info)
-    info["versions"]["pybullet"] = "3.2.5"
+    if also_differs:
+        info["instruction"] = "Do something else."
+        strict = tmp_path / "strict.mcap"
+        strict.write_bytes(rewritten(blind, change={EPISODE: {"info": json.dumps(info)}}))
+        assert deep_check(strict, simulators).level == "fail"
+    for name, value in change.items():
+        info[name] = {**info[name], **value} if isinstance(value, dict) else value
     spoilt = tmp_path / "spoilt.mcap"
     spoilt.write_bytes(rewritten(blind, change={EPISODE: {"info": json.dumps(info)}}))
     report = deep_check(spoilt, simulators)
     assert report.level == "warn"
-    assert any("pybullet is 3.2.5 there" in line for line in report.versions)
-    with pytest.raises(SystemExit) as ended:
-        main(["check", str(spoilt), "--deep", "--only", "opens"])
-    assert ended.value.code in (0, None)
+    assert [d.field for d in report.differences] == (["info.instruction"] if also_differs else [])
+    assert exit_code("check", spoilt, "--deep", "--only", "opens") == 0
     lines = capsys.readouterr().out.splitlines()
     assert "made again" in lines[1]
-    assert "pybullet is 3.2.5 there" in lines[2]
+    assert f"Not provable here: {line}" in lines[2]
+    assert any("info.instruction" in text for text in lines) == also_differs
+
+
+def test_a_config_that_this_version_cannot_read_is_not_provable_here(
+    blind: Path, tmp_path: Path, simulators: SimulatorCache
+) -> None:
+    with Recording(blind) as recording:
+        info = to_plain(recording.info)
+    info["simulation"]["config"]["gravity_of_tomorrow"] = 1
+    levels = []
+    for version in (info["versions"]["demorec"], "99.0.0"):
+        info["versions"]["demorec"] = version
+        spoilt = tmp_path / f"{version}.mcap"
+        spoilt.write_bytes(rewritten(blind, change={EPISODE: {"info": json.dumps(info)}}))
+        report = deep_check(spoilt, simulators)
+        assert "gravity_of_tomorrow" in report.error
+        levels.append(report.level)
+    assert levels == ["fail", "warn"]
 
 
 # ----------------------------------------------------------------------------------------------------- the images
@@ -346,9 +382,9 @@ def test_a_damaged_file_among_good_ones(blind: Path, tmp_path: Path, simulators:
 
 @pytest.mark.slow
 def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
-    """What generate-dataset does at the end: the second and the fourth of four episodes."""
+    """What generate-dataset does at the end: the first and the third of four episodes."""
     folder = simulate_run(tmp_path / "run", 4, seed=7, fps=FPS)
-    path = folder / "episodes" / "episode_000003.mcap"
+    path = folder / "episodes" / "episode_000002.mcap"
     run = load_run_file(folder)
     result = RunResult(folder=folder, run=run, made=(), interrupted=False)
     found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
@@ -362,7 +398,8 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     (failure,) = (failure for failure in failures if "made again" in failure)
     assert failure.startswith(path.name)
     assert "info.instruction" in failure
-    assert "made again" not in check_run(result, deep_every=5, progress=lambda done, total: None)[0]
+    assert "1 episode made again" in check_run(result, deep_every=5, progress=lambda done, total: None)[0]
+    assert "made again" not in check_run(result, deep_every=0, progress=lambda done, total: None)[0]
 
 
 def test_a_recording_that_a_crash_cut_off_is_compared_as_far_as_it_goes(

@@ -152,29 +152,32 @@ def test_a_model_that_changed_is_another_version(folder: Path) -> None:
     assert deciding_versions(GenerateConfig()) == deciding_versions()
 
 
-def test_the_source_counts_with_what_it_imports_from_beside_it(folder: Path) -> None:
-    (folder / "my_tasks.py").write_text("import os\nfrom helpers import sizes\nimport my_robots\n")
-    (folder / "helpers").mkdir()
-    (folder / "helpers" / "__init__.py").write_text("")
-    (folder / "helpers" / "sizes.py").write_text("from . import units\n")
-    (folder / "helpers" / "units.py").write_text("MM = 1e-3\n")
-    (folder / "helpers" / "unused.py").write_text("A = 1\n")
-    digests = []
+def test_a_module_counts_with_its_file_and_a_package_with_all_of_its_files(folder: Path) -> None:
+    (folder / "my_tasks.py").write_text("A = 1\n")
+    (folder / "arms" / "deep" / "__pycache__").mkdir(parents=True)
+    files = ("arms/__init__.py", "arms/one.py", "arms/deep/two.py", "arms/deep/mug.obj")
+    left_out = ("arms/.notes", "arms/deep/__pycache__/two.pyc")
+    for name in (*files, *left_out):
+        (folder / name).write_text("")
 
-    def look() -> str:
+    def digests() -> tuple[str, str]:
         forget("my_tasks")
-        digests.append(own_versions(["my_tasks"])["source of my_tasks"])
-        return digests[-1]
+        versions = own_versions(["my_tasks", "arms.one"])
+        return versions["source of my_tasks"], versions["source of arms.one"]
 
-    first = look()
-    assert look() == first
-    (folder / "helpers" / "unused.py").write_text("A = 2\n")
-    assert look() == first
-    for name in ("my_tasks.py", "helpers/__init__.py", "helpers/sizes.py", "helpers/units.py", "my_robots.py"):
+    before = first = digests()
+    for name in ("my_robots.py", *left_out):  # beside the module, and what is no source
         (folder / name).write_text((folder / name).read_text() + "# edited\n")
-        look()
-    assert len(set(digests)) == 1 + 5
-    assert "my_robots" not in sys.modules  # read, not run
+        assert digests() == first
+    (folder / "my_tasks.py").write_text("A = 2\n")
+    assert digests()[0] != first[0]
+    for name in files:
+        (folder / name).write_text("# edited\n")
+        assert digests()[1] != before[1], name
+        before = digests()
+    (folder / "arms/deep/mug.obj").rename(folder / "arms/deep/cup.obj")
+    assert digests()[1] != before[1]
+    assert "arms.one" not in sys.modules  # read, not run
 
 
 @pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from support.check import checked, simulate
 
-from demorec.core.own_versions import source_digest
 from demorec.core.tables import ROBOTS
 from demorec.mcap import Recording
 from demorec.replay import ReplayOptions, open_file, replay_all
@@ -35,39 +34,3 @@ def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch
         ((report, _),) = replay_all([open_file(path, options)], options)
         assert report.is_identical
         assert checked(path).level == "pass"
-
-
-MODEL_TASK = """
-from pathlib import Path
-HERE = Path(__file__).parent
-MUG = HERE / "models" / "mug.obj"
-ARM = "models/arm.urdf"
-NAME = "mug.obj"
-"""
-
-
-def test_files_that_a_module_names_are_part_of_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By name, also through what they name themselves; neighbours are not."""
-    models = tmp_path / "models"
-    models.mkdir()
-    (tmp_path / "my_models.py").write_text(MODEL_TASK)
-    (tmp_path / "mug.obj").write_text("mtllib mug.mtl\nv 0 0 0\n")
-    (tmp_path / "mug.mtl").write_text("newmtl a\nmap_Kd mug.png\n")
-    (models / "arm.urdf").write_text('<robot><mesh filename="link.stl"/></robot>')
-    for named in ("mug.png", "models/link.stl", "notes.txt", "models/other.stl"):
-        (tmp_path / named).write_text("1")
-    monkeypatch.syspath_prepend(str(tmp_path))
-
-    def digest() -> str:
-        source_digest.cache_clear()
-        return source_digest("my_models")
-
-    before = digest()
-    for name in ("notes.txt", "models/other.stl"):
-        (tmp_path / name).write_text("2")
-        assert digest() == before
-    for name in ("my_models.py", "mug.obj", "mug.mtl", "mug.png", "models/arm.urdf", "models/link.stl"):
-        path = tmp_path / name
-        path.write_text(path.read_text() + "\n")
-        assert digest() != before, name
-        before = digest()

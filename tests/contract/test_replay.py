@@ -197,7 +197,10 @@ def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path
     export_lerobot([quiet_run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
     from demorec.cli.replay import demonstrations
 
-    found = [report for report, _ in replay_all(demonstrations([tmp_path / "ds"], ReplayOptions()), ReplayOptions())]
+    found = [
+        report
+        for report, _ in replay_all(demonstrations([tmp_path / "ds"], ReplayOptions(), episodes=""), ReplayOptions())
+    ]
     assert [report.success for report in found] == [True, True]
     assert all(report.unreachable == 0 for report in found)
     # Inverse kinematics may bend the elbow another way; the joints themselves come back to rounding and drift.

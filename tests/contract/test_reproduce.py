@@ -1,4 +1,4 @@
-"""`reproduce` compares with what the recordings hold, not with what run.json says of them."""
+"""`generate-dataset --config RUN/run.json` compares with the content of the recordings, whatever run.json says."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from support.check import edit_json, simulate_run
 from support.commands import exit_code
 from support.mcap import rewritten
 
-from demorec.cli import main
 from demorec.core.plain import to_plain
 from demorec.generate.reproduce import read_original
 from demorec.mcap import Recording
@@ -49,15 +48,47 @@ def test_what_is_no_longer_what_was_made(run: Path, tmp_path: Path, capsys: pyte
         info = to_plain(recording.info)
     info["versions"]["pybullet"] = "3.2.5"
     names[4].write_bytes(rewritten(names[4], change={EPISODE: {"info": json.dumps(info)}}))
-    with pytest.raises(SystemExit) as ended:
-        main(["reproduce", str(spoilt), "--out", str(tmp_path / "copy"), "--workers", "1"])
+    code = exit_code("generate", "--config", spoilt, "--out", tmp_path / "copy", "--workers", 1, "--no-check")
     told = capsys.readouterr()
-    assert ended.value.code == 1
-    assert told.out.startswith("2 of 5 episodes are bit-exact")
+    assert code == 1
+    last = told.out.splitlines()[-1]
+    assert (
+        last == f"Not the same as {spoilt}: 3 of 5 episodes differ: {', '.join(f'{n} (attempt 0)' for n in (1, 2, 3))}."
+    )
     assert "Note: version of pybullet is 3.2.5 there" in told.err.splitlines()[0]
-    assert "Different: 1 (attempt 0), 2 (attempt 0), 3 (attempt 0)" in told.err
     for name in names[1:4]:
         assert str(name) in told.err
+
+
+def test_a_single_recording_is_made_again(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = run / "episodes" / "episode_000001.mcap"
+    words = ("--out", tmp_path / "copy", "--workers", 1, "--no-check", "--no-export")
+    assert exit_code("generate", "--config", source, *words) == 0
+    assert capsys.readouterr().out.endswith(f"The same as {source}: 1 episode, bit for bit.\n")
+    assert len(list((tmp_path / "copy" / "episodes").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--seed", 4), "--seed"),
+        (("--num-episodes", 2), "--num-episodes"),
+        (("--codec", "av1", "--speed", 1, 2, "--no-antialias"), "--antialias, --codec, --speed"),
+        (("--cameras", "none"), "--cameras"),
+    ],
+)
+def test_another_episode_flag_beside_a_run_is_refused(
+    flags: tuple[object, ...], named: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code("generate", "--config", run / "run.json", "--out", tmp_path / "copy", *flags) == 2
+    said = capsys.readouterr().err
+    assert f"again as they are: leave out {named}." in said
+    assert not (tmp_path / "copy").exists()
+
+
+def test_allow_is_for_what_a_file_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("generate", "--out", tmp_path / "run", "--allow", "my_tasks") == 2
+    assert "--allow is for a --config that names a run" in capsys.readouterr().err
 
 
 def test_another_digest_in_run_json(run: Path, tmp_path: Path) -> None:
@@ -74,8 +105,8 @@ def test_renderings_of_a_run_are_no_copy_of_it(run: Path, tmp_path: Path, capsys
     assert exit_code("render", run, "--out", out, "--cameras", "front", "--width", 16, "--height", 16) == 0
     there = {path.name: path.read_bytes() for path in out.rglob("*.mcap")}
     assert len(there) == 5
-    for command in (("reproduce", run), ("generate", "--num-episodes", 5, "--seed", 3, "--fps", 10)):
-        assert exit_code(*command, "--out", out) == 2
+    for words in (("--config", run), ("--num-episodes", 5, "--seed", 3, "--fps", 10)):
+        assert exit_code("generate", *words, "--out", out) == 2
         assert (
             "Nothing in the output folder was generated, choose another --out: The recording is a render of"
             in capsys.readouterr().err

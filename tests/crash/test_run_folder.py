@@ -181,15 +181,15 @@ def test_nothing_is_set_aside_for_what_the_machine_lacks(
     assert {path: data for path, data in content_of(out).items() if path != ".lock"} == before
 
 
-@pytest.mark.parametrize("command", ["info", "check", "reproduce"])
+@pytest.mark.parametrize("command", ["info", "check", "generate"])
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.write_text("[" * 100_000)])
 def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, make: Callable[[Path], object]
 ) -> None:
     make(tmp_path / "run.json")
-    out = ["--out", str(tmp_path / "copy")] if command == "reproduce" else []
+    words = [str(tmp_path)] if command != "generate" else ["--config", str(tmp_path), "--out", str(tmp_path / "copy")]
     with pytest.raises(SystemExit) as ended:
-        main([command, str(tmp_path), *out])
+        main([command, *words])
     assert ended.value.code in (1, 2)
     told = capsys.readouterr()
     assert "Traceback" not in told.err

@@ -18,13 +18,13 @@ ON_A_PATH = {
     "export": "export lerobot PATH --out NEW --no-verify",
     "replay": "replay PATH",
     "render": "render PATH --out NEW --workers 1",
-    "reproduce": "reproduce PATH --out NEW --workers 1",
+    "generate": "generate --config PATH --out NEW --workers 1 --no-check --no-export",
     "recover": "recover PATH --out NEW.mcap",
 }
 """How every command that takes recordings, runs or datasets is called with a PATH; what it makes begins with NEW."""
 ON_EVERYTHING = ("info", "check", "view", "report", "export")
 """Those that read bags and other formats, too."""
-OTHERS = {"generate", "import", "dataset", "pretrain", "train", "evaluate", "correct", "improve", "list"}
+OTHERS = {"import", "dataset", "pretrain", "train", "evaluate", "correct", "improve", "list"}
 """Commands that take other things."""
 
 

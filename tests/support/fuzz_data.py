@@ -125,7 +125,7 @@ class FuzzedData:
             ["check", root, "--only", *_CHECKS], ["report", root, "--out", self.folder / "out.html"],
             ["export", "lerobot", self._good, "--out", root, "--append", "--no-verify"], ["replay", root],
             ["view", root, "--save", self.folder / "out.rrd"],
-            ["reproduce", root, "--out", self.folder / "out", "--workers", "0"],
+            ["generate", "--config", root, "--out", self.folder / "out", "--workers", "0"],
         )  # fmt: skip
         return what, list(map(str, chance.choice(commands)))
 

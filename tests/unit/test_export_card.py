@@ -68,7 +68,7 @@ def test_the_commands_of_a_card_make_the_dataset(tmp_path: Path) -> None:
     parsed = parse(Export, exporting[2:], prog="")
     assert parsed.options == ExportOptions(**options)
     assert parsed.sources == (made.options.out,)
-    assert "demorec reproduce path/of/this/folder --out copy" in (tmp_path / "d" / "README.md").read_text()
+    assert "generate-dataset --config path/of/this/folder --out copy" in (tmp_path / "d" / "README.md").read_text()
 
 
 @pytest.mark.parametrize("language", [None, (), ("subtask", "plan")])

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError, ExportError
+from demorec.core.errors import ConfigError, ExportError, write_error
 from demorec.core.replacing import check_replaceable, written_whole
 from demorec.core.tables import environment_name
 from demorec.datasets.episode import DONE, ExportEpisode
@@ -64,7 +64,7 @@ def export_hdf5(
                 report = _write(file, found, out, options, progress)
             check()  # something may have been put there meanwhile
     except OSError as error:
-        raise ExportError(f"The file cannot be written ({error.strerror or error}): {out}") from error
+        raise write_error("The file", error, out, ExportError) from error
     return report
 
 

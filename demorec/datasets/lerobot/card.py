@@ -212,7 +212,7 @@ def _origin_section(root: Path, configs: Mapping[str, Any], options: ExportOptio
     if commands:
         yield from ("Made by these commands:", "", "```sh", *map(printable, commands), "```", "")
         yield "This makes it again, from what this folder says about itself, and compares every episode to the bit:"
-        yield from ("", "```sh", "demorec reproduce path/of/this/folder --out copy", "```", "")
+        yield from ("", "```sh", "generate-dataset --config path/of/this/folder --out copy", "```", "")
 
 
 # ------------------------------------------------------------------------------------------------------ success rates

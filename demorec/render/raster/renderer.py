@@ -64,7 +64,7 @@ class RasterRenderer(Closing):
         check_setup(setup)
         self._setup = setup
         instances = make_instances(setup.bodies, self._store)
-        largest = max((setup.detail.get(camera.name, camera.height) for camera in setup.cameras), default=0)
+        largest = max((camera.height for camera in setup.cameras), default=0)
         self._stage = Stage(
             instances,
             setup.light,
@@ -74,17 +74,17 @@ class RasterRenderer(Closing):
         batches: dict[tuple[int | None, ...], Batch] = {}
         self._views = []
         for camera in setup.cameras:
-            levels = tuple(None if self._exact else self._level(instance, camera, setup) for instance in instances)
+            levels = tuple(None if self._exact else self._level(instance, camera) for instance in instances)
             if levels not in batches:
                 batches[levels] = make_batch(instances, levels, specular=setup.light.specular)
             canvas = Canvas(camera, batches[levels], self._stage, setup)
             self._views.append(CameraView(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
 
-    def _level(self, instance: Instance, camera: SceneCamera, setup: RenderSetup) -> int | None:
-        """How many faces an instance keeps for a camera."""
+    def _level(self, instance: Instance, camera: SceneCamera) -> int | None:
+        """Return how many faces an instance keeps for a camera."""
         distance = WORKING_DISTANCE["world" if camera.mount == "world" else "link"]
         pixels = 2 * instance.radius * float(camera.intrinsics[1, 1]) / distance
-        return power_of_two(FACES_PER_PIXEL * pixels * setup.detail.get(camera.name, camera.height) / camera.height)
+        return power_of_two(FACES_PER_PIXEL * pixels)
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
         """Camera name -> images, with poses (n, 7) as of `Renderer.render`; RuntimeError without a scene."""

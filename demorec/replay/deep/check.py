@@ -12,8 +12,8 @@ from typing import Literal
 
 from demorec.check.dataset import Dataset, DescribedEpisode
 from demorec.check.run_dataset import episode_differences, export_options, with_videos
-from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, resource_error
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
+from demorec.core.errors import ConfigError, DemorecError, NotAllowedError, RecordingError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.plain import digest
 from demorec.core.processes import in_turn
@@ -38,7 +38,8 @@ class DeepReport:
 
     Attributes:
         path: The recording.
-        versions: One line for each version in which what made it differs from what is here.
+        versions: One line for each version, and the type of CPU, in which what made it differs from what is here. With
+            any of them nothing is provable here, so that differences are warnings.
         differences: Everything that differs, ordered by the first frame.
         error: Why it could not be made again; "" where it could.
         replay: How its own commands fare in its own scene, in words; "" unless numbers differ.
@@ -56,8 +57,9 @@ class DeepReport:
 
     @property
     def level(self) -> Literal["pass", "warn", "fail"]:
-        """Other versions, and other codings of the same images, are warnings."""
-        if self.error or any(not difference.is_coding for difference in self.differences):
+        """Failed where something differs that versions and CPU do not explain; other encodings are warnings."""
+        differs = any(not difference.is_coding for difference in self.differences)
+        if (self.error or differs) and not self.versions:
             return "fail"
         return "warn" if self.versions or self.differences else "pass"
 
@@ -84,8 +86,8 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
             open_recording(path, simulated=True) as recording,
         ):
             info = recording.info
-            versions = version_differences(info.versions, _versions_here(info, allowed))
-            report = replace(report, versions=versions, num_frames=recording.num_frames, is_derived=bool(info.origin))
+            report = replace(report, num_frames=recording.num_frames, is_derived=bool(info.origin))
+            report = replace(report, versions=_unlike_here(info, allowed))
             again = Path(folder) / "again.mcap"
             remake(recording, again, simulators, allowed)
             differences = tuple(_differences(recording, again, simulators, allowed))
@@ -103,7 +105,17 @@ def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
         raise error
     if lack is not None:
         raise lack from error
+    if isinstance(error, NotAllowedError | RecordingError):  # neither versions nor the CPU explain it
+        report = replace(report, versions=())
     return replace(report, error=str(error))
+
+
+def _unlike_here(info: EpisodeInfo, allowed: Sequence[str]) -> tuple[str, ...]:
+    """Describe in which versions, and in which type of CPU, what made an episode differs from what is here."""
+    lines = list(version_differences(info.versions, _versions_here(info, allowed)))
+    if info.cpu != cpu_type():
+        lines.append(f"it was simulated on {info.cpu or 'an unknown CPU'}, this is {cpu_type()}")
+    return tuple(lines)
 
 
 def _versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
@@ -161,7 +173,7 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     info = recording.info.with_simulation(config_digest=digest(recording.info.config))
     RENDERERS.check_name(str(info.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
-    painter = _recorded_painter(info, renderer, allowed)
+    painter = _recorded_painter(info, renderer)
     with EpisodeWriter(path, info, video=config_as(info.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
@@ -176,11 +188,11 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
         writer.finish(outcome)
 
 
-def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None, allowed: Collection[str]) -> Painter | None:
+def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter | None:
     """Draws what the recording shows, from where its cameras really were; None without cameras."""
     if renderer is None:
         return None
-    return view_painter(renderer, recorded_view(info, allowed), info.config)
+    return view_painter(renderer, recorded_view(info), info.config)
 
 
 def _differences(
@@ -193,10 +205,11 @@ def _differences(
             made.cut_off(found)
         differences, images = content_differences(found, made, remade.info, recording.info.fps)
         if images:
-            painter = _recorded_painter(remade.info, simulators.acquire(remade.info)[1], allowed)
+            world, renderer = simulators.acquire(remade.info)
+            painter = _recorded_painter(remade.info, renderer)
             assert painter is not None, "images were drawn"
             cameras = coded_topics(remade.info)
-            differences += image_differences(found, made, remade, painter, cameras, images)
+            differences += image_differences(found, made, remade, world, painter, cameras, images)
     yield from sorted(differences, key=lambda difference: difference.first_frame)
 
 
@@ -243,7 +256,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
                 info = episode.info
                 report = DeepReport(
                     path=path / f"episode {episode.number}",
-                    versions=version_differences(info.versions, _versions_here(info, allowed)),
+                    versions=_unlike_here(info, allowed),
                     num_frames=len(episode.rows["index"]),
                 )
                 try:

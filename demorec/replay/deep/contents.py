@@ -26,8 +26,8 @@ CODED = ("h264", "video", "image/compressed", "depth", "segmentation")
 """Streams of a camera whose messages hold a coded image in the field `data`."""
 _SEAL = "crc32"
 """Follows from the other values of a metadata record."""
-_VERSIONS = "info.versions"
-"""Reported by themselves, before all else."""
+_MADE_BY = ("info.versions", "info.simulation.cpu")
+"""Fields that are reported by themselves, before all others."""
 
 _SHOWN = reprlib.Repr(maxstring=80, maxother=80)
 
@@ -169,7 +169,7 @@ def _all_differing(
             yield f"attachment {name}", "data", None, a, b
     for name in dict.fromkeys((*again.metadata, *recorded.metadata)):
         for path, a, b in _metadata_differences(recorded.metadata.get(name), again.metadata.get(name)):
-            if not (name == EPISODE and path.startswith(_VERSIONS)):
+            if not (name == EPISODE and path.startswith(_MADE_BY)):
                 yield f"metadata {name}", path, None, a, b
     coded = coded_topics(info)
     for topic in dict.fromkeys((*again.channels, *recorded.channels)):

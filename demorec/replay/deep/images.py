@@ -23,8 +23,9 @@ from demorec.mcap.lossless import decode_depth, decode_labels
 from demorec.mcap.messages import message_fields
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 from demorec.render.painter import Painter
-from demorec.render.recorded import RecordedWorld
 from demorec.replay.deep.contents import Contents, Difference
+from demorec.sim.recorded_states import RecordedStates
+from demorec.sim.world import World
 
 _BLOCK = 8
 """Pixels a side: those of a transform in H.264."""
@@ -37,6 +38,7 @@ def image_differences(
     recorded: Contents,
     again: Contents,
     remade: Recording,
+    world: World,
     painter: Painter,
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
@@ -46,6 +48,7 @@ def image_differences(
     Args:
         recorded, again: The two files.
         remade: The one made again, open.
+        world: World of its robot; is reset.
         painter: Draws what it shows.
         cameras: Topic -> camera, of streams of coded images.
         differing: Topic -> frames whose coded images differ.
@@ -56,7 +59,7 @@ def image_differences(
         if topic.rpartition("/")[2] in ("depth", "segmentation"):
             found = dict(_lossless(topic, *images, (settings.height, settings.width)))
         else:
-            found = dict(_colours(settings, *images, _drawn(remade, painter, cameras[topic])))
+            found = dict(_colours(settings, *images, _drawn(remade, world, painter, cameras[topic])))
         if found:
             yield Difference(
                 stream=topic,
@@ -89,14 +92,11 @@ def _coded(contents: Contents, topic: str) -> list[bytes]:
     return images
 
 
-def _drawn(remade: Recording, painter: Painter, camera: str) -> Iterator[Rgb]:
-    columns, info = remade.columns(), remade.info
-    world = RecordedWorld(
-        info.robot, info.scene, joint_position=columns.joint_position, object_poses=columns.object_poses
-    )
-    painter.setup(world)
-    for frame in range(columns.num_frames):
-        world.frame = frame
+def _drawn(remade: Recording, world: World, painter: Painter, camera: str) -> Iterator[Rgb]:
+    states = RecordedStates(world, remade.info.scene, remade.columns())
+    painter.setup(states)
+    for frame in range(remade.num_frames):
+        states.frame = frame
         yield painter.images()[camera].color
 
 
