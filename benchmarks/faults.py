@@ -28,7 +28,6 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 from support.faults import Changed
 
-from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Form, Result
 from demorec.check.episode import CheckedEpisode
 from demorec.check.evidence import Motions, motion_of_features
@@ -37,6 +36,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.tables import CHECKS
 from demorec.episode.episode import frame_time_ns
 from demorec.episode.info import Feature
+from demorec.episode.words import COLOR_WORDS
 
 Rows = NDArray[Any]
 Fault = Callable[[Changed], Changed]

@@ -10,19 +10,9 @@ from typing import Any
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.scene import Body, Goal, Scene
+from demorec.episode.scene import Goal, Scene
+from demorec.episode.words import nouns_of
 
-COLOR_WORDS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey")
-"""Words for colours in instructions and names."""
-_NOUNS = {"jenga": "wooden plank", "lego": "toy brick"}
-"""Words for things whose names say less."""
-_SYNONYMS = {
-    "target": ("target", "mark", "square"),
-    "mark": ("mark", "target", "square"),
-    "tray": ("tray",),
-}
-CONTAINERS = ("tray", "bowl")
-"""What things go into and are in, not onto and on."""
 _AT_THE_PLACE = 0.01
 """How far, metres, the middle of a mark may be from a goal that is meant to be on it."""
 
@@ -109,19 +99,6 @@ def situations(scene: Scene, world_from_object: Mapping[str, Array], moments: in
 def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
     """The same of one moment: (7,) poses."""
     return situations(scene, {name: pose[np.newaxis] for name, pose in (world_from_object or {}).items()}, 1)[0]
-
-
-def nouns_of(body: Body) -> tuple[str, ...]:
-    """What a body may be called: by its name, less colour and number, and by its shape."""
-    words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLOR_WORDS, "other")]
-    noun = " ".join(_NOUNS.get(word, word) for word in words) or "object"
-    nouns = _SYNONYMS.get(noun, (noun,))
-    x, y, z = body.shape.extents
-    if body.movable and body.shape.kind == "box":
-        nouns += ("cube",) if max(x, y, z) < 1.05 * min(x, y, z) else ("block",)
-    elif body.movable and body.shape.kind in ("cylinder", "sphere", "capsule"):
-        nouns += (body.shape.kind,)
-    return tuple(dict.fromkeys(nouns))
 
 
 def place_of(scene: Scene, goal: Goal) -> str:

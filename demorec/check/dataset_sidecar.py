@@ -288,7 +288,7 @@ def dataset_progress(dataset: Dataset) -> Measurement | None:
         return None
     episodes = read_progress(dataset.path)
     lengths = [
-        (episode.dense[-1].last + 1, place.length) for episode, place in zip(episodes, dataset.places, strict=True)
+        (episode.runs[-1].last + 1, place.length) for episode, place in zip(episodes, dataset.places, strict=True)
     ]
     if wrong := [number for number, (found, length) in enumerate(lengths) if found != length]:
         return Measurement(value=len(wrong), detail=f"the stages of episode {wrong[0]} do not cover it")

@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from demorec.annotate.situation import COLOR_WORDS
 from demorec.check.base import Found, Measurement, NotMeasured, outcome_check
 from demorec.check.episode import CheckedEpisode
 from demorec.core.geometry import Pose
@@ -17,6 +16,7 @@ from demorec.core.tables import TASKS
 from demorec.episode.conditions import DISTURBED, LIMITS, OPEN, PLACED
 from demorec.episode.episode import gave_up
 from demorec.episode.scene import Body, Scene
+from demorec.episode.words import COLOR_WORDS
 
 _PLACES = ("target", "mark", "marks", "tray")
 """What the tasks call bodies of the role "target"."""

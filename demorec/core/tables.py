@@ -161,7 +161,6 @@ CHECKS: Registry[Check] = Registry(
         ("alignment", "dataset_action_lag"),
         ("dataset_sidecar", "dataset_sidecar", "dataset_robots", "dataset_facts", "dataset_progress"),
         ("dataset_sidecar", "dataset_details"),
-        ("dataset_language", "dataset_instructions", "dataset_language", "dataset_language_truth"),
         ("dataset_files", "dataset_opens"),
     ),
 )

@@ -233,7 +233,6 @@ def left_out(plan: Plan) -> tuple[str, ...]:
 
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
     cameras = {take.feature for take in plan.takes[number].values()}
-    proportions = [PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")]
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()
@@ -253,7 +252,9 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
             yield name, "its camera is left out"
         elif name == PROGRESS_PATH and not keeps_progress:
             yield name, "not all datasets have progress with the same columns"
-        elif name in proportions and not (keeps_progress and _has_stages(plan)):
+        elif name.startswith("meta/temporal_proportions_") and not (
+            name == PROPORTIONS_PATH and keeps_progress and _has_stages(plan)
+        ):
             yield name, "they are those of the source's episodes together"
 
 
