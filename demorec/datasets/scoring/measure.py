@@ -123,9 +123,8 @@ def _shares(values: Array, ranges: Array) -> Array:
 
 
 def _readings(motion: Motion, ranges: Motion, is_gripper: NDArray[np.bool_], fps: float) -> dict[str, Reading]:
-    is_arm = np.full_like(is_gripper, True) if is_gripper.all() else ~is_gripper
-    state = _shares(motion.state[:, is_arm], ranges.state[:, is_arm])
-    action = _shares(motion.action[:, is_arm], ranges.action[:, is_arm])
+    state = _shares(motion.state[:, ~is_gripper], ranges.state[:, ~is_gripper])
+    action = _shares(motion.action[:, ~is_gripper], ranges.action[:, ~is_gripper])
     openings = _shares(motion.state[:, is_gripper], ranges.state[:, is_gripper])
     commands = _shares(motion.action[:, is_gripper], ranges.action[:, is_gripper])
     switches = sorted({frame for command in commands.T for frame in _switches(command)})

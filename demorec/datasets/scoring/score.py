@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -90,14 +91,13 @@ def score_dataset(root: Path) -> list[EpisodeScore]:
     ]
 
 
-def _groups(tasks: Sequence[str]) -> list[list[int]]:
+def _groups(tasks: Sequence[str]) -> Iterable[list[int]]:
     """Return the numbers of the episodes that are compared with each other."""
+    counts = Counter(tasks)
     found: dict[str, list[int]] = {}
     for number, task in enumerate(tasks):
-        found.setdefault(task, []).append(number)
-    large = [numbers for numbers in found.values() if len(numbers) >= MIN_EPISODES]
-    small = [number for numbers in found.values() if len(numbers) < MIN_EPISODES for number in numbers]
-    return [*large, small]
+        found.setdefault(task if counts[task] >= MIN_EPISODES else "", []).append(number)
+    return found.values()
 
 
 def _judged(name: str, readings: Mapping[int, Reading]) -> Iterator[tuple[int, Reason]]:
