@@ -58,11 +58,13 @@ def seen_objects(
     bodies = {
         body.name: body for body in recording.info.scene.bodies if body.role in ("object", "target", "distractor")
     }
-    label_of = {name: label for label, name in recording.segment_labels().items() if name in bodies}
-    for _, frame, labels in recording.segmentation_at([camera.name], row_of):
+    value_of = {name: value for value, name in recording.segment_names().items() if name in bodies}
+    for frame, image in enumerate(recording.segmentation(camera.name)):
+        if frame not in row_of:
+            continue
         world_from_camera = columns.world_from_camera[camera.name][frame]
-        for name, label in label_of.items():
-            shown = labels == label
+        for name, value in value_of.items():
+            shown = image == value
             area = int(np.count_nonzero(shown))
             if not area:
                 continue

@@ -46,7 +46,7 @@ class StageRun:
     last: int
 
 
-def stage_names(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
+def dense_stages(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
     """All stages of an episode with so many goals, in order; a script that lets things fall has fewer."""
     done = {run.stage.partition(": ")[2] for run in runs}
     is_dropped = "release" in done and "lower" not in done
@@ -55,7 +55,7 @@ def stage_names(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
     return tuple(f"goal {goal}: {stage}" for goal in range(1, num_goals + 1) for stage in stages)
 
 
-def stage_runs(timeline: EpisodeTimeline, rows: NDArray[np.intp]) -> list[StageRun]:
+def dense_runs(timeline: EpisodeTimeline, rows: NDArray[np.intp]) -> list[StageRun]:
     """The stages of an episode's rows, in order of time; one alone where the phases are not those of our skills.
 
     Args:

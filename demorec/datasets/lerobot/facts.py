@@ -28,9 +28,9 @@ import pyarrow.parquet as pq
 from demorec.annotate.progress import (
     WHOLE_TASK,
     StageRun,
+    dense_stages,
     progress,
     proportions,
-    stage_names,
 )
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import sync_path
@@ -69,7 +69,7 @@ class EpisodeProgress:
         """All stages of an episode with this number of goals."""
         if self.runs[0].stage == WHOLE_TASK:
             return (WHOLE_TASK,)
-        return stage_names(self.num_goals, self.runs)
+        return dense_stages(self.num_goals, self.runs)
 
     def row(self) -> dict[str, Any]:
         """Return its entries in the table of episodes."""

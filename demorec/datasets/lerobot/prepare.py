@@ -12,7 +12,7 @@ import numpy as np
 from demorec.annotate import Statement
 from demorec.annotate.attempts import episode_timeline
 from demorec.annotate.boxes import seen_objects
-from demorec.annotate.progress import stage_runs
+from demorec.annotate.progress import dense_runs
 from demorec.annotate.statements import episode_statements
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
@@ -117,7 +117,7 @@ def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
         return {}
     facts = episode_facts(episode.recording, episode.columns)
     if options.progress:
-        runs = stage_runs(episode_timeline(episode.recording, episode.columns), episode.rows)
+        runs = dense_runs(episode_timeline(episode.recording, episode.columns), episode.rows)
         num_goals = len(episode.info.scene.goals)
         facts |= EpisodeProgress(num_goals=num_goals, runs=tuple(runs)).row()
     return facts

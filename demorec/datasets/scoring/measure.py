@@ -46,8 +46,8 @@ class Reading(NamedTuple):
 class Motion(NamedTuple):
     """State and action (T, D) of the same elements; without an action the state stands for it."""
 
-    state: Array
-    action: Array
+    state: NDArray[Any]
+    action: NDArray[Any]
 
 
 class MeasuredEpisode(NamedTuple):
@@ -106,7 +106,7 @@ def _names(feature: DatasetFeature) -> list[str]:
     return [_SUFFIX.sub("", name) for name in names]
 
 
-def _range(values: Sequence[Array]) -> Array:
+def _range(values: Sequence[NDArray[Any]]) -> Array:
     """Return the least and the largest value (2, D) of all episodes without the outermost tenth of them."""
     if not values:
         return np.zeros((2, 0))
@@ -115,7 +115,7 @@ def _range(values: Sequence[Array]) -> Array:
     return np.stack([low, high])
 
 
-def _shares(values: Array, ranges: Array) -> Array:
+def _shares(values: NDArray[Any], ranges: Array) -> Array:
     """Return values (T, K) in units of their ranges (2, K); an element that hardly moves counts less than others."""
     width = ranges[1] - ranges[0]
     floor = max(0.2 * float(np.median(width)), 1e-9) if len(width) else 1.0
