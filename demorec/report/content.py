@@ -81,39 +81,18 @@ MAX_SAMPLES = 200
 """Frames of each episode that a distribution is drawn from, beside its extremes."""
 
 
-class Distribution:
-    """Sampled values of one component of state or action.
-
-    Attributes:
-        not_finite: Number of values that are not finite.
-    """
-
-    def __init__(self) -> None:
-        self._parts: list[NDArray[np.float32]] = []
-        self.not_finite = 0
-
-    def add(self, values: NDArray[Any]) -> None:
-        """Add the values (T,) of one episode: evenly spaced ones, and the extremes."""
-        finite = values[np.isfinite(values)]
-        self.not_finite += len(values) - len(finite)
-        if len(finite):
-            sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
-            self._parts.append(np.array([*sampled, finite.min(), finite.max()], dtype=np.float32))
-
-    @property
-    def values(self) -> NDArray[np.float32]:
-        """(N,) all sampled values."""
-        return np.concatenate([np.zeros(0, np.float32), *self._parts])
-
-
-Components = dict[tuple[str, str], Distribution]
-"""(feature, name of the component) -> its values."""
+Components = dict[tuple[str, str], list[NDArray[np.float32]]]
+"""(feature, name of the component) -> its sampled values, episode by episode."""
 
 
 def add_values(into: Components, feature: str, names: Iterable[str], values: NDArray[Any]) -> None:
-    """Add the values of a feature (T, D) by component, as far as there are names."""
+    """Add the values of a feature (T, D) in one episode: finite ones, evenly spaced, and the extremes."""
     for name, column in zip(names, values.T, strict=False):
-        into.setdefault((feature, name), Distribution()).add(column)
+        finite = column[np.isfinite(column)]
+        if len(finite):
+            sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
+            parts = into.setdefault((feature, name), [])
+            parts.append(np.array([*sampled, finite.min(), finite.max()], dtype=np.float32))
 
 
 class CheckSummaries:

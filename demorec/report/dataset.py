@@ -238,10 +238,8 @@ def _missing(info: DatasetInfo, *, has_sidecar: bool) -> Iterator[str]:
         yield "It has no color images, so there are no filmstrips."
     for feature in (STATE, ACTION):
         item = info.features.get(feature)
-        if item is None:
-            yield f"It has no column {feature}, so nothing is drawn of it."
-        elif item.dtype not in _NUMBERS or len(item.shape) != 1:
-            yield f"The column {feature} is not a vector of numbers (dtype {item.dtype}), so nothing is drawn of it."
+        if item is None or item.dtype not in _NUMBERS or len(item.shape) != 1:
+            yield f"It has no column {feature} of numbers, so nothing is drawn of it."
         elif item.shape[0] > _MAX_COMPONENTS:
             yield f"Of the {item.shape[0]} components of {feature} the first {_MAX_COMPONENTS} are drawn."
 

@@ -171,9 +171,8 @@ def _words(episode: ReportedEpisode) -> str:
 
 def _distributions(report: Report) -> Iterator[Chart]:
     by_name: dict[str, list[tuple[str, NDArray[np.float32]]]] = {}
-    for (feature, name), found in report.distributions.items():
-        if len(found.values):
-            by_name.setdefault(name, []).append(({STATE: "state", ACTION: "action"}[feature], found.values))
+    for (feature, name), parts in report.distributions.items():
+        by_name.setdefault(name, []).append(({STATE: "state", ACTION: "action"}[feature], np.concatenate(parts)))
     for name, series in by_name.items():
         unit = _unit(name) if report.has_units else ""
         yield charts.distribution(f"{name} ({unit})" if unit else name, series)
