@@ -30,12 +30,11 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 CHOICES: dict[str, dict[str, Any]] = {
     "plain": {},
     "subtask": {"language": ("subtask",)},
-    "states": {"language": ("subtask", "plan", "memory", "motion", "task_aug")},
     "language": {"language": ()},
     "progress": {"progress": True},
     "boxes": {"boxes": True},
 }
-"""What is exported, and with which options; `states` is all language but what is about single images."""
+"""What is exported, and with which options."""
 
 
 BATCH = 32
@@ -82,7 +81,7 @@ def items(run: Path, work: Path, rounds: int, *, images: bool) -> None:
 
     torch.set_num_threads(1)  # threads that wait for each other count as CPU time
     features = () if images else ("observation.state", "action")
-    names = ("plain", "subtask", "states", "language")
+    names = ("plain", "subtask", "language")
     readers: dict[tuple[str, str, str], Any] = {}
     for name in names:
         out = work / f"items-{name}-{images}"

@@ -7,7 +7,7 @@ after a miss, a drop or a bad placement the next approach begins, so that progre
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
 
 if TYPE_CHECKING:
-    from demorec.annotate.tries import Story, Stretch
+    from demorec.annotate.attempts import EpisodeTimeline, PhaseSegment
 
 _STAGES = ("approach", "descend", "close", "lift", "transport", "lower", "release", "retreat")
 _ALSO = {
@@ -27,11 +26,8 @@ _ALSO = {
     "hold": "lift",
     "carry": "transport",
     "recover": "approach",
-    MISTAKEN_PHASE: "approach",
-    CORRECTED_PHASE: "approach",
 }
-"""The tutorial's words for the same, and what a failure or a correction leads back to."""
-_PICK = ("approach", "descend", "close", "lift")
+"""The tutorial's words for the same, and what a failure leads back to."""
 WHOLE_TASK = "task"
 """The only stage of an episode whose phases nobody knows."""
 
@@ -59,22 +55,17 @@ def dense_stages(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
     return tuple(f"goal {goal}: {stage}" for goal in range(1, num_goals + 1) for stage in stages)
 
 
-def sparse_stages(num_goals: int) -> tuple[str, ...]:
-    """The same, a pick and a place for each goal."""
-    return tuple(f"goal {goal}: {stage}" for goal in range(1, num_goals + 1) for stage in ("pick", "place"))
-
-
-def dense_runs(story: Story, rows: NDArray[np.intp]) -> list[StageRun]:
+def dense_runs(timeline: EpisodeTimeline, rows: NDArray[np.intp]) -> list[StageRun]:
     """The stages of an episode's rows, in order of time; one alone where the phases are not those of our skills.
 
     Args:
-        story: Of the recording.
+        timeline: Timeline of the recording.
         rows: (T,) which of its frames the dataset has.
     """
-    names = [_stage_of(stretch) for stretch in story.stretches]
+    names = [_stage_of(segment) for segment in timeline.segments]
     if not all(names):
         return [StageRun(stage=WHOLE_TASK, first=0, last=len(rows) - 1)]
-    starts = [stretch.first for stretch in story.stretches]
+    starts = [segment.first for segment in timeline.segments]
     numbers = np.searchsorted(starts, rows, side="right") - 1
     of_rows = [names[number] for number in numbers.tolist()]
     runs = []
@@ -84,27 +75,14 @@ def dense_runs(story: Story, rows: NDArray[np.intp]) -> list[StageRun]:
     return runs
 
 
-def _stage_of(stretch: Stretch) -> str:
-    """Name of the stage that a stretch belongs to, "" when nobody knows."""
-    phase, attempt = _ALSO.get(stretch.phase, stretch.phase), stretch.attempt
+def _stage_of(segment: PhaseSegment) -> str:
+    """Name of the stage that a segment belongs to, "" when nobody knows."""
+    phase, attempt = _ALSO.get(segment.phase, segment.phase), segment.attempt
     if phase not in _STAGES or attempt.goal is None:
         return ""
     if attempt.end == "misplaced" and phase in ("release", "retreat"):
         phase = "approach"
     return f"goal {attempt.goal + 1}: {phase}"
-
-
-def sparse_runs(dense: Sequence[StageRun]) -> list[StageRun]:
-    """The same rows in the stages of `sparse_stages`; a new try begins its pick anew."""
-    found: list[StageRun] = []
-    for run in dense:
-        goal, _, phase = run.stage.partition(": ")
-        stage = f"{goal}: {'pick' if phase in _PICK else 'place'}" if phase else run.stage
-        if found and found[-1].stage == stage and phase != _STAGES[0]:
-            found[-1] = replace(found[-1], last=run.last)
-        else:
-            found.append(replace(run, stage=stage))
-    return found
 
 
 def proportions(episodes: Sequence[Sequence[StageRun]], stages: Sequence[str]) -> dict[str, float]:

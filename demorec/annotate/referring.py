@@ -12,7 +12,8 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 
-from demorec.annotate.situation import COLOR_WORDS, NamedThing, Surroundings
+from demorec.annotate.situation import NamedThing, Surroundings
+from demorec.episode.words import COLOR_WORDS
 
 MIN_GAP = 0.04
 """By how much, metres, one thing must be farther to a side, or nearer, than the next one to be called so."""

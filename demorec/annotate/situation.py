@@ -5,24 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.scene import Body, Goal, Scene
+from demorec.episode.scene import Goal, Scene
+from demorec.episode.words import nouns_of
 
-COLOR_WORDS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey")
-"""Words for colours in instructions and names."""
-_NOUNS = {"jenga": "wooden plank", "lego": "toy brick"}
-"""Words for things whose names say less."""
-_SYNONYMS = {
-    "target": ("target", "mark", "square"),
-    "mark": ("mark", "target", "square"),
-    "tray": ("tray",),
-}
-CONTAINERS = ("tray", "bowl")
-"""What things go into and are in, not onto and on."""
 _AT_THE_PLACE = 0.01
 """How far, metres, the middle of a mark may be from a goal that is meant to be on it."""
 
@@ -74,54 +63,32 @@ class Surroundings:
         raise KeyError(name)
 
 
-def situations(scene: Scene, world_from_object: Mapping[str, Array], moments: int) -> list[Surroundings]:
-    """The things of a scene at T moments.
+def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
+    """Return the objects of a scene at one moment.
 
     Args:
         scene: At the episode's start.
-        world_from_object: Body -> (T, 7) poses (xyz, quaternion xyzw); the scene's own where left out.
-        moments: T.
+        world_from_object: Body -> (7,) pose (xyz, quaternion xyzw); the scene's own where left out.
     """
-    bodies = [body for body in scene.bodies if body.role != "fixture"]
-    traits: list[dict[str, Any]] = [
-        {
-            "name": body.name,
-            "nouns": nouns_of(body),
-            "color": body.color_name,
-            "size": max(body.shape.extents),
-            "height": body.shape.extents[2],
-            "can_be_held": body.movable,
-        }
-        for body in bodies
-    ]
-    places = np.empty((moments, len(bodies), 3))
-    for index, body in enumerate(bodies):
-        moved = world_from_object.get(body.name)
-        places[:, index] = body.world_from_body.position if moved is None else moved[:, :3]
-    return [
-        Surroundings(
-            things=tuple(NamedThing(position=place, **same) for place, same in zip(there, traits, strict=True))
+    moved = world_from_object or {}
+    base_from_world = scene.robot.world_from_base.inverse()
+    things = []
+    for body in scene.bodies:
+        if body.role == "fixture":
+            continue
+        place = moved[body.name][:3] if body.name in moved else body.world_from_body.position
+        things.append(
+            NamedThing(
+                name=body.name,
+                nouns=nouns_of(body),
+                color=body.color_name,
+                size=max(body.shape.extents),
+                position=base_from_world.apply(place),
+                height=body.shape.extents[2],
+                can_be_held=body.movable,
+            )
         )
-        for there in scene.robot.world_from_base.inverse().apply(places)
-    ]
-
-
-def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
-    """The same of one moment: (7,) poses."""
-    return situations(scene, {name: pose[np.newaxis] for name, pose in (world_from_object or {}).items()}, 1)[0]
-
-
-def nouns_of(body: Body) -> tuple[str, ...]:
-    """What a body may be called: by its name, less colour and number, and by its shape."""
-    words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLOR_WORDS, "other")]
-    noun = " ".join(_NOUNS.get(word, word) for word in words) or "object"
-    nouns = _SYNONYMS.get(noun, (noun,))
-    x, y, z = body.shape.extents
-    if body.movable and body.shape.kind == "box":
-        nouns += ("cube",) if max(x, y, z) < 1.05 * min(x, y, z) else ("block",)
-    elif body.movable and body.shape.kind in ("cylinder", "sphere", "capsule"):
-        nouns += (body.shape.kind,)
-    return tuple(dict.fromkeys(nouns))
+    return Surroundings(things=tuple(things))
 
 
 def place_of(scene: Scene, goal: Goal) -> str:

@@ -1,20 +1,18 @@
-"""Sentences for stretches and goals: subtask, plan, memory, motion."""
+"""Sentences for phase segments and goals: subtask, plan, memory, motion."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from demorec.annotate.attempts import EpisodeTimeline, GoalAttempt, PhaseSegment
 from demorec.annotate.referring import phrase_for
-from demorec.annotate.situation import CONTAINERS, Surroundings, nouns_of, place_of
-from demorec.annotate.tries import Story, Stretch, Try
+from demorec.annotate.situation import Surroundings, place_of
 from demorec.core.geometry import Array
-from demorec.episode.episode import CORRECTED_PHASE, MISTAKEN_PHASE
 from demorec.episode.scene import Scene
+from demorec.episode.words import VESSELS, nouns_of
 
 _SENTENCES = {
-    MISTAKEN_PHASE: "move above {object}",
-    CORRECTED_PHASE: "stop and listen",
     "open": "open the gripper",
     "approach": "move above {object}",
     "above_cube": "move above {object}",
@@ -35,7 +33,7 @@ _MISSING = {
     "lift": "lift the empty gripper, having missed {object} on purpose",
 }
 _AGAIN = ("approach", "descend", "close")
-"""Phases of a later try in which the subtask says that it is one."""
+"""Phases of a later attempt in which the subtask says that it is one."""
 _RECOVERY = {
     "missed": "open the gripper and rise after missing {object}",
     "dropped": "open the gripper and rise after dropping {object}",
@@ -46,7 +44,7 @@ _SMALLEST_MOVE, _SMALLEST_OPENING = 0.005, 0.0025
 
 @dataclass(frozen=True, kw_only=True)
 class GoalWords:
-    """How the things of one goal are called during a try.
+    """Words for the objects of one goal during an attempt.
 
     Attributes:
         object: "the red cube".
@@ -80,17 +78,17 @@ def prepositions(scene: Scene, place: str) -> tuple[str, str]:
     """("into", "in") for a container, ("to", "at") for a place without a thing, ("onto", "on") for everything else."""
     if not place:
         return "to", "at"
-    return ("into", "in") if nouns_of(scene.body(place))[0] in CONTAINERS else ("onto", "on")
+    return ("into", "in") if nouns_of(scene.body(place))[0] in VESSELS else ("onto", "on")
 
 
-def subtask(stretch: Stretch, words: GoalWords, instruction: str, *, is_dropped: bool) -> str:
-    """What is to be done in a stretch, as an imperative; the instruction where the recording knows no phase."""
-    phase, attempt = stretch.phase, stretch.attempt
+def subtask(segment: PhaseSegment, words: GoalWords, instruction: str, *, is_dropped: bool) -> str:
+    """Return the imperative for a segment; the instruction where the recording has no phase."""
+    phase, attempt = segment.phase, segment.attempt
     if phase == "recover":
         text = _RECOVERY.get(attempt.end, "open the gripper and rise")
         if attempt.is_deliberate_miss:
             text += " on purpose"
-    elif stretch.is_deliberate_miss and phase in _MISSING:
+    elif segment.is_deliberate_miss and phase in _MISSING:
         text = _MISSING[phase]
     elif phase == "release" and is_dropped:
         text = "drop {object} {into} {place}"
@@ -114,31 +112,31 @@ def plan(goals: Sequence[GoalWords], *, is_dropped: bool, is_retry: bool) -> str
     return "\n".join(f"{number}. {line}" for number, line in enumerate(lines, start=1))
 
 
-def memories(story: Story, words: dict[int, GoalWords], *, is_dropped: bool) -> Iterator[tuple[int, str]]:
+def memories(timeline: EpisodeTimeline, words: dict[int, GoalWords], *, is_dropped: bool) -> Iterator[tuple[int, str]]:
     """What was done so far, in the first person: (frame from which it is remembered, text).
 
     Args:
-        story: Of the episode.
-        words: First frame of a try -> how its things are called.
-        is_dropped: Whether objects are let fall.
+        timeline: Timeline of the episode.
+        words: First frame of an attempt -> how its objects are called.
+        is_dropped: Whether objects are released from a height.
     """
     done: list[str] = []
-    for before, stretch in zip((None, *story.stretches), story.stretches, strict=False):
-        attempt = stretch.attempt
+    for before, segment in zip((None, *timeline.segments), timeline.segments, strict=False):
+        attempt = segment.attempt
         spoken = words[attempt.first]
         present = ""
         if before is not None and before.attempt is attempt:
-            if before.phase in ("lift", "hold") and stretch.phase != "recover":
+            if before.phase in ("lift", "hold") and segment.phase != "recover":
                 present = f"I picked up {spoken.object}."
             elif before.phase == "release" and attempt.end == "placed":
                 done.append(_placed(spoken, is_dropped=is_dropped))
             elif before.phase == "release" and attempt.end == "misplaced":
                 present = f"I put {spoken.object} down in the wrong place."
-            elif stretch.phase == "recover":
-                present = _trouble(attempt, spoken)
+            elif segment.phase == "recover":
+                present = _failure(attempt, spoken)
             else:
                 continue
-            yield stretch.first, " ".join([*done, *([present] if present else [])])
+            yield segment.first, " ".join([*done, *([present] if present else [])])
 
 
 def _placed(words: GoalWords, *, is_dropped: bool) -> str:
@@ -148,7 +146,7 @@ def _placed(words: GoalWords, *, is_dropped: bool) -> str:
     return f"I {verb} {words.object} {where} {words.place}."
 
 
-def _trouble(attempt: Try, words: GoalWords) -> str:
+def _failure(attempt: GoalAttempt, words: GoalWords) -> str:
     verb = "dropped" if attempt.end == "dropped" else "missed"
     return f"I {verb} {words.object}{' on purpose' if attempt.is_deliberate_miss else ''}."
 

@@ -12,12 +12,11 @@ from tyro.conf import Positional, arg
 from demorec.cli.shared.output import counted, say, say_json, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.core.errors import ConfigError, ExportError, check_option
+from demorec.core.errors import ConfigError, ExportError
 from demorec.core.registry import check_choice
 from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
-    from demorec.check.scoring.score import EpisodeScore
     from demorec.datasets.editing.plan import Plan, Source
 
 _COMMANDS = (
@@ -36,8 +35,6 @@ _FLAGS = {
     "task": ("set-task",),
     "mapping": ("merge",),
     "json": ("diff", "score"),
-    "images": ("score",),
-    "workers": ("score",),
     "scores": ("select", "drop", "set-task", "split", "reorder"),
     **dict.fromkeys(("out", "overwrite"), tuple(name for name in _COMMANDS if name != "diff")),
     **dict.fromkeys(("decode", "dry_run"), tuple(name for name in _COMMANDS if name not in ("diff", "score"))),
@@ -115,10 +112,6 @@ class Dataset:
     """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""
     scores: Path | None = None
     """File of score --out, for conditions and orders by score (auto: the dataset is scored)."""
-    images: bool = True
-    """Look at some images of each episode (score)."""
-    workers: int | None = None
-    """Processes (score; auto: one for each core)."""
     overwrite: bool = False
     """Replace a dataset, or a file of scores, that is there."""
     dry_run: bool = False
@@ -211,7 +204,7 @@ class Dataset:
         return 0 if found.is_same else 1
 
     def _score(self) -> int:
-        from demorec.check.scoring.score import check_target, to_json, write_scores
+        from demorec.datasets.scoring.score import check_target, score_dataset, to_json, write_scores
 
         if len(self.words) != 1:
             raise ConfigError(f"One dataset is scored, given are {len(self.words)}: demorec dataset score DATASET.")
@@ -219,7 +212,7 @@ class Dataset:
         if self.out is not None:
             refuse_inside([self.out])
             check_target(self.out, source=root, overwrite=self.overwrite)
-        found = scored(root, images=self.images, workers=self.workers)
+        found = score_dataset(root)
         if self.json:
             say_json(to_json(found))
         for episode in () if self.json else sorted(found, key=lambda episode: episode.score):
@@ -242,12 +235,14 @@ class Dataset:
         if "score" not in names_in(self.where) | {self.by} or any("score" in row for row in source.columns()):
             return
         if self.scores is not None:
-            from demorec.check.scoring.score import read_scores
+            from demorec.datasets.scoring.score import read_scores
 
             lengths = {place.episode_index: place.length for place in source.places}
             source.scores = read_scores(self.scores, lengths)
         else:
-            source.scores = {episode.episode_index: episode.score for episode in scored(source.root)}
+            from demorec.datasets.scoring.score import score_dataset
+
+            source.scores = {episode.episode_index: episode.score for episode in score_dataset(source.root)}
 
     def _plan(self, sources: Sequence[Source]) -> Plan:
         from demorec.datasets.editing import operations
@@ -343,16 +338,6 @@ def _dataset(word: str) -> Path:
     if not is_dataset(path / DATASET):
         raise ConfigError(f"This run has no dataset in {DATASET}/, make one (demorec export lerobot): {path}")
     return path / DATASET
-
-
-def scored(root: Path, *, images: bool = True, workers: int | None = None) -> list[EpisodeScore]:
-    """The scores of a dataset, with a bar; a few episodes are measured by this process alone."""
-    from demorec.check.scoring.score import score_dataset
-    from demorec.core.processes import available_cores
-
-    check_option("workers", workers, 1, 1024)
-    with ProgressBar("scoring") as bar:
-        return score_dataset(root, images=images, workers=workers or available_cores(), progress=bar.set)
 
 
 def _numbers(texts: Sequence[str]) -> list[int]:

@@ -119,12 +119,16 @@ class View:
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""
-        from demorec.cli.dataset import scored
+        from demorec.datasets.scoring.score import score_dataset
         from demorec.runs.find import find
 
         if others := [path for path in self.paths if find(path).kind != "dataset"]:
             raise ConfigError(f"--rank score is for LeRobot datasets, which this is not: {others[0]}")
-        found = {f"{path}: episode {episode.episode_index}": episode for path in self.paths for episode in scored(path)}
+        found = {
+            f"{path}: episode {episode.episode_index}": episode
+            for path in self.paths
+            for episode in score_dataset(path)
+        }
         ranked = sorted(sources, key=lambda source: found[source.name].score)
         for episode in [found[source.name] for source in ranked[:_MOST_REASONS]]:
             reasons = "; ".join(reason.text for reason in episode.reasons)

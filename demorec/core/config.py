@@ -102,8 +102,6 @@ class GenerateConfig:
     of .obj and .stl files in metres, with a slash: ./my_meshes (auto: those of the task, if it draws from shelves)."""
     object_split: Literal["all", "train", "eval"] = "all"
     """train leaves out one shape in five of each kind; eval has only those."""
-    interject: bool = False
-    """The expert first goes for a wrong object and is corrected in words, if the scene has one to mistake."""
     sampling: Literal["random", "sobol", "lhs"] = "random"
     """How layouts cover the table: independently at random, or evenly by a Sobol sequence or Latin hypercubes."""
     sampling_block: int = 50

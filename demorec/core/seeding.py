@@ -22,7 +22,6 @@ Purpose = Literal[
     "behaviour",
     "language",
     "takeover",
-    "interjection",
 ]
 """What a stream is used for. Append only: the position in this list is part of every recorded seed."""
 

@@ -24,10 +24,6 @@ POLICY_PHASE = "policy"
 HALT_PHASE = "halt"
 """Phase in which an expert that has taken over does nothing yet but stop the arm. That is not to be learned: it stops
 in states in which a demonstration goes on."""
-MISTAKEN_PHASE, CORRECTED_PHASE = "mistake", "correct"
-"""Phases of an episode with an interjection: the wrong thing is gone for; what was said is listened to."""
-INTERJECTION_EVENT = "interjection"
-"""Event between these two: "NAME is meant, not NAME"."""
 
 TIME_LIMIT = "time_limit"
 """Reason of a failure that had not ended when its time was over."""

@@ -26,7 +26,6 @@ from demorec.robots.assets import allow_models, model_name
 from demorec.robots.robot import RobotSpec
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.interjection import Interjection, draw_interjection
 from demorec.tasks.sampling import Sampler, stratified_point
 from demorec.tasks.script import Behaviour
 from demorec.tasks.vary import calibration_errors, draw_behaviour, moved_camera, vary_cameras, vary_looks, vary_physics
@@ -47,7 +46,6 @@ class Episode:
         behaviour: How the expert does it.
         cameras: Where the cameras really are: `info.scene.cameras` holds the same with the calibration error.
         true_from_recorded: Camera name -> calibration error, of the cameras that have one.
-        interjection: What the expert mistakes at first, or None.
     """
 
     plan: EpisodePlan
@@ -56,7 +54,6 @@ class Episode:
     behaviour: Behaviour
     cameras: tuple[SceneCamera, ...] = ()
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
-    interjection: Interjection | None = None
 
     def rng(self, purpose: Purpose) -> np.random.Generator:
         """A fresh stream of this attempt."""
@@ -141,7 +138,6 @@ def prepare(plan: EpisodePlan) -> Episode:
         behaviour=behaviour,
         cameras=cameras,
         true_from_recorded=errors,
-        interjection=draw_interjection(scene, _rng(plan, "interjection")) if config.interject else None,
     )
 
 

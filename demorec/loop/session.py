@@ -30,7 +30,6 @@ from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.interjection import mistake
 from demorec.tasks.script import Step
 from demorec.tasks.skills import Expert, GaveUp
 
@@ -258,7 +257,7 @@ class ScriptAgent:
         It goes on only as long as the hand does what a real one could: a demonstration that crushes things is none.
         """
         try:
-            for step in self._script(expert):
+            for step in self._episode.task.script(expert):
                 yield step
                 if name := expert.world.crushed():
                     expert.note("crush", f"pressed on {name} harder than a hand can", trouble=True)
@@ -266,11 +265,6 @@ class ScriptAgent:
         except GaveUp as error:
             self._gave_up = error
             yield expert.step()
-
-    def _script(self, expert: Expert) -> Iterator[Step]:
-        if self._episode.interjection is not None:
-            yield from mistake(expert, self._episode.interjection)
-        yield from self._episode.task.script(expert)
 
     def failure(self, failed: Sequence[str]) -> tuple[str, str]:
         """See `Agent`."""

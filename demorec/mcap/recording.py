@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from itertools import islice, repeat
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
@@ -52,8 +51,6 @@ class Recording(EpisodeFile):
 
     _said: Said | None = None
     """Messages of all events, once `columns` has come by them: they lie among the numbers in the file."""
-    _packed_labels: Mapping[str, Block] = MappingProxyType({})
-    """topic -> segmentation images and the names in them, once `coded_images` has come by them."""
 
     def columns(self) -> Columns:
         """All numbers, one row a frame, bit-exact as they were written, and which images the frames hold."""
@@ -108,10 +105,7 @@ class Recording(EpisodeFile):
     def coded_images(self, cameras: Sequence[str]) -> dict[str, Block]:
         """camera -> all its encoded images, read in one pass; they are in memory together."""
         topics = {camera: self._image_topic(camera) for camera in cameras}
-        labels = [self._segmentation_topic(camera) for camera in cameras if self.has_segmentation(camera)]
-        labels += [channels.LABELS] if labels else []
-        found = self._container.blocks((*topics.values(), *labels))
-        self._packed_labels = {topic: found[topic] for topic in labels}
+        found = self._container.blocks(tuple(topics.values()))
         images = {}
         for camera, topic in topics.items():
             times = frame_times(self.num_frames, self.info.fps)
@@ -132,34 +126,6 @@ class Recording(EpisodeFile):
         for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
             yield labels
 
-    def segmentation_at(
-        self, cameras: Sequence[str], frames: Collection[int]
-    ) -> Iterator[tuple[str, int, NDArray[np.uint16]]]:
-        """(camera, frame, (H, W) labels) of some frames, read in one pass; the other images stay packed.
-
-        Labels are what `segment_labels` tells, less to compute than the values of `segmentation`.
-
-        Those of one camera come in the order of its frames; how those of several cameras alternate is not said.
-        """
-        topics = {camera: self._segmentation_topic(camera) for camera in cameras}
-        decoders = {camera: LabelDecoder(self._size(camera)) for camera in cameras}
-        times, counts = frame_times(self.num_frames, self.info.fps), dict.fromkeys(cameras, 0)
-        is_read = self._packed_labels.keys() >= set(topics.values())
-        for blocks in [self._packed_labels] if is_read else self._container.blocks_by_chunk(topics.values()):
-            for camera, topic in topics.items():
-                block, first = blocks[topic], counts[camera]
-                counts[camera] += len(block)
-                if not np.array_equal(block.time_ns, times[first : counts[camera]]):
-                    raise self._wrong_times(topic)
-                chosen = np.array([index for index in range(len(block)) if first + index in frames], dtype=np.intp)
-                for index, message in zip(chosen.tolist(), block.select(chosen).messages(), strict=True):
-                    with damage_as_recording_error(self.path):
-                        labels = decoders[camera].labels(messages.read_compressed_image(message))
-                    yield camera, first + index, labels
-        for camera, count in counts.items():
-            if count != self.num_frames:
-                raise self._wrong_times(topics[camera])
-
     def _segmentation_topic(self, camera: str) -> str:
         if not self.has_segmentation(camera):
             raise RecordingError(f"The recording has no segmentation images of the camera {camera!r}: {self.path}")
@@ -167,17 +133,9 @@ class Recording(EpisodeFile):
 
     def segment_names(self) -> dict[int, str]:
         """Segmentation value -> name of the body, or ROBOT/LINK; empty when no segmentation was recorded."""
-        labels = self.segment_labels()
-        values = from_labels(np.array(list(labels), dtype=np.uint16)).tolist()
-        return dict(zip(values, labels.values(), strict=True))
-
-    def segment_labels(self) -> dict[int, str]:
-        """Label in the files -> name, as of `segment_names`."""
-        if packed := self._packed_labels.get(channels.LABELS):
-            with damage_as_recording_error(self.path):
-                return messages.read_label_info(next(packed.messages()))
         for _, names in self._read(channels.LABELS, messages.read_label_info):
-            return names
+            values = from_labels(np.array(list(names), dtype=np.uint16)).tolist()
+            return dict(zip(values, names.values(), strict=True))
         return {}
 
     def _shown(self, camera: str) -> NDArray[np.int64]:

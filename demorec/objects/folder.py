@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.annotate.situation import COLOR_WORDS
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import open_regular
 from demorec.core.geometry import Array
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import MAX_EXTENT, MAX_POINTS, UNIT, SolidMesh
+from demorec.episode.words import COLOR_WORDS
 from demorec.objects.antipodal import standing_rotation
 from demorec.objects.shelf import Kind, Shelf
 from demorec.robots.assets import data_folder

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Level, Result
 from demorec.episode.episode import Outcome
-from demorec.episode.info import EpisodeInfo
 from demorec.learn.evaluate.statistics import Rate
-from demorec.report.differences import Differences
 from demorec.report.filmstrip import Filmstrip
-from demorec.report.histogram import Histogram
 
 LEVELS: tuple[Level, ...] = ("skip", "pass", "warn", "fail")
 State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
@@ -39,7 +37,6 @@ class ReportedEpisode:
         flags: Results of checks that failed or warned, failures first.
         filmstrip: None without images, and for some successes in a long report.
         facts: (name, value) of what the summary says of all episodes together: robot, cameras, ...
-        info: Everything known before the first frame of a simulated one.
     """
 
     name: str
@@ -54,7 +51,6 @@ class ReportedEpisode:
     flags: tuple[Result, ...] = ()
     filmstrip: Filmstrip | None = None
     facts: tuple[tuple[str, str], ...] = ()
-    info: EpisodeInfo | None = None
 
     @property
     def success(self) -> bool | None:
@@ -81,14 +77,22 @@ class ReportedEpisode:
         return f"{reason} in phase {phase}" if phase else reason
 
 
-Components = dict[tuple[str, str], Histogram]
-"""(feature, name of the component) -> its values over all frames."""
+MAX_SAMPLES = 200
+"""Frames of each episode that a distribution is drawn from, beside its extremes."""
 
 
-def count(into: Components, feature: str, names: Iterable[str], values: NDArray[Any]) -> None:
-    """Count the values of a feature (T, D) by component, as far as there are names."""
+Components = dict[tuple[str, str], list[NDArray[np.float32]]]
+"""(feature, name of the component) -> its sampled values, episode by episode."""
+
+
+def add_values(into: Components, feature: str, names: Iterable[str], values: NDArray[Any]) -> None:
+    """Add the values of a feature (T, D) in one episode: finite ones, evenly spaced, and the extremes."""
     for name, column in zip(names, values.T, strict=False):
-        into.setdefault((feature, name), Histogram()).add(column)
+        finite = column[np.isfinite(column)]
+        if len(finite):
+            sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
+            parts = into.setdefault((feature, name), [])
+            parts.append(np.array([*sampled, finite.min(), finite.max()], dtype=np.float32))
 
 
 class CheckSummaries:
@@ -137,8 +141,6 @@ class Report:
         has_units: Whether their components have demorec's names, and so known units.
         checks: None when no checks were run.
         missing: Sentences about what the source does not contain.
-        configs: Resolved configurations.
-        differences: From another dataset; None when it was compared with none.
     """
 
     title: str
@@ -149,8 +151,6 @@ class Report:
     has_units: bool
     checks: CheckSummaries | None
     missing: tuple[str, ...]
-    configs: tuple[Mapping[str, Any], ...]
-    differences: Differences | None = None
 
 
 def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:

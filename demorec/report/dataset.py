@@ -13,19 +13,17 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Result
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.check.scoring.neighbours import FEWEST
-from demorec.check.scoring.score import SOUND, score_dataset
 from demorec.core.errors import ConfigError, ExportError, describe_error, without_path
-from demorec.datasets.lerobot.files import read_json, read_table
+from demorec.datasets.lerobot.files import read_table
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places
-from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA
+from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
+from demorec.datasets.scoring.score import MIN_EPISODES, MIN_SOUND, score_dataset
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import ACTION, IMAGE_PREFIX, STATE
-from demorec.episode.validity import read_episode_info
-from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, common_facts, count
+from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, add_values, common_facts
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
 
 _SUCCESS = "next.success"
@@ -43,7 +41,7 @@ _Row = Mapping[str, Any]
 def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance: Callable[[int, int], None]) -> Report:
     """The content of a page about a dataset; arguments and errors as of `demorec.report.gather.gather`."""
     info = DatasetInfo.load(root)
-    rows, left_out, configs = _read_sidecar(root)
+    rows, left_out = _read_sidecar(root)
     missing = list(_missing(info, has_sidecar=bool(rows)))
     key = _camera_key(info, camera, root)
     stored = None if key is None or info.features[key].is_video else StoredImages(info, key)
@@ -57,7 +55,7 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
     stride = max(1, -(-info.total_episodes // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
-    flags = {} if checks is None else _flags(root, info, missing, images=checks.images)
+    flags = {} if checks is None else _flags(root, info, missing)
     for number, place in enumerate(episode_places(root, info)):
         columns = {} if reader is None else reader.numbers(place)
         _count_components(components, root, info, columns)
@@ -85,16 +83,15 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
         has_units=bool(rows),
         checks=summaries if checks else None,
         missing=tuple(missing),
-        configs=tuple(configs.values()),
     )
 
 
-def _flags(root: Path, info: DatasetInfo, missing: list[str], *, images: bool) -> dict[int, tuple[Result]]:
-    """episode_index -> its score, of the worst of those below `SOUND`; why there are no scores goes into `missing`."""
-    if info.total_episodes < FEWEST:
+def _flags(root: Path, info: DatasetInfo, missing: list[str]) -> dict[int, tuple[Result]]:
+    """Return episode_index -> its score, of the worst below `MIN_SOUND`; why there are none goes into `missing`."""
+    if info.total_episodes < MIN_EPISODES:
         return {}
     try:
-        found = sorted(score_dataset(root, images=images), key=lambda episode: episode.score)
+        found = sorted(score_dataset(root), key=lambda episode: episode.score)
     except ExportError as error:
         missing.append(f"Its episodes have no scores: {without_path(error, root)}")
         return {}
@@ -106,19 +103,19 @@ def _flags(root: Path, info: DatasetInfo, missing: list[str], *, images: bool) -
                 level="warn",
                 value=episode.score,
                 unit="",
-                warn=SOUND,
+                warn=MIN_SOUND,
                 fail=0.0,
                 frame=episode.reasons[0].first if episode.reasons else None,
                 detail="; ".join(reason.text for reason in episode.reasons),
             ),
         )
         for episode in found[:MAX_SHOWN]
-        if episode.score < SOUND
+        if episode.score < MIN_SOUND
     }
 
 
-def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row], _Row]:
-    """(episode index -> its row, rows of attempts outside of the dataset, configurations); empty without a sidecar.
+def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row]]:
+    """Return episode index -> its row, and the rows of attempts outside of the dataset; empty without a sidecar.
 
     Raises:
         ExportError: It is damaged.
@@ -134,12 +131,8 @@ def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row], _Row]:
             ("attempts", _ATTEMPT_COLUMNS, ATTEMPT_SCHEMA),
         )
     )
-    try:
-        configs = read_json(root / CONFIGS_PATH) if episodes else {}
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The sidecar's configs.json cannot be read ({describe_error(error)}): {root}") from error
     rows = {row["episode_index"]: row for row in episodes}
-    return rows, [row for row in attempts if not row["in_dataset"]], configs if isinstance(configs, dict) else {}
+    return rows, [row for row in attempts if not row["in_dataset"]]
 
 
 def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:
@@ -192,7 +185,6 @@ def _episode(place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]],
             known,
             seed=row["root_seed"],
             phases=tuple((phase["name"], phase["from"], phase["to"]) for phase in row["phases"]),
-            info=read_episode_info(row["episode_info"]),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise ExportError(f"The sidecar's row of {name} cannot be used ({describe_error(error)})") from error
@@ -230,15 +222,15 @@ def _count_components(into: Components, root: Path, info: DatasetInfo, columns: 
         names = info.features[feature].names or ()
         if len(names) != values.shape[1]:
             names = tuple(f"component {number}" for number in range(values.shape[1]))
-        count(into, feature, names[:_MAX_COMPONENTS], values)
+        add_values(into, feature, names[:_MAX_COMPONENTS], values)
 
 
 def _missing(info: DatasetInfo, *, has_sidecar: bool) -> Iterator[str]:
     """Sentences about what the dataset does not contain."""
     if not has_sidecar:
         yield (
-            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: scenes, random seeds, phases, "
-            "the conditions of success and the coverage of the randomised ranges are not known."
+            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: random seeds, phases "
+            "and the conditions of success are not known."
         )
         if _SUCCESS not in info.features:
             yield f"No column {_SUCCESS} states which episodes succeeded."
@@ -246,10 +238,8 @@ def _missing(info: DatasetInfo, *, has_sidecar: bool) -> Iterator[str]:
         yield "It has no color images, so there are no filmstrips."
     for feature in (STATE, ACTION):
         item = info.features.get(feature)
-        if item is None:
-            yield f"It has no column {feature}, so nothing is drawn of it."
-        elif item.dtype not in _NUMBERS or len(item.shape) != 1:
-            yield f"The column {feature} is not a vector of numbers (dtype {item.dtype}), so nothing is drawn of it."
+        if item is None or item.dtype not in _NUMBERS or len(item.shape) != 1:
+            yield f"It has no column {feature} of numbers, so nothing is drawn of it."
         elif item.shape[0] > _MAX_COMPONENTS:
             yield f"Of the {item.shape[0]} components of {feature} the first {_MAX_COMPONENTS} are drawn."
 

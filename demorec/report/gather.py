@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
 from demorec.core.errors import ConfigError, ExportError, RecordingError, without_path
-from demorec.core.plain import to_plain
 from demorec.core.processes import in_turn
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.options import CommonOptions
@@ -25,8 +24,8 @@ from demorec.report.content import (
     Components,
     Report,
     ReportedEpisode,
+    add_values,
     common_facts,
-    count,
     few,
 )  # fmt: skip
 from demorec.report.dataset import dataset_report
@@ -104,7 +103,7 @@ def _recordings_report(
     for episode, vectors, checked in _read_all(path, camera, checks, subjects, workers):
         episodes.append(episode)
         for feature, (names, values) in vectors.items():
-            count(components, feature, names, values)
+            add_values(components, feature, names, values)
         if checked is not None:
             summaries.add(checked.results, episode.name)
         advance(len(episodes), total)
@@ -118,17 +117,15 @@ def _recordings_report(
             missing.append("The checks that decode all images were not run; --images runs them, too.")
     if run is not None:
         episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
-    configs = {episode.info.config_digest: episode.info.config for episode in episodes if episode.info is not None}
     return Report(
         title=path.resolve().name,
         kind=_KINDS[found.kind],
         facts=tuple(_facts(found, run, episodes)),
         episodes=tuple(episodes),
         distributions=components,
-        has_units=all(episode.info is not None for episode in episodes if episode.facts),
+        has_units=all(episode.seed is not None for episode in episodes if episode.facts),
         checks=summaries if checks else None,
         missing=tuple(missing),
-        configs=tuple(configs.values()) if run is None else (to_plain(run.config),),
     )
 
 
@@ -187,7 +184,6 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tupl
         phases=tuple((names[first], first, end) for first, end in pairwise(bounds)),
         filmstrip=strip,
         facts=tuple(_facts_of(recording)),
-        info=None if simulated is None else info,
     )
     return episode, _vectors(content)
 

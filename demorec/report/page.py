@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -19,19 +18,17 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.environment import TemplateStream
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from demorec.check.base import Result
 from demorec.core.errors import ConfigError
 from demorec.core.replacing import REPORT, REPORT_MARK, written_whole
 from demorec.core.text import printable
 from demorec.episode.features import ACTION, STATE
-from demorec.episode.info import EpisodeInfo
 from demorec.report import charts
 from demorec.report.charts import Chart, css_color
-from demorec.report.content import LEVELS, Report, ReportedEpisode, State, success_rate
-from demorec.report.coverage import MIN_VALUES, drawn_columns, randomised, with_unit
+from demorec.report.content import LEVELS, MAX_SAMPLES, Report, ReportedEpisode, State, success_rate
 from demorec.report.filmstrip import MAX_SHOWN
-from demorec.report.histogram import Histogram
 from demorec.view.style import phase_colors
 
 _STATES: dict[State, str] = {
@@ -43,8 +40,6 @@ _STATES: dict[State, str] = {
 }
 """State of an episode -> its words, in the order of the list of episodes."""
 _GOOD = ("success at the first try", "success after a retry")
-_MAX_POINTS = 4000
-"""Of the map of starts and goals."""
 
 
 def write_page(report: Report, path: Path) -> int:
@@ -81,9 +76,7 @@ def _stream(report: Report) -> TemplateStream:
         outcomes=_outcomes(report.episodes),
         checks=report.checks if report.checks and report.checks.worst else None,
         rate=success_rate(report.episodes),
-        coverage=list(_coverage(report.episodes)),
         distributions=list(_distributions(report)),
-        configs=[(config, json.dumps(config, indent=2, ensure_ascii=False).split("\n")) for config in report.configs],
         shown=shown,
         counts=Counter(episode.state for episode in report.episodes),
         colors=colors,
@@ -100,7 +93,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(charts=charts, levels=LEVELS[::-1], min_values=MIN_VALUES, states=_STATES)
+    environment.globals.update(charts=charts, levels=LEVELS[::-1], max_samples=MAX_SAMPLES, states=_STATES)
     environment.filters.update(
         fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, measured=measured, words=_words
     )
@@ -176,40 +169,17 @@ def _words(episode: ReportedEpisode) -> str:
     return " ".join([*parts, episode.failure]).lower()
 
 
-def _coverage(episodes: Sequence[ReportedEpisode]) -> Iterator[dict[str, object]]:
-    """For each task the variables of its part of the section."""
-    by_task: dict[str, list[tuple[int, ReportedEpisode, EpisodeInfo]]] = {}
-    for number, episode in enumerate(episodes):
-        if episode.info is not None:
-            by_task.setdefault(episode.info.task, []).append((number, episode, episode.info))
-    for task, members in by_task.items():
-        infos = [info for _, _, info in members]
-        failed = np.array([episode.success is False for _, episode, _ in members])
-        behavior = drawn_columns([info.behaviour for info in infos])
-        yield {
-            "task": task,
-            "num_episodes": len(members),
-            "num_failed": int(failed.sum()),
-            "map": charts.floor_map(members[:: -(-len(members) // _MAX_POINTS)]),
-            "scenes": [charts.coverage(with_unit(name), values, failed) for name, values in randomised(infos).items()],
-            "behavior": [charts.coverage(name.replace("_", " "), values, failed) for name, values in behavior.items()],
-        }
-
-
 def _distributions(report: Report) -> Iterator[Chart]:
-    by_name: dict[str, list[tuple[str, Histogram]]] = {}
-    for (feature, name), histogram in report.distributions.items():
-        if histogram.count:
-            by_name.setdefault(name, []).append(({STATE: "state", ACTION: "action"}[feature], histogram))
+    by_name: dict[str, list[tuple[str, NDArray[np.float32]]]] = {}
+    for (feature, name), parts in report.distributions.items():
+        by_name.setdefault(name, []).append(({STATE: "state", ACTION: "action"}[feature], np.concatenate(parts)))
     for name, series in by_name.items():
         unit = _unit(name) if report.has_units else ""
         yield charts.distribution(f"{name} ({unit})" if unit else name, series)
-    lengths = Histogram()
-    lengths.add(np.array([episode.num_frames / episode.fps for episode in report.episodes if episode.num_frames]))
-    if lengths.count > 1:
-        yield charts.distribution("length of episodes (s)", [("state", lengths)])._replace(
-            note=f"mean: {lengths.mean:.3g}"
-        )
+    seconds = [episode.num_frames / episode.fps for episode in report.episodes if episode.num_frames]
+    if len(seconds) > 1:
+        lengths = charts.distribution("length of episodes (s)", [("state", np.array(seconds, np.float32))])
+        yield lengths._replace(note=f"mean: {np.mean(seconds):.3g}")
 
 
 def _unit(name: str) -> str:

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.annotate.situation import CONTAINERS
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
 from demorec.episode.mesh import decode_mesh, encode_mesh
 from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape, Texture
+from demorec.episode.words import VESSELS
 from demorec.objects.shelf import MATERIALS, Kind, Material
 from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
@@ -121,7 +121,7 @@ class PickAnything(TableTask):
         """One of the wordings, filled in."""
         (goal,) = scene.goals
         name = goal.onto or "green_target"
-        place = f"{'in' if name.endswith(CONTAINERS) else 'on'} the {name.replace('_', ' ')}"
+        place = f"{'in' if name.endswith(VESSELS) else 'on'} the {name.replace('_', ' ')}"
         return wording(rng, *self.wordings, thing=words_for(scene.body(goal.object)), place=place)
 
 

@@ -34,7 +34,7 @@ def test_a_run_stands_for_its_dataset(tmp_path: Path, capsys: pytest.CaptureFixt
     assert exit_code("dataset", "score", run) == 2
     assert "This run has no dataset in dataset/" in capsys.readouterr().err
     write_foreign(run / "dataset", episodes=3)
-    assert exit_code("dataset", "score", run, "--no-images", "--workers", "1", "--json") == 0
+    assert exit_code("dataset", "score", run, "--json") == 0
     assert len(json.loads(capsys.readouterr().out)["episodes"]) == 3
     assert exit_code("dataset", "select", run, "--episodes", "1", "--out", tmp_path / "one") == 0
     assert "1 of 3 episodes, 8 of 24 frames" in capsys.readouterr().out
@@ -151,8 +151,8 @@ def test_the_home_folder_within_quotes(
     monkeypatch.setenv("HOME", str(cups.parent))
     assert exit_code("dataset", "select", "~/cups", "--episodes", "0", "--out=~/new") == 0
     assert (cups.parent / "new/meta/info.json").is_file()
-    assert exit_code("dataset", "score", "cups", "--no-images", "--workers", "1", "--out", "~/scores.json") == 0
+    assert exit_code("dataset", "score", "cups", "--out", "~/scores.json") == 0
     assert f"Scores of 5 episodes: {cups.parent}/scores.json" in capsys.readouterr().err
     assert not Path("~").exists()
-    assert exit_code("dataset", "score", "cups", "--no-images", "--workers", "1", "--out", "x" * 250) == 1
+    assert exit_code("dataset", "score", "cups", "--out", "x" * 250) == 1
     assert "The scores cannot be written (File name too long)" in capsys.readouterr().err

@@ -531,7 +531,7 @@ def test_an_empty_file_is_not_replaced(
 def test_scores_replace_scores_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files_of(place)
     (place / "other.json").write_text('{"episodes": []}')
-    score = ("dataset", "score", place / "dataset", "--no-images", "--workers", "1", "--out")
+    score = ("dataset", "score", place / "dataset", "--out")
     for name in ("other.json", "thesis.tex", "thesis", "dataset/meta/info.json", "dataset/scores.json"):
         assert exit_code(*score, place / name, "--overwrite") == 2, name
         assert len(capsys.readouterr().err.splitlines()) == 1

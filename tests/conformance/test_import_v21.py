@@ -133,7 +133,7 @@ def test_every_tool_reads_it(version: str, tmp_path: Path, capsys: pytest.Captur
         np.testing.assert_array_equal(episode.curves["observation.state"].values, state(1))
         assert len(list(episode.videos["top"].packets())) == LENGTHS[1]
     capsys.readouterr()
-    assert exit_code("dataset", "score", root, "--workers", "1", "--json") == 0
+    assert exit_code("dataset", "score", root, "--json") == 0
     scored = json.loads(capsys.readouterr().out)["episodes"]
     assert [episode["num_frames"] for episode in scored] == list(LENGTHS)
 

@@ -15,8 +15,8 @@ from support.check import simulate_run
 from support.export import data_table, episode_rows, export, files_of
 from support.language import active, language_of, meant, phrases, scene_at
 
-from demorec.annotate import STATES
-from demorec.annotate.situation import nouns_of, place_of
+from demorec.annotate import KINDS
+from demorec.annotate.situation import place_of
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
@@ -25,6 +25,7 @@ from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
+from demorec.episode.words import nouns_of
 from demorec.mcap import Recording
 from demorec.tasks.furniture import THINGS
 
@@ -75,7 +76,7 @@ def test_lerobots_own_validator_finds_nothing(dataset: Path, tmp_path: Path) -> 
     for record, frames in zip(records, spoken, strict=True):
         persistent = frames[0][0]
         assert all(rows == persistent and events == [] for rows, events in frames)
-        assert {row["style"] for row in persistent} == set(STATES)
+        assert {row["style"] for row in persistent} == set(KINDS)
         for row in persistent:
             assert column_for_style(row["style"]) == "language_persistent"
             validate_camera_field(row["style"], row["camera"])
@@ -259,35 +260,31 @@ def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset
     rows = episode_rows(dataset)
     assert table["index"] == list(range(sum(row["length"] for row in rows)))
     assert table["episode_index"] == data_table(dataset).column("episode_index").to_pylist()
-    for head in ("sparse", "dense"):
-        share = json.loads((dataset / "meta" / f"temporal_proportions_{head}.json").read_text())
-        found = np.array(table[f"progress_{head}"])
-        assert 0 <= found.min() <= found.max() <= 1
-        for row, run in zip(rows, runs, strict=True):
-            names, starts, ends = (row[f"{head}_subtask_{part}"] for part in ("names", "start_frames", "end_frames"))
-            assert starts == [0, *(end + 1 for end in ends[:-1])]
-            assert ends[-1] == row["length"] - 1
-            own = found[row["dataset_from_index"] : row["dataset_to_index"]]
-            assert own[0] == 0
-            assert own[-1] == 1  # all of them succeed
-            stages = [stage for stage in share if stage in names]
-            assert all(f"goal {goal + 1}: " in " ".join(stages) for goal in range(row["num_goals"]))
-            for frame in range(row["length"]):
-                value = find_stage_and_tau(
-                    frame, row["length"], names, starts, ends, stages, share, return_combined=True
-                )
-                assert isinstance(value, float)
-                shares = {stage: share[stage] for stage in stages}
-                expected = normalize_stage_tau(value, temporal_proportions=shares, subtask_names=stages)
-                assert abs(float(expected) - own[frame]) < 2e-3, (run, frame)
-            with _recording(run) as recording:
-                misses, phase = recording.columns().is_deliberate_miss, recording.columns().phase
-            if head == "dense":
-                changes = {frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]}
-                assert set(starts[1:]) <= changes
-            # It rises but where a try came to nothing.
-            falls = np.flatnonzero(np.diff(own) < 0)
-            assert falls.tolist() == (np.flatnonzero(misses)[-1:].tolist() if misses.any() else [])
+    share = json.loads((dataset / "meta" / "temporal_proportions_dense.json").read_text())
+    found = np.array(table["progress_dense"])
+    assert 0 <= found.min() <= found.max() <= 1
+    for row, run in zip(rows, runs, strict=True):
+        names, starts, ends = (row[f"dense_subtask_{part}"] for part in ("names", "start_frames", "end_frames"))
+        assert starts == [0, *(end + 1 for end in ends[:-1])]
+        assert ends[-1] == row["length"] - 1
+        own = found[row["dataset_from_index"] : row["dataset_to_index"]]
+        assert own[0] == 0
+        assert own[-1] == 1  # all of them succeed
+        stages = [stage for stage in share if stage in names]
+        assert all(f"goal {goal + 1}: " in " ".join(stages) for goal in range(row["num_goals"]))
+        shares = {stage: share[stage] for stage in stages}
+        for frame in range(row["length"]):
+            value = find_stage_and_tau(frame, row["length"], names, starts, ends, stages, share, return_combined=True)
+            assert isinstance(value, float)
+            expected = normalize_stage_tau(value, temporal_proportions=shares, subtask_names=stages)
+            assert abs(float(expected) - own[frame]) < 2e-3, (run, frame)
+        with _recording(run) as recording:
+            misses, phase = recording.columns().is_deliberate_miss, recording.columns().phase
+        changes = {frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]}
+        assert set(starts[1:]) <= changes
+        # It falls only where an attempt missed.
+        falls = np.flatnonzero(np.diff(own) < 0)
+        assert falls.tolist() == (np.flatnonzero(misses)[-1:].tolist() if misses.any() else [])
 
 
 def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
@@ -296,18 +293,16 @@ def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
     from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
 
     policy = SimpleNamespace(config=SimpleNamespace(chunk_size=10))
-    for head in ("sparse", "dense"):
-        config = SampleWeightingConfig(head_mode=head)
-        weighter = make_sample_weighter(config, policy, torch.device("cpu"), dataset_root=str(dataset))
-        assert isinstance(weighter, RABCWeights)
-        row = next(row for row in episode_rows(dataset) if row["has_deliberate_miss"])
-        ends = row[f"{head}_subtask_end_frames"]
-        missed = ends[0] if head == "sparse" else ends[2]  # the last frame of the missed pick, or of its close
-        frames = torch.arange(row["dataset_from_index"], row["dataset_from_index"] + missed + 20)
-        weights, _ = weighter.compute_batch_weights({"index": frames})
-        assert (weights[missed - 8 : missed + 1] == 0).all()
-        assert (weights[: missed - 10] > 0).all()
-        assert (weights[missed + 1 :] > 0).all()
+    config = SampleWeightingConfig(head_mode="dense")
+    weighter = make_sample_weighter(config, policy, torch.device("cpu"), dataset_root=str(dataset))
+    assert isinstance(weighter, RABCWeights)
+    row = next(row for row in episode_rows(dataset) if row["has_deliberate_miss"])
+    missed = row["dense_subtask_end_frames"][2]  # the last frame of the missed close
+    frames = torch.arange(row["dataset_from_index"], row["dataset_from_index"] + missed + 20)
+    weights, _ = weighter.compute_batch_weights({"index": frames})
+    assert (weights[missed - 8 : missed + 1] == 0).all()
+    assert (weights[: missed - 10] > 0).all()
+    assert (weights[missed + 1 :] > 0).all()
 
 
 def test_episodes_are_filtered_by_what_is_known_of_them(runs: list[Path], dataset: Path) -> None:

@@ -127,7 +127,7 @@ def test_language_is_equal(tmp_path: Path) -> None:
     rows = table.column("language_events").to_pylist()
     call = {"type": "function", "function": {"name": "say", "arguments": {"text": "Yes, the red one."}}}
     rows[3] = [
-        {"role": "user", "content": "No, the red one.", "style": "interjection", "camera": None, "tool_calls": None},
+        {"role": "user", "content": "No, the red one.", "style": None, "camera": None, "tool_calls": None},
         {"role": "assistant", "content": None, "style": None, "camera": None, "tool_calls": [json.dumps(call)]},
     ]
     fields = dict.fromkeys(("role", "content", "style", "camera"), pa.string()) | {"tool_calls": pa.list_(pa.string())}

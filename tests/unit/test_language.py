@@ -1,4 +1,4 @@
-"""Words for things and tries, on scenes and episodes that are made up."""
+"""Words for objects and attempts, on scenes and episodes that are made up."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from support.recording import make_episode
 
-from demorec.annotate.narration import narrate
 from demorec.annotate.referring import phrase_for, phrases_for, resolve
 from demorec.annotate.situation import situation
+from demorec.annotate.statements import episode_statements
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot import files
@@ -96,7 +96,7 @@ def told(folder: Path, script: list[tuple[str, str, str]], **arguments: object) 
         rows = np.arange(len(columns.time_ns))
         return [
             (statement.row, statement.kind, statement.text)
-            for statement in narrate(recording, columns, rows, ("subtask", "plan", "memory"))
+            for statement in episode_statements(recording, columns, rows, ("subtask", "plan", "memory"))
         ]
 
 

@@ -22,7 +22,6 @@ pytestmark = pytest.mark.slow
 
 LENGTH, EPISODES_IN_ALL, BAD, SIZE = 60, 24, 5, (32, 24)
 CLOSES, OPENS = 20, 42
-COLORS = {"red": (220, 20, 20), "blue": (20, 20, 220)}
 Rows = dict[str, NDArray[Any]]
 
 
@@ -39,12 +38,8 @@ def demonstration(number: int) -> Rows:
     action[CLOSES:OPENS, 2] = 0.0
     state = np.concatenate([action[:1], action[:-1]])
     state[:, 2] = np.maximum(state[:, 2], 0.4 + rng.uniform(-0.05, 0.05))
-    color = list(COLORS)[number % 2]
     images = np.full((LENGTH, SIZE[1], SIZE[0], 3), 90, np.uint8)
-    for t in range(LENGTH):
-        left = int(10 + 6 * state[t, 0])
-        images[t, 6:16, left : left + 8] = COLORS[color]
-    return {"state": state, "action": action, "images": images, "task": np.array(f"take the {color} block")}
+    return {"state": state, "action": action, "images": images, "task": np.array("take the block")}
 
 
 def write(root: Path, episodes: list[Rows]) -> Path:
@@ -100,11 +95,6 @@ def goes_aside(rows: Rows) -> Rows:
     return longer
 
 
-def loses_it(rows: Rows) -> Rows:
-    rows["state"][32:OPENS, 2] = 0.0
-    return rows
-
-
 def shakes(rows: Rows) -> Rows:
     rows["action"][:, :2] += np.random.default_rng(0).normal(0, 0.02, (LENGTH, 2))
     return rows
@@ -114,46 +104,8 @@ def is_late(rows: Rows) -> Rows:
     return {**rows, "action": np.concatenate([rows["action"][:1]] * 3 + [rows["action"][:-3]])}
 
 
-def takes_the_other(rows: Rows) -> Rows:
-    other = {"take the red block": "take the blue block", "take the blue block": "take the red block"}
-    return {**rows, "task": np.array(other[str(rows["task"])])}
-
-
-def freezes(rows: Rows) -> Rows:
-    rows["images"][24:40] = rows["images"][24]
-    return rows
-
-
 def ends_early(rows: Rows) -> Rows:
     return _each(rows, lambda values: values[:38])
-
-
-def goes_elsewhere_in_the_end(rows: Rows) -> Rows:
-    return _shifted(rows, OPENS, LENGTH - 1)
-
-
-def puts_it_elsewhere(rows: Rows) -> Rows:
-    """And ends as far from there as always."""
-    return _shifted(rows, CLOSES, OPENS)
-
-
-def _shifted(rows: Rows, first: int, last: int) -> Rows:
-    way = np.clip((np.arange(LENGTH) - first) / (last - first), 0, 1)
-    for name in ("state", "action"):
-        rows[name][:, 1] += 0.5 * (3 * way**2 - 2 * way**3)
-    return rows
-
-
-def sees_little(rows: Rows) -> Rows:
-    """But for a shadow that moves."""
-    freezes(rows)
-    for t in range(24, 40):
-        rows["images"][t, 22:, 2 * (t - 24) : 2 * (t - 24) + 2] -= 20
-    return rows
-
-
-def is_copied(rows: Rows) -> Rows:
-    return demonstration(BAD - 2)
 
 
 def lacks_numbers(rows: Rows) -> Rows:
@@ -170,7 +122,7 @@ def scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[Call
         if spoil is not None:
             episodes[BAD] = spoil(episodes[BAD])
         root = write(tmp_path / "d", episodes)
-        assert exit_code("dataset", "score", str(root), "--workers", "1", "--json") == 0
+        assert exit_code("dataset", "score", str(root), "--json") == 0
         return json.loads(capsys.readouterr().out)["episodes"]
 
     return run
@@ -179,17 +131,12 @@ def scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[Call
 @pytest.mark.parametrize(
     ("spoil", "kinds", "frame"),
     [
-        (hesitates, {"pause", "time", "idle"}, 35),
-        (goes_aside, {"path", "course", "strokes"}, 38),
-        (loses_it, {"slip"}, 31),
-        (shakes, {"action noise"}, 30),
+        (hesitates, {"pause"}, 35),
+        (goes_aside, {"path"}, 38),
+        (shakes, {"noise"}, 30),
         (is_late, {"lag"}, 30),
-        (takes_the_other, {"instruction"}, 30),
-        (freezes, {"frozen"}, 32),
-        (ends_early, {"switches", "end"}, 37),
-        (goes_elsewhere_in_the_end, {"end"}, LENGTH - 1),
-        (is_copied, {"copy"}, 30),
-        (lacks_numbers, {"missing"}, 7),
+        (ends_early, {"switches"}, 37),
+        (lacks_numbers, {"flaw"}, 7),
     ],
 )
 def test_the_spoilt_episode_is_the_worst_and_says_why(
@@ -204,72 +151,10 @@ def test_the_spoilt_episode_is_the_worst_and_says_why(
     assert all(episode["score"] > 0.8 for episode in found if episode["episode_index"] != BAD)
 
 
-@pytest.mark.parametrize(("vary", "kind"), [(puts_it_elsewhere, "end"), (sees_little, "frozen")])
-def test_what_varies_honestly_is_not_blamed(scored: Any, vary: Callable[[Rows], Rows], kind: str) -> None:
-    assert kind not in {reason["kind"] for reason in scored(vary)[BAD]["reasons"]}
-
-
 def test_sound_episodes_are_sound(scored: Any) -> None:
     found = scored(None)
     assert [episode["episode_index"] for episode in found] == list(range(EPISODES_IN_ALL))
     assert all(episode["score"] > 0.8 and not episode["reasons"] for episode in found)
-
-
-def from_the_hand(number: int, color: tuple[int, int, int], task: str = "take the block") -> Rows:
-    """A demonstration as a camera on the hand sees it: the ground goes by, and what is held stands still."""
-    rng = np.random.default_rng(100 + number)
-    rows = demonstration(number)
-    ground = rng.integers(90, 160, (SIZE[1], 4 * LENGTH + SIZE[0], 1)).repeat(3, axis=2)
-    rows["images"] = np.stack([ground[:, 4 * t : 4 * t + SIZE[0]] for t in range(LENGTH)]).astype(np.uint8)
-    half = int(rng.integers(3, 6))
-    rows["images"][CLOSES:OPENS, 12 - half : 12 + half, 16 - half : 16 + half] = np.array(color) * rng.uniform(0.7, 1.1)
-    return {**rows, "task": np.array(task)}
-
-
-@pytest.fixture
-def held(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[list[Rows]], dict[int, Any]]:
-    """What is held in which episodes that is not what others hold: number -> the reason."""
-
-    def run(episodes: list[Rows]) -> dict[int, Any]:
-        root = write(tmp_path / "d", episodes)
-        assert exit_code("dataset", "score", str(root), "--workers", "1", "--json") == 0
-        found = json.loads(capsys.readouterr().out)["episodes"]
-        return {
-            episode["episode_index"]: reason
-            for episode in found
-            for reason in episode["reasons"]
-            if reason["kind"] == "held"
-        }
-
-    return run
-
-
-RED, BLUE, BLACK = (200, 30, 30), (30, 30, 200), (20, 20, 20)
-
-
-@pytest.mark.parametrize("other", [BLUE, BLACK])
-def test_what_holds_something_else_is_found(held: Any, other: tuple[int, int, int]) -> None:
-    found = held([from_the_hand(number, other if number == BAD else RED) for number in range(EPISODES_IN_ALL)])
-    assert list(found) == [BAD]
-    assert found[BAD]["factor"] < 0.5
-    assert (found[BAD]["first"], found[BAD]["last"]) == (CLOSES, OPENS - 1)
-
-
-def test_instructions_by_which_most_hold_the_same_are_compared(held: Any) -> None:
-    """A fifth of one that few have is wrong, which by itself would be as good as any other fifth."""
-    texts = ["grab the block" if number < BAD else "take the block" for number in range(EPISODES_IN_ALL)]
-    found = held([from_the_hand(n, BLACK if n == 1 else RED, text) for n, text in enumerate(texts)])
-    assert list(found) == [1]
-
-
-def test_things_that_differ_honestly_are_not_judged(held: Any) -> None:
-    colors = [RED, BLUE, BLACK, (30, 180, 30), (220, 200, 30), (220, 220, 220)]
-    assert not held([from_the_hand(number, colors[number % 6]) for number in range(EPISODES_IN_ALL)])
-
-
-def test_what_the_instruction_names_is_no_outlier(held: Any) -> None:
-    told = [(BLUE, "take the blue block") if number % 8 == 5 else (RED, "take the red block") for number in range(24)]
-    assert not held([from_the_hand(number, color, task) for number, (color, task) in enumerate(told)])
 
 
 @pytest.fixture
@@ -282,8 +167,8 @@ def late(tmp_path: Path) -> Path:
 
 def test_what_is_good_is_selected(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(tmp_path / "scores.json")
-    assert exit_code("dataset", "score", str(late), "--workers", "1", "--out", file) == 0
-    assert f"episode {BAD}: the state follows the action by -2.0 frames" in capsys.readouterr().out.splitlines()[0]
+    assert exit_code("dataset", "score", str(late), "--out", file) == 0
+    assert f"episode {BAD}: the state follows the action by -2 frames" in capsys.readouterr().out.splitlines()[0]
     good, same = str(tmp_path / "good"), str(tmp_path / "same")
     assert exit_code("dataset", "select", str(late), "--where", "score > 0.8", "--scores", file, "--out", good) == 0
     assert f"{EPISODES_IN_ALL - 1} episodes" in capsys.readouterr().out
@@ -302,4 +187,4 @@ def test_the_worst_is_shown_first(late: Path, tmp_path: Path, capsys: pytest.Cap
     page = (tmp_path / "page.html").read_text()
     first = page.partition('<section id="episodes">')[2].partition("<article")[2].partition("</article>")[0]
     assert f"episode {BAD}<" in first
-    assert "the state follows the action by -2.0 frames" in first
+    assert "the state follows the action by -2 frames" in first

@@ -22,7 +22,7 @@ from demorec.datasets.editing.plan import Cut, Plan, Source
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
-from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, THUMBNAILS_PATH, is_dataset_file
+from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
 from demorec.datasets.lerobot.reader import EpisodeRows
 from demorec.datasets.lerobot.robots import read_robot
 from demorec.datasets.lerobot.sidecar import (
@@ -233,7 +233,6 @@ def left_out(plan: Plan) -> tuple[str, ...]:
 
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
     cameras = {take.feature for take in plan.takes[number].values()}
-    proportions = [PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")]
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()
@@ -243,8 +242,6 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
             yield name, "of a kind that demorec does not know: copy it if it still holds"
         elif name in ABOUT_THE_WHOLE and len(plan.sources) > 1:
             yield name, "each of the datasets may have its own"
-        elif name == THUMBNAILS_PATH:
-            yield name, "it shows the episodes of the source"
         elif name.startswith("images/"):
             yield name, "no row has it"
         elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
@@ -253,7 +250,9 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
             yield name, "its camera is left out"
         elif name == PROGRESS_PATH and not keeps_progress:
             yield name, "not all datasets have progress with the same columns"
-        elif name in proportions and not (keeps_progress and _has_stages(plan)):
+        elif name.startswith("meta/temporal_proportions_") and not (
+            name == PROPORTIONS_PATH and keeps_progress and _has_stages(plan)
+        ):
             yield name, "they are those of the source's episodes together"
 
 

@@ -16,7 +16,7 @@ from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 
 if TYPE_CHECKING:
-    from demorec.annotate.grounding import SeenObject
+    from demorec.annotate.boxes import SeenObject
 
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
 
@@ -27,13 +27,12 @@ SeenByCamera = tuple[int, int, tuple[BoxEntry, ...]]
 """Width and height of a camera's images in an episode, px, and what is seen in them, row by row."""
 
 
-def box_entry(item: SeenObject, *, width: int, height: int) -> BoxEntry:
-    """What an image of that size (px) shows of one object."""
+def box_entry(item: SeenObject) -> BoxEntry:
+    """Return the box of an object as the file has it."""
     values = {
         "bbox": list(item.box),
         "area": item.area,
         "iscrowd": 0,
-        "segmentation": {"size": [height, width], "counts": coco_string(item.counts)},
         "object": item.name,
         "color": item.color,
         "visible_fraction": item.visible_fraction,
@@ -164,7 +163,7 @@ class _CameraFile:
         self._path, self._key, self._fps = path, key, fps
         self._annotations: IO[str] = path.open("w")
         self._images: IO[str] = path.with_suffix(".images").open("w+")
-        self._annotations.write('{"info": {"description": "boxes and masks from the simulator"},\n"annotations": [\n')
+        self._annotations.write('{"info": {"description": "boxes from the simulator"},\n"annotations": [\n')
         self._categories: dict[str, int] = {}
         self._num_annotations = 0
         self._num_images = 0
@@ -207,19 +206,3 @@ class _CameraFile:
     def close(self) -> None:
         self._annotations.close()
         self._images.close()
-
-
-def coco_string(counts: Sequence[int]) -> str:
-    """Run lengths in COCO's compressed form: differences to the one before the last (from the fourth on), in 5 bits."""
-    return "".join(_characters(counts))
-
-
-def _characters(counts: Sequence[int]) -> Iterator[str]:
-    for index, count in enumerate(counts):
-        value = count - counts[index - 2] if index > 2 else count
-        while True:
-            bits, value = value & 0x1F, value >> 5
-            more = value != (-1 if bits & 0x10 else 0)
-            yield chr(48 + bits + (0x20 if more else 0))
-            if not more:
-                break

@@ -131,8 +131,7 @@ def link_files(source: Path, target: Path) -> None:
 
     Only files that are never changed in place are linked; what the writer will write anew is left out.
     """
-    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH}
-    renewed |= {PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")}
+    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH, PROPORTIONS_PATH}
     for folder, _, names in os.walk(source):
         for name in names:
             path = Path(folder) / name

@@ -4,11 +4,11 @@ Facts are columns of the table that LeRobot filters episodes by (`episode_filter
 by the first episode, since all files of the table must have the same ones; an episode that lacks a value has null
 there. The sidecar (`demorec/episodes`) has everything, whatever the columns are. Progress and stages are:
 
-- `sarm_progress.parquet`: `progress_sparse` and `progress_dense` of every row of the dataset, which
-  `lerobot-train --sample_weighting.type=rabc` weighs samples by;
-- columns `sparse_subtask_names`, `..._start_frames`, `..._end_frames` and the same with `dense_` in the table of
-  episodes, which SARM is trained with;
-- `meta/temporal_proportions_sparse.json` and `_dense.json`: the stages' mean shares of the time.
+- `sarm_progress.parquet`: `progress_dense` of every row of the dataset, which
+  `lerobot-train --sample_weighting.type=rabc --sample_weighting.head_mode=dense` weighs samples by;
+- columns `dense_subtask_names`, `..._start_frames`, `..._end_frames` in the table of episodes, which SARM is trained
+  with (annotation_mode dense_only);
+- `meta/temporal_proportions_dense.json`: the stages' mean shares of the time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -31,8 +31,6 @@ from demorec.annotate.progress import (
     dense_stages,
     progress,
     proportions,
-    sparse_runs,
-    sparse_stages,
 )
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import sync_path
@@ -45,15 +43,11 @@ if TYPE_CHECKING:
     from demorec.mcap import Recording
 
 PROGRESS_PATH = "sarm_progress.parquet"
-PROPORTIONS_PATH = "meta/temporal_proportions_{head}.json"
-
-Head = Literal["sparse", "dense"]
-_HEADS: tuple[Head, Head] = ("sparse", "dense")
-_PARTS = ("subtask_names", "subtask_start_frames", "subtask_end_frames")
+PROPORTIONS_PATH = "meta/temporal_proportions_dense.json"
 STAGE_COLUMNS: dict[str, pa.DataType] = {
-    f"{head}_{part}": pa.list_(pa.string() if part == "subtask_names" else pa.int64())
-    for head in _HEADS
-    for part in _PARTS
+    "dense_subtask_names": pa.list_(pa.string()),
+    "dense_subtask_start_frames": pa.list_(pa.int64()),
+    "dense_subtask_end_frames": pa.list_(pa.int64()),
 }
 """Column of the table of episodes -> its type."""
 
@@ -68,38 +62,31 @@ class EpisodeProgress:
     """
 
     num_goals: int
-    dense: tuple[StageRun, ...]
+    runs: tuple[StageRun, ...]
 
-    def runs(self, head: Head) -> list[StageRun]:
-        """The stages as one of SARM's heads has them."""
-        return list(self.dense) if head == "dense" else sparse_runs(self.dense)
-
-    def stages(self, head: Head) -> tuple[str, ...]:
-        """All stages that an episode of so many goals has."""
-        if self.dense[0].stage == WHOLE_TASK:
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """All stages of an episode with this number of goals."""
+        if self.runs[0].stage == WHOLE_TASK:
             return (WHOLE_TASK,)
-        return dense_stages(self.num_goals, self.dense) if head == "dense" else sparse_stages(self.num_goals)
+        return dense_stages(self.num_goals, self.runs)
 
     def row(self) -> dict[str, Any]:
-        """Its entries in the table of episodes."""
-        row: dict[str, Any] = {}
-        for head in _HEADS:
-            runs = self.runs(head)
-            parts = ([run.stage for run in runs], [run.first for run in runs], [run.last for run in runs])
-            row.update({f"{head}_{name}": values for name, values in zip(_PARTS, parts, strict=True)})
-        return row
+        """Return its entries in the table of episodes."""
+        parts = ([run.stage for run in self.runs], [run.first for run in self.runs], [run.last for run in self.runs])
+        return dict(zip(STAGE_COLUMNS, parts, strict=True))
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any], num_goals: int) -> EpisodeProgress:
         """Inverse of `row`; ValueError, TypeError or KeyError for what is none."""
-        names, starts, ends = (row[f"dense_{part}"] for part in _PARTS)
+        names, starts, ends = (row[name] for name in STAGE_COLUMNS)
         runs = tuple(
             StageRun(stage=str(name), first=int(first), last=int(last))
             for name, first, last in zip(names, starts, ends, strict=True)
         )
         if not runs or runs[0].first != 0 or any(b.first != a.last + 1 for a, b in pairwise(runs)):
             raise ValueError("stages that leave gaps")
-        return cls(num_goals=num_goals, dense=runs)
+        return cls(num_goals=num_goals, runs=runs)
 
 
 def read_progress(root: Path) -> list[EpisodeProgress]:
@@ -118,35 +105,34 @@ def read_progress(root: Path) -> list[EpisodeProgress]:
 
 
 def progress_table(episodes: Sequence[EpisodeProgress]) -> pa.Table:
-    """`index`, `episode_index`, `frame_index`, `progress_sparse`, `progress_dense` (0..1) of every row."""
-    lengths = [episode.dense[-1].last + 1 for episode in episodes]
-    columns: dict[str, Any] = {
-        "index": np.arange(sum(lengths)),
-        "episode_index": np.repeat(np.arange(len(lengths)), lengths),
-        "frame_index": np.concatenate([np.arange(length) for length in lengths]),
-    }
-    for head in _HEADS:
-        share = _proportions(episodes, head)
-        parts = [progress(episode.runs(head), episode.stages(head), share) for episode in episodes]
-        columns[f"progress_{head}"] = np.concatenate(parts).astype(np.float32)
-    return pa.table(columns)
+    """`index`, `episode_index`, `frame_index` and `progress_dense` (0..1) of every row."""
+    lengths = [episode.runs[-1].last + 1 for episode in episodes]
+    share = _proportions(episodes)
+    parts = [progress(episode.runs, episode.stages, share) for episode in episodes]
+    return pa.table(
+        {
+            "index": np.arange(sum(lengths)),
+            "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+            "frame_index": np.concatenate([np.arange(length) for length in lengths]),
+            "progress_dense": np.concatenate(parts).astype(np.float32),
+        }
+    )
 
 
 def write_progress(root: Path) -> None:
-    """Write the files of a whole dataset, durably, from the stages in its table of episodes."""
+    """Write both files of a whole dataset, durably, from the stages in its table of episodes."""
     episodes, path = read_progress(root), root / PROGRESS_PATH
     pq.write_table(progress_table(episodes), path, use_dictionary=["episode_index"])
     sync_path(path)
-    for head in _HEADS:
-        file = root / PROPORTIONS_PATH.format(head=head)
-        file.write_text(json.dumps(_proportions(episodes, head), indent=2) + "\n")
-        sync_path(file)
+    file = root / PROPORTIONS_PATH
+    file.write_text(json.dumps(_proportions(episodes), indent=2) + "\n")
+    sync_path(file)
 
 
-def _proportions(episodes: Sequence[EpisodeProgress], head: Head) -> dict[str, float]:
-    """Of the stages of the episode that has most, and of those whose phases nobody knows."""
-    stages = tuple(dict.fromkeys(stage for episode in episodes for stage in episode.stages(head)))
-    return proportions([episode.runs(head) for episode in episodes], stages)
+def _proportions(episodes: Sequence[EpisodeProgress]) -> dict[str, float]:
+    """Return the mean share of every stage that an episode has."""
+    stages = tuple(dict.fromkeys(stage for episode in episodes for stage in episode.stages))
+    return proportions([episode.runs for episode in episodes], stages)
 
 
 _TYPES: dict[str, pa.DataType] = {

@@ -18,9 +18,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.annotate import STATES
 from demorec.core.errors import ExportError, describe_error
-from demorec.episode.features import IMAGE_PREFIX
 
 if TYPE_CHECKING:
     from demorec.annotate import Statement
@@ -55,34 +53,26 @@ class EpisodeLanguage:
     Attributes:
         persistent: What stands in every row; of one that was read, in the first.
         events: Row -> what stands in it alone, of rows in which anything does.
-        num_rows, differing: Only of one that was read: how many rows it has, and in which of them
-            `language_persistent` is not that of the first.
     """
 
     persistent: Sequence[dict[str, Any]] = ()
     events: Mapping[int, Sequence[dict[str, Any]]] = field(default_factory=dict)
-    num_rows: int = 0
-    differing: Sequence[int] = ()
 
 
 def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLanguage:
     """The statements in LeRobot's form; times are bit-exact those of the `timestamp` column."""
-    persistent: list[dict[str, Any]] = []
-    events: dict[int, list[dict[str, Any]]] = {}
-    for statement in statements:
-        is_state = statement.kind in STATES
-        is_answer = statement.kind == "interjection" and statement.role == "assistant"  # a call of a tool, in LeRobot
-        call = {"type": "function", "function": {"name": "say", "arguments": {"text": statement.text}}}
-        entry = {
+    persistent = [
+        {
             "role": statement.role,
-            "content": None if is_answer else statement.text,
-            "style": None if is_answer else statement.kind,
-            **({"timestamp": float(np.float32(statement.row / fps))} if is_state else {}),
-            "camera": None if statement.camera is None else IMAGE_PREFIX + statement.camera,
-            "tool_calls": [json.dumps(call)] if is_answer else None,
+            "content": statement.text,
+            "style": statement.kind,
+            "timestamp": float(np.float32(statement.row / fps)),
+            "camera": None,
+            "tool_calls": None,
         }
-        (persistent if is_state else events.setdefault(statement.row, [])).append(entry)
-    return EpisodeLanguage(persistent=persistent, events=events)
+        for statement in statements
+    ]
+    return EpisodeLanguage(persistent=persistent)
 
 
 def language_feature(name: str) -> dict[str, Any]:
@@ -184,22 +174,18 @@ def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> EpisodeLanguage:
     """
     said: list[dict[str, Any]] = []
     events: dict[int, list[dict[str, Any]]] = {}
-    differing: list[int] = []
-    number, first = 0, None
+    number = 0
     try:
         for batch in batches:
             persistent, of_rows = (batch.column(name) for name in COLUMNS)
             if not is_language(persistent.type) or not is_language(of_rows.type):
                 raise ValueError("language columns of another type")
             for row in range(len(batch)):
-                state = persistent[row].values
                 if not number:
-                    said, first = persistent[row].as_py() or [], state
-                elif (state is None) != (first is None) or (state is not None and not state.equals(first)):
-                    differing.append(number)
+                    said = persistent[row].as_py() or []
                 if found := of_rows[row].as_py():
                     events[number] = found
                 number += 1
     except (ValueError, pa.ArrowException) as error:
         raise ExportError(f"The language of the dataset cannot be read ({describe_error(error)}): {path}") from error
-    return EpisodeLanguage(persistent=said, events=events, num_rows=number, differing=differing)
+    return EpisodeLanguage(persistent=said, events=events)

@@ -31,13 +31,12 @@ class ExportOptions(CommonOptions):
     says)."""
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: say in words what the robot does, from what was recorded. Named kinds alone
-    (subtask plan memory motion task_aug vqa trace interjection), or all that the recordings support."""
+    (subtask plan memory motion task_aug), or all that the recordings support."""
     progress: bool = False
     """Add how far each frame has come (0 to 1) and the stages of the task, where LeRobot's sample weighting and SARM
     look for them."""
     boxes: bool = False
-    """Write boxes and masks of what the cameras see beside the dataset, in COCO's format (of recordings with
-    segmentation)."""
+    """Write boxes of what the cameras see beside the dataset, in COCO's format (of recordings with segmentation)."""
     repo_id: str = "local/demorec"
     """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False

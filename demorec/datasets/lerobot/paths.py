@@ -13,7 +13,6 @@ SIDECAR_DIR = "demorec"
 """Folder inside the dataset for what LeRobot has no place for."""
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
 """Where the card goes if the dataset has a README.md that demorec did not write."""
-THUMBNAILS_PATH = f"{SIDECAR_DIR}/thumbnails.jpg"
 
 
 def is_dataset(path: Path) -> bool:
@@ -35,7 +34,7 @@ _PARTS = re.compile(
     rf"|{SIDECAR_DIR}/(episodes|attempts|camera_poses)/chunk-\d+/file-\d+\.parquet"
     rf"|{SIDECAR_DIR}/boxes/[^/]+\.json"
     rf"|{SIDECAR_DIR}/robots/[0-9a-f]{{16}}\.(json|urdf)"
-    rf"|{SIDECAR_DIR}/(configs\.json|export\.json|thumbnails\.jpg|README\.md)"
+    rf"|{SIDECAR_DIR}/(configs\.json|export\.json|README\.md)"
     r"|README\.md|\.gitattributes|\.cache/huggingface/.*"
 )
 """Files of a dataset in LeRobot's formats 2.0 to 3.0, of ours, and of the Hub's."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from demorec.annotate import Statement
-from demorec.annotate.grounding import seen_objects
-from demorec.annotate.narration import narrate
+from demorec.annotate.attempts import episode_timeline
+from demorec.annotate.boxes import seen_objects
 from demorec.annotate.progress import dense_runs
-from demorec.annotate.tries import story_of
+from demorec.annotate.statements import episode_statements
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
@@ -62,14 +62,11 @@ def reasons_to_transcode(episode: ExportEpisode) -> dict[ExportCamera, str]:
     return {camera: reason_to_transcode(episode, camera) for camera in episode.cameras if not camera.is_depth}
 
 
-def prepare_episode(
-    episode: ExportEpisode, options: ExportOptions, *, encode_depth: bool = True, about: Collection[int] | None = None
-) -> EpisodeData:
+def prepare_episode(episode: ExportEpisode, options: ExportOptions, *, encode_depth: bool = True) -> EpisodeData:
     """Read an episode into memory, as the dataset wants it.
 
     Args:
         encode_depth: Whether depth videos, which must be encoded, are made.
-        about: The rows whose images are spoken of, if language is asked for; None for all.
 
     Raises:
         ConfigError: A kind of image is missing that was asked for.
@@ -95,12 +92,12 @@ def prepare_episode(
         videos=videos,
         video_info={key: wanted[key].info or {} for key in videos},
         pixels=pixels,
-        language=_language(episode, options, about),
+        language=_language(episode, options),
         facts=_facts(episode, options),
     )
 
 
-def _language(episode: ExportEpisode, options: ExportOptions, about: Collection[int] | None) -> EpisodeLanguage:
+def _language(episode: ExportEpisode, options: ExportOptions) -> EpisodeLanguage:
     """What the dataset shall say about the episode; nothing unless it was asked for."""
     if options.language is None:
         return EpisodeLanguage()
@@ -110,13 +107,7 @@ def _language(episode: ExportEpisode, options: ExportOptions, about: Collection[
             Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in recording.subtasks
         ]
         return episode_language(stated, fps=episode.fps)
-    cameras = [camera for camera in recording.cameras if options.takes(IMAGE_PREFIX + camera)]
-    if "vqa" in (options.language or ()) and not any(map(recording.has_segmentation, cameras)):
-        raise ConfigError(
-            "Questions about images (vqa) need recordings with segmentation (generate --segmentation), leave them "
-            f"out: {recording.path}"
-        )
-    statements = narrate(recording, episode.columns, episode.rows, options.spoken, cameras, about=about)
+    statements = episode_statements(recording, episode.columns, episode.rows, options.spoken)
     return episode_language(statements, fps=episode.fps)
 
 
@@ -126,9 +117,9 @@ def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
         return {}
     facts = episode_facts(episode.recording, episode.columns)
     if options.progress:
-        runs = dense_runs(story_of(episode.recording, episode.columns), episode.rows)
+        runs = dense_runs(episode_timeline(episode.recording, episode.columns), episode.rows)
         num_goals = len(episode.info.scene.goals)
-        facts |= EpisodeProgress(num_goals=num_goals, dense=tuple(runs)).row()
+        facts |= EpisodeProgress(num_goals=num_goals, runs=tuple(runs)).row()
     return facts
 
 
@@ -144,9 +135,8 @@ def episode_boxes(episode: ExportEpisode) -> dict[str, SeenByCamera]:
         for camera in episode.info.scene.cameras:
             if camera.name in taken and episode.recording.has_segmentation(camera.name):
                 seen = seen_objects(episode.recording, episode.columns, episode.rows, camera)
-                width, height = camera.width, camera.height
-                entries = tuple(box_entry(item, width=width, height=height) for item in seen)
-                boxes[IMAGE_PREFIX + camera.name] = width, height, entries
+                entries = tuple(box_entry(item) for item in seen)
+                boxes[IMAGE_PREFIX + camera.name] = camera.width, camera.height, entries
     if not boxes:
         raise ConfigError(
             "Boxes need recordings with segmentation (generate --segmentation), leave them out: "
