@@ -19,9 +19,9 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError
-from demorec.learn.training.columns import Column, Statements, is_statements, numbers
-from demorec.learn.training.images import ImageReader
+from lerobot_policy_act_keypoints.columns import Column, Statements, is_statements, numbers
+from lerobot_policy_act_keypoints.errors import RequestError
+from lerobot_policy_act_keypoints.images import ImageReader
 
 INTERVENTION = "intervention"
 """Column of LeRobot's DAgger: true where the expert acts in an episode that a policy began."""
@@ -320,7 +320,7 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
         **kwargs: As of `LeRobotDataset`.
 
     Raises:
-        ConfigError: Only the expert's frames are wanted, and the dataset does not state which these are.
+        RequestError: Only the expert's frames are wanted, and the dataset does not state which these are.
     """
 
     _frame_cache_bytes = DEFAULT_CACHE_BYTES
@@ -333,7 +333,7 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
         self._expert_only = expert_only
         super().__init__(*args, **kwargs)
         if expert_only and INTERVENTION not in self.meta.features:
-            raise ConfigError(
+            raise RequestError(
                 f"The dataset does not state which frames are the expert's: export it with --intervention: {self.root}"
             )
 

@@ -1,4 +1,4 @@
-"""Training the image encoder of a policy before the policy itself.
+"""Pretraining of the image encoder of a policy.
 
     OUT/pretraining.json    the settings that decide the result; at the end also the result
     OUT/unfinished.pt       weights and optimizer, until it is done
@@ -26,12 +26,12 @@ from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
-from demorec.core.errors import ConfigError, DemorecError, describe_error
-from demorec.core.files import LOCK_NAME, read_json_object, replace_text, run_lock
-from demorec.learn.training.columns import numbers
-from demorec.learn.training.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
-from demorec.learn.training.reader import INTERVENTION, FastDataset, expert_acts
-from demorec.lerobot_policy import vocabulary_of
+from lerobot_policy_act_keypoints.columns import numbers
+from lerobot_policy_act_keypoints.errors import RequestError, TrainingError
+from lerobot_policy_act_keypoints.files import LOCK_NAME, atomic_write, folder_lock
+from lerobot_policy_act_keypoints.keyframes import KeyframeTargets, find_keyframes, keyframe_targets
+from lerobot_policy_act_keypoints.modeling_act_keypoints import vocabulary_of
+from lerobot_policy_act_keypoints.reader import INTERVENTION, FastDataset, expert_acts
 
 RESULT_NAME, UNFINISHED_NAME = "pretraining.json", "unfinished.pt"
 _STATE, _EE_POSE, _ACTION = "observation.state", "observation.ee_pose", "action"
@@ -107,18 +107,18 @@ def pretrain(
         save_every: Updates from one to the next state that a stopped call can go on from.
 
     Raises:
-        ConfigError: The policy is of another type, the dataset has no images or no TCP poses, or
+        RequestError: The policy is of another type, the dataset has no images or no TCP poses, or
             the folder holds something else.
-        DemorecError: What is in the folder is damaged.
+        TrainingError: What is in the folder is damaged.
     """
     if getattr(config.policy, "type", None) != "act_keypoints":
-        raise ConfigError("Only the encoder of one type of policy can be pretrained: --policy.type=act_keypoints.")
+        raise RequestError("Only the encoder of one type of policy can be pretrained: --policy.type=act_keypoints.")
     chosen = config.dataset
     changes = chosen.image_transforms if chosen.image_transforms.enable else None
     dataset = _opened(chosen, changes, frame_cache_bytes)
     targets = read_targets(dataset)
     if not dataset.meta.camera_keys:
-        raise ConfigError(f"The dataset has no images to learn from: {dataset.root}")
+        raise RequestError(f"The dataset has no images to learn from: {dataset.root}")
     settings = {
         **asdict(plan),
         "dataset": _digest(dataset),
@@ -127,8 +127,9 @@ def pretrain(
         "image_transforms": changes and json.loads(json.dumps(asdict(changes))),
         "targets": list(targets.names),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    with run_lock(out):
+    if out.resolve().is_relative_to(Path(dataset.root).resolve()):
+        raise RequestError(f"The folder is inside the dataset, choose another --out: {out}")
+    with folder_lock(out):
         finished = _settle(out, settings)
         if finished is not None:
             return finished
@@ -138,7 +139,7 @@ def pretrain(
         training.finish_targets(on_progress)
         result = training.evaluate(time.process_time() - started)
         training.save(out)
-        replace_text(out / RESULT_NAME, json.dumps({"settings": settings, "result": asdict(result)}, indent=1))
+        atomic_write(out / RESULT_NAME, json.dumps({"settings": settings, "result": asdict(result)}, indent=1))
         (out / UNFINISHED_NAME).unlink(missing_ok=True)
         return result
 
@@ -159,16 +160,15 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
     """What is to be predicted for each row of a dataset.
 
     Raises:
-        ConfigError: The dataset lacks the TCP's pose or the commanded opening.
+        RequestError: The dataset lacks the TCP's pose or the commanded opening.
     """
     features = dataset.meta.features
     pose = next((name for name in (_EE_POSE, _STATE) if set(_TCP) <= set(_names(features.get(name)))), None)
     if pose is None or _OPENING not in _names(features.get(_ACTION)):
         missing = f"an action {_OPENING}" if pose else f"{_TCP[0]} to {_TCP[-1]} in {_EE_POSE} or {_STATE}"
-        raise ConfigError(
-            f"The dataset lacks {missing}, so where the hand will grasp is unknown: demorec export lerobot "
-            "--state joint_ee has both; for recordings from elsewhere, a mapping's `names` name these numbers: "
-            f"{dataset.root}"
+        raise RequestError(
+            f"The dataset lacks {missing}, so where the hand will grasp is unknown: name the elements so (demorec export "
+            f"lerobot --state joint_ee does): {dataset.root}"
         )
     places = [_names(features[pose]).index(name) for name in _TCP]
     tcp = _column(dataset, pose)[:, places]
@@ -327,7 +327,7 @@ class _EncoderTraining:
             self._optimizer.load_state_dict(state["optimizer"])
             self._done, self._loss = int(state["done"]), float(state["loss"])
         except Exception as error:  # whatever a damaged file makes of torch
-            raise DemorecError(f"What a stopped call left is damaged, delete it to begin anew: {path}") from error
+            raise TrainingError(f"What a stopped call left is damaged, delete it to begin anew: {path}") from error
 
 
 def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
@@ -335,11 +335,11 @@ def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
     episodes.
 
     Raises:
-        ConfigError: There are fewer than two episodes.
+        RequestError: There are fewer than two episodes.
     """
     numbers_of = np.unique(episode)
     if len(numbers_of) < 2:
-        raise ConfigError(
+        raise RequestError(
             f"The gripper is commanded to close or to open in {len(numbers_of)} of the dataset's episodes: at least 2 "
             "are needed, one of which is held out."
         )
@@ -353,17 +353,17 @@ def _settle(out: Path, settings: dict[str, Any]) -> PretrainResult | None:
     path = out / RESULT_NAME
     if not path.exists():
         if strangers := [each.name for each in out.iterdir() if each.name != LOCK_NAME]:
-            raise ConfigError(f"The folder holds something else ({strangers[0]}), choose another --out: {out}")
-        replace_text(path, json.dumps({"settings": settings}, indent=1))
+            raise RequestError(f"The folder holds something else ({strangers[0]}), choose another --out: {out}")
+        atomic_write(path, json.dumps({"settings": settings}, indent=1))
         return None
     try:
-        written = read_json_object(path)
+        written = json.loads(path.read_text())
         result = PretrainResult(**written["result"]) if "result" in written else None
         others = sorted(name for name in settings if written["settings"].get(name) != settings[name])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DemorecError(f"{RESULT_NAME} is damaged ({describe_error(error)}): {path}") from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise TrainingError(f"{RESULT_NAME} is damaged, delete the folder to start again: {path}") from error
     if others:
-        raise ConfigError(
+        raise RequestError(
             f"Another encoder is pretrained in this folder (another {', another '.join(others)}), choose another "
             f"--out: {out}"
         )
@@ -392,7 +392,7 @@ def _column(dataset: FastDataset, name: str) -> NDArray[Any]:
     table = dataset.hf_dataset.with_format("arrow").select_columns([name])[:]
     column = numbers(table.column(name))
     if column is None:
-        raise ConfigError(f"The feature {name} of the dataset holds more than numbers: {dataset.root}")
+        raise RequestError(f"The feature {name} of the dataset holds more than numbers: {dataset.root}")
     return column.take(np.arange(len(column)))
 
 

@@ -1,34 +1,29 @@
-"""A policy of LeRobot: ACT that gets keypoints in place of images.
+"""ACT that gets keypoints instead of images.
 
-    lerobot-eval --env.discover_packages_path=demorec.lerobot_env --env.type=demorec --policy.path=...
-
-Importing this package makes the policy known to LeRobot, which finds the parts below by their names.
-
-ACT's own ResNet gives maps of features, in which a place is hard to read to the millimetre. Here a small convolutional
-network makes a few maps of each image, and the policy gets the place that each map points at: its expectation under a
-softmax over the map (Finn et al., "Deep Spatial Autoencoders for Visuomotor Learning", 2016). Where episodes have
-different instructions, the instruction scales and shifts the network's last features (FiLM: Perez et al., 2018), so
-that a map can look for the thing that is named. What the network learns, before the policy does, is in
-`demorec.learn.training.pretrain`.
+ACT's own ResNet gives maps of features, from which a position is hard to read to the millimetre. Here a small
+convolutional network makes a few maps of each image, and the policy gets the position that each map points at: its
+expectation under a softmax over the map (Finn et al., "Deep Spatial Autoencoders for Visuomotor Learning", 2016). Where
+episodes have different instructions, the instruction scales and shifts the network's last features (FiLM: Perez et al.,
+2018), so that a map can look for the object that is named. The network is trained before the policy, by `pretrain`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACT, ACTPolicy
-from lerobot.policies.act.processor_act import make_act_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import nn
 
-__all__ = ["ActKeypointsConfig", "ActKeypointsPolicy", "KeypointEncoder", "make_act_keypoints_pre_post_processors"]
+from lerobot_policy_act_keypoints.configuration_act_keypoints import ActKeypointsConfig
+
+__all__ = ["ActKeypointsPolicy", "KeypointEncoder", "vocabulary_of"]
 
 _HIDDEN = 256
 _WORD_SIZE, _INSTRUCTION_SIZE = 32, 64
@@ -37,37 +32,6 @@ _HEIGHT_SCALE = 0.1
 """Of a map's maximum, beside its coordinates, which lie in [-1, 1]."""
 _LEAST_STD = 1e-4
 """By which what hardly changes is divided."""
-
-
-@PreTrainedConfig.register_subclass("act_keypoints")
-@dataclass
-class ActKeypointsConfig(ACTConfig):  # type: ignore[misc]
-    """Flags `--policy.NAME=...`: those of ACT, of which the ones about the ResNet mean nothing here.
-
-    Attributes:
-        num_keypoints: Maps of each camera.
-        encoder_channels: Of the first convolutions; the later ones have twice as many.
-        num_targets: Numbers that the encoder predicts beside the keypoints; set by `demorec pretrain`.
-        vocabulary: Words of instructions that the encoder reads; none where all episodes have the same instruction; set
-            by `demorec pretrain`.
-        normalization_mapping: The encoder normalises its inputs by the dataset that it was trained on. LeRobot would by
-            each dataset that the policy is trained on, and images by ImageNet.
-    """
-
-    num_keypoints: int = 32
-    encoder_channels: int = 32
-    num_targets: int = 0
-    vocabulary: tuple[str, ...] = ()
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.IDENTITY,
-            "ACTION": NormalizationMode.MEAN_STD,
-        }
-    )
-
-
-make_act_keypoints_pre_post_processors = make_act_pre_post_processors
 
 
 def vocabulary_of(instructions: Iterable[str]) -> tuple[str, ...]:
