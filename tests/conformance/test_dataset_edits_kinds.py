@@ -15,7 +15,7 @@ from av.video.stream import VideoStream
 from support.check import checked
 from support.commands import exit_code
 from support.datasets import TOP, items, same, write_with_lerobot
-from support.training import DEPTH, write_by_lerobot
+from lerobot_datasets import DEPTH, write_by_lerobot
 
 pytestmark = [
     pytest.mark.slow,

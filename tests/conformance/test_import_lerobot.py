@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 from support.export import data_table, export, make_run, recordings
-from support.training import CAMERA, DEPTH, write_by_lerobot
+from lerobot_datasets import CAMERA, DEPTH, write_by_lerobot
 
 from demorec.cli import main
 from demorec.core.errors import DemorecError

@@ -327,7 +327,7 @@ class _EncoderTraining:
             self._optimizer.load_state_dict(state["optimizer"])
             self._done, self._loss = int(state["done"]), float(state["loss"])
         except Exception as error:  # whatever a damaged file makes of torch
-            raise TrainingError(f"What a stopped call left is damaged, delete it to begin anew: {path}") from error
+            raise TrainingError(f"What a stopped call left is damaged, delete it to start again: {path}") from error
 
 
 def split(episode: NDArray[np.integer]) -> tuple[Rows, Rows, int]:
