@@ -16,9 +16,9 @@ from support.lerobot_tools import Command, plugin_names, run_commands
 
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
-from lerobot_robot_demorec import DemorecPanda, DemorecPandaConfig, DemorecSO101, DemorecSO101Config
 from demorec.mcap import Recording
 from demorec.robots.motors import CALIBRATIONS
+from lerobot_robot_demorec import DemorecPanda, DemorecPandaConfig, DemorecSO101, DemorecSO101Config
 
 SEED = 11
 NAMES = tuple(

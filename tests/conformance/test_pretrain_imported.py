@@ -9,9 +9,10 @@ import h5py
 import numpy as np
 import pytest
 from lerobot_datasets import SMALL_ACT
-from lerobot_policy_act_keypoints.commands import act_keypoints_pretrain
 from numpy.typing import NDArray
 from support.commands import exit_code
+
+from lerobot_policy_act_keypoints.commands import act_keypoints_pretrain
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache", "hdf5_read_here")
 

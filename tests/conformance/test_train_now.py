@@ -1,4 +1,4 @@
-"""What README's "Train now" runs: lerobot-train with the settings of examples/, and the policies that evaluate finds."""
+"""README's "Train now": lerobot-train with the settings of examples/, and policies of plug-ins in `evaluate`."""
 
 from __future__ import annotations
 

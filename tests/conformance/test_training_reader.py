@@ -32,6 +32,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pair(root: Path, **arguments: Any) -> tuple[Any, Any]:
     """Open both readers with the same arguments."""
     from lerobot.datasets import LeRobotDataset
+
     from lerobot_policy_act_keypoints import FastDataset
 
     arguments = {"root": root, "video_backend": "pyav", "return_uint8": True, **arguments}
@@ -52,7 +53,7 @@ def assert_same(fast: Any, slow: Any) -> None:
 def test_every_window_is_equal(as_bytes: bool, root: Path) -> None:
     _, plain = pair(root)
     keys = [key for key in plain.meta.features if key.startswith("observation.")]
-    windows = {**dict.fromkeys(keys, [-2 / 30, 0.0]), "action": [k / 30 for k in range(16)]}
+    windows = {**{key: [-2 / 30, 0.0] for key in keys}, "action": [k / 30 for k in range(16)]}
     assert_same(*pair(root, delta_timestamps=windows, return_uint8=as_bytes))
 
 
@@ -112,4 +113,4 @@ def _plain_state(kind: pa.ListType) -> pa.StructType:
 
 
 def test_the_example_of_the_docs_runs(root: Path) -> None:
-    assert run_examples("docs/training.md", "FastDataset", {"recordings/demo/dataset": root}) == 1
+    assert run_examples("plugins/lerobot_policy_act_keypoints/README.md", "FastDataset", {"recordings/demo/dataset": root}) == 1

@@ -42,7 +42,14 @@ from demorec.generate.executor import Raised
 from demorec.generate.local import LocalExecutor
 from demorec.gym_env import DemorecEnv
 from demorec.learn.evaluate import TakeOver
-from demorec.learn.evaluate.policy import Policy, check_steps, find_checkpoint, policy_config, policy_digest, trained_action
+from demorec.learn.evaluate.policy import (
+    Policy,
+    check_steps,
+    find_checkpoint,
+    policy_config,
+    policy_digest,
+    trained_action,
+)
 from demorec.learn.evaluate.statistics import Rate, factors_of
 from demorec.learn.evaluate.turns import Turns
 from demorec.learn.evaluate.watch import correcting_behaviour

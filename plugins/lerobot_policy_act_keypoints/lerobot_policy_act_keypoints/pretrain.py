@@ -167,8 +167,8 @@ def read_targets(dataset: FastDataset) -> KeyframeTargets:
     if pose is None or _OPENING not in _names(features.get(_ACTION)):
         missing = f"an action {_OPENING}" if pose else f"{_TCP[0]} to {_TCP[-1]} in {_EE_POSE} or {_STATE}"
         raise RequestError(
-            f"The dataset lacks {missing}, so where the hand will grasp is unknown: name the elements so (demorec export "
-            f"lerobot --state joint_ee does): {dataset.root}"
+            f"The dataset lacks {missing}, so where the hand will grasp is unknown: name the elements so, as "
+            f"demorec export lerobot --state joint_ee does: {dataset.root}"
         )
     places = [_names(features[pose]).index(name) for name in _TCP]
     tcp = _column(dataset, pose)[:, places]

@@ -66,9 +66,7 @@ def test_where_a_policy_closed_and_was_corrected_is_no_keyframe(tmp_path: Path) 
     corrected = [False] * 4 + [True] * 8  # first the policy closes
     ahead = {}
     for name in ("d", "silent"):
-        root = write(
-            tmp_path / name, DEMONSTRATION, corrected, openings=closes_and_opens, corrected=name == "d"
-        )
+        root = write(tmp_path / name, DEMONSTRATION, corrected, openings=closes_and_opens, corrected=name == "d")
         targets = read_targets(FastDataset("local/d", root=root))
         columns = [targets.names.index(f"{command}.x") for command in ("closing", "opening")]
         ahead[name] = ~np.isnan(targets.values[:, columns])

@@ -25,11 +25,11 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Outcome
 from demorec.episode.features import state_names
 from demorec.gym_env import DemorecEnv
-from lerobot_robot_demorec.config import DemorecPandaConfig, DemorecSO101Config, SimulatedArmConfig
 from demorec.mcap import EpisodeWriter
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
 from demorec.robots.so101 import SO101_FOLLOWER
+from lerobot_robot_demorec.config import DemorecPandaConfig, DemorecSO101Config, SimulatedArmConfig
 
 __all__ = ["DemorecPanda", "DemorecPandaConfig", "DemorecSO101", "DemorecSO101Config"]
 
