@@ -113,4 +113,7 @@ def _plain_state(kind: pa.ListType) -> pa.StructType:
 
 
 def test_the_example_of_the_docs_runs(root: Path) -> None:
-    assert run_examples("plugins/lerobot_policy_act_keypoints/README.md", "FastDataset", {"recordings/demo/dataset": root}) == 1
+    assert (
+        run_examples("plugins/lerobot_policy_act_keypoints/README.md", "FastDataset", {"recordings/demo/dataset": root})
+        == 1
+    )

@@ -74,7 +74,7 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
     try:
         with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err):
-            return tyro.cli(  # type: ignore[call-overload]  # which knows True and False, but no bool
+            return tyro.cli(
                 command,
                 args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
                 prog=prog,
