@@ -1,4 +1,4 @@
-"""What an image encoder learns to predict before the policy is trained: where the hand will be at its next keyframes.
+"""Targets of the image encoder's pretraining: the hand's poses at its next keyframes.
 
 A keyframe is a moment at which the gripper is commanded to close or to open (James and Davison, "Q-attention", 2021;
 PerAct, Shridhar et al., 2022). Keyframes follow from the robot's own poses and commands, which real recordings have,
@@ -23,12 +23,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KeyframeTargets:
-    """What an image encoder learns to predict for each frame.
+    """Targets of the image encoder for each frame.
 
     Attributes:
         values: (N, K) metres, and sines and cosines of angles; NaN where no such keyframe is ahead.
-        names: Of the components.
-        offsets: (N, 3) places of the offset from the TCP to the keyframe that comes first, base frame, x, y, z.
+        names: Names of the components.
+        offsets: (N, 3) indices of the components that hold the offset from the TCP to the earlier keyframe (x, y, z in
+            the base frame).
     """
 
     values: NDArray[np.float32]
@@ -37,14 +38,14 @@ class KeyframeTargets:
 
 
 def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The next frames at which the gripper is commanded to close, and to open.
+    """Find the next frames at which the gripper is commanded to close, and to open.
 
     Args:
-        opening: (N,) commanded opening, in any unit. It is open above the middle of all that is commanded.
-        episode: (N,) number of each frame's episode; its frames follow one another.
+        opening: (N,) commanded opening, in any unit. Open is above the middle of its range.
+        episode: (N,) number of each frame's episode; the frames of an episode are contiguous.
 
     Returns:
-        (N, 2) indices of the next closing and of the next opening; -1 where the episode has none ahead.
+        (N, 2) indices of the next closing and of the next opening; -1 if the episode has none ahead.
     """
     is_open = opening > (opening.min() + opening.max()) / 2
     changes = np.flatnonzero((np.diff(is_open) != 0) & (np.diff(episode) == 0)) + 1
@@ -58,12 +59,12 @@ def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) 
 def keyframe_targets(
     position: NDArray[np.floating], quat_xyzw: NDArray[np.floating], keyframes: NDArray[np.int64]
 ) -> KeyframeTargets:
-    """The hand's poses at its next keyframes, as they are and as seen from where it is now.
+    """Compute the hand's poses at its next keyframes, absolute and relative to its current pose.
 
     Args:
-        position: (N, 3) of the TCP, metres, base frame.
-        quat_xyzw: (N, 4) of the TCP, base frame.
-        keyframes: As of `find_keyframes`.
+        position: (N, 3) position of the TCP, metres, base frame.
+        quat_xyzw: (N, 4) orientation of the TCP, base frame.
+        keyframes: Result of `find_keyframes`.
     """
     xyz = position.astype(np.float64)
     yaw = _yaw(quat_xyzw.astype(np.float64))
@@ -93,7 +94,7 @@ def keyframe_targets(
 
 
 def _yaw(quat_xyzw: Array) -> Array:
-    """(N,) angle about the base's z of the x axes of frames, radians."""
+    """Angle (N,) of the frames' x axes about the base's z axis, radians."""
     x, y, z, w = quat_xyzw.T
     return np.asarray(np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)))
 

@@ -198,7 +198,7 @@ def test_one_stopped_in_its_last_part_ends_with_the_same_weights(
     from lerobot_policy_act_keypoints.training import training_config
 
     def stop(text: str) -> None:
-        if text.startswith("what it tells"):
+        if text.startswith("prediction layers"):
             raise KeyboardInterrupt
 
     plan = pretraining.PretrainConfig(updates=6, batch_size=4, seed=1000)
