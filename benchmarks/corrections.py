@@ -1,6 +1,6 @@
 """What corrections do for a policy, against equally many new plain demonstrations.
 
-    python benchmarks/corrections.py --out outputs/corrections --plot outputs/corrections/corrections.png
+    python benchmarks/corrections.py --out outputs/corrections
     python benchmarks/corrections.py --seeds 1 --scenes 50 --rounds 1     # a first look
 
 A policy learns from --episodes plain demonstrations. Then, in --rounds, it acts in scenes of the training's part of the
@@ -19,7 +19,7 @@ import json
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,10 +30,11 @@ import torch
 from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, command, statistics, train
 
 from demorec.core.config import GenerateConfig
+from demorec.episode.episode import interventions
 from demorec.learn.evaluate import TakeOver
-from demorec.learn.evaluate.improvement import corrected_episodes
-from demorec.learn.evaluate.rollouts import Evaluation, evaluate, settings_for
-from demorec.learn.evaluate.statistics import Rate, cells
+from demorec.learn.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
+from demorec.learn.evaluate.statistics import Rate
+from demorec.mcap import Recording
 
 INTERVENTION = "intervention"
 CORRECTION_SEED = 1
@@ -56,7 +57,6 @@ class Stage:
         updates: Of the training.
         evaluation: On the held-out scenes.
         cpu_seconds: Of the training.
-        losses: Of the training, as (update, L1 of the normalised actions).
     """
 
     arm: str
@@ -66,7 +66,6 @@ class Stage:
     updates: int
     evaluation: Evaluation
     cpu_seconds: float
-    losses: tuple[tuple[int, float], ...]
 
     @property
     def row(self) -> tuple[str, int, int]:
@@ -112,6 +111,17 @@ def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Nam
         corrected = corrected_episodes(out)
     export(out, dataset, args, ",".join(map(str, corrected[:wanted])))
     return dataset
+
+
+def corrected_episodes(corrections: Path) -> list[int]:
+    """Episodes in which the expert took over, did more than stop the arm, and succeeded."""
+    corrected = []
+    for rollout in load_evaluation(corrections).rollouts:
+        if rollout.success:
+            with Recording(corrections / rollout.file) as recording:
+                if interventions(recording.columns().phase).any():
+                    corrected.append(rollout.episode_index)
+    return corrected
 
 
 def load(datasets: list[Path], *, hidden: tuple[re.Pattern[str], ...]) -> Data:
@@ -164,7 +174,6 @@ def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argpa
         updates=updates,
         evaluation=found,
         cpu_seconds=training["cpu_seconds"],
-        losses=tuple((point["step"], point["loss"]) for point in training["curve"]),
     )
     return made, out
 
@@ -193,62 +202,6 @@ def rate(found: list[Stage]) -> Rate:
     return Rate(successes=sum(r.successes for r in rates), trials=sum(r.trials for r in rates))
 
 
-def plot(rows: dict[tuple[str, int, int], list[Stage]], path: Path) -> None:
-    """Success over corrected episodes, beside plain demonstrations; training losses; success by cell."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure = plt.figure(figsize=(11, 7.6), layout="constrained")
-    grid = figure.add_gridspec(2, 2)
-    curve, losses, bars = (figure.add_subplot(place) for place in (grid[0, 0], grid[0, 1], grid[1, :]))
-    for number, ((arm, count, corrected), found) in enumerate(rows.items()):
-        label = f"{arm}: {count} plain, {corrected} corrected"
-        losses.plot(*zip(*found[0].losses, strict=True), color=f"C{number + 2}", label=label)
-    losses.set_yscale("log")
-    losses.set_xlabel("updates (first training of each)")
-    losses.set_ylabel("loss (L1, normalised actions)")
-    losses.legend(fontsize=8)
-    ways: tuple[tuple[str, str, Callable[[Stage], int]], ...] = (
-        ("corrected", "corrected episodes", lambda s: s.corrected),
-        ("plain", "plain demonstrations", lambda s: s.demonstrations - first),
-    )
-    first = min(count for _, count, _ in rows)
-    for color, (arm, label, added) in enumerate(ways):
-        points = sorted((added(found[0]), rate(found)) for row, found in rows.items() if row[0] in (arm, "start"))
-        x = [count for count, _ in points]
-        y = [100 * r.value for _, r in points]
-        below = [100 * (r.value - r.interval[0]) for _, r in points]
-        above = [100 * (r.interval[1] - r.value) for _, r in points]
-        curve.errorbar(x, y, yerr=[below, above], marker="o", capsize=3, color=f"C{color}", label=label)
-        for found in (f for row, f in rows.items() if row[0] in (arm, "start")):
-            for one in found:
-                curve.plot(added(one), 100 * one.evaluation.rate.value, ".", color=f"C{color}", alpha=0.4)
-    curve.set_xlabel(f"episodes added to {first} demonstrations")
-    curve.set_ylabel("solved, % (bar: 95 % interval)")
-    curve.set_ylim(0, 102)
-    curve.legend(fontsize=8, loc="lower right")
-    last = max(row[2] for row in rows)
-    shown = {arm: found for (arm, _, count), found in rows.items() if arm != "corrected" or count == last}
-    for number, (arm, found) in enumerate(shown.items()):
-        factors = [factor for one in found for factor in one.evaluation.factors]
-        successes = [bool(r.success) for one in found for r in one.evaluation.rollouts]
-        parts = cells(factors, successes)
-        places = np.arange(len(parts)) + 0.26 * (number - 1)
-        bars.bar(places, [100 * part.rate.value for part in parts], 0.24, color=("C7", "C0", "C1")[number], label=arm)
-        bars.set_xticks(
-            range(len(parts)), [f"{p.factor} {p.low:.3g}..{p.high:.3g}" for p in parts], rotation=90, fontsize=6
-        )
-    bars.set_ylim(0, 102)
-    bars.set_ylabel("solved, %")
-    bars.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
-    for axes in (curve, losses, bars):
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
-    figure.savefig(path, dpi=110)
-
-
 def main() -> None:
     """Make what is missing and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -271,7 +224,6 @@ def main() -> None:
     parser.add_argument("--hand-back", action="store_true")
     parser.add_argument("--no-noise", dest="noise", action="store_false")
     parser.add_argument("--out", type=Path, default=Path("outputs/corrections"))
-    parser.add_argument("--plot", type=Path, help="also draw the table into this PNG")
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.device = "cpu"
@@ -296,8 +248,6 @@ def main() -> None:
             f"{np.mean([s.cpu_seconds for s in found]):>11.0f}  {rate(found)}"
         )
     print(f"CPU seconds of this process, workers not counted: {time.process_time() - started:.0f}")
-    if args.plot is not None:
-        plot(rows, args.plot)
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ def items(run: Path, work: Path, rounds: int, *, images: bool) -> None:
     import torch
     from lerobot.datasets import LeRobotDataset
 
-    from demorec.learn.training.reader import FastDataset
+    from lerobot_policy_act_keypoints import FastDataset
 
     torch.set_num_threads(1)  # threads that wait for each other count as CPU time
     features = () if images else ("observation.state", "action")

@@ -3,14 +3,12 @@
     python benchmarks/learning.py --variants base clean plain_increments --out outputs/learning
     python benchmarks/learning.py --episodes 1000 --steps 8000 --scenes 100 --seeds 3
     python benchmarks/learning.py --variants joint_state joint_ee_state --episodes 300 --steps 3000 --scenes 60
-    python benchmarks/learning.py --variants base clean --plot outputs/learning/learning.png
 
 Every variant is made with the product's own commands (generate-dataset, demorec export lerobot, demorec evaluate).
 Training is LeRobot's ACT class with the numbers of a dataset held in memory: lerobot-train reads them row by row and
 spends five sixths of its CPU time there; the network, the loss and the optimizer are the same. One thread, no
 download. Each variant is one row: strict success in closed loop with its 95 % interval, and CPU seconds of training.
-What is there already (runs, datasets, policies, evaluations in --out) is used again. benchmarks/checkpoints.py measures
-trainings of lerobot-train, such as those with images.
+What is there already (runs, datasets, policies, evaluations in --out) is used again.
 """
 
 from __future__ import annotations
@@ -46,36 +44,29 @@ class Variant:
     Attributes:
         about: What is different from the base.
         generate: Flags of generate-dataset.
-        share: Of the episodes of the benchmark.
         action: As of demorec export lerobot.
         plain: Take the way back from noise out of the increments.
-        hide: Components of the environment state whose names contain one of these are hidden.
-        see: Pattern of the components that are not hidden; "" for all.
-        chunk, execute: Actions predicted at once, and executed before looking again.
+        see: Pattern of the components of the environment state that are not hidden; "" for all.
+        execute: Actions of the chunk that are executed before looking again.
     """
 
     about: str
     generate: tuple[str, ...] = ()
-    share: float = 1.0
     action: str = "joint_increment"
     plain: bool = False
-    hide: tuple[str, ...] = ()
     see: str = ""
-    chunk: int = 16
     execute: int = 16
 
 
-RELATIVE = ("from_", ".yaw.", "tcp.")
-NEAR_FIELD = (".near_",)
+CHUNK = 16
+"""Actions predicted at once."""
 THINGS = r"red_cube\.([xyz]|size\.[xyz]|yaw\.\w+|goal\.[xyz])"
 """What a perfect eye would tell: where cube and mark are."""
 VARIANTS = {
     "base": Variant(about="noise 0.02 rad, clean labels, increments, all of the state, 16 of 16 executed"),
     "clean": Variant(about="no action noise", generate=("--action-noise", "0", "0")),
-    "noise_0.04": Variant(about="noise 0.04 rad", generate=("--action-noise", "0.04", "0.04")),
     "plain_increments": Variant(about="increments without the way back from noise", plain=True),
     "joint": Variant(about="absolute joint targets", action="joint"),
-    "ee": Variant(about="absolute TCP poses", action="ee"),
     "ee_delta": Variant(about="TCP deltas", action="ee_delta"),
     "joint_state": Variant(
         about="TCP deltas; poses of cube and mark and the joints alone", action="ee_delta", see=THINGS
@@ -83,15 +74,6 @@ VARIANTS = {
     "joint_ee_state": Variant(
         about="the same, and the TCP's position and yaw", action="ee_delta", see=rf"{THINGS}|tcp\..*"
     ),
-    "no_velocity": Variant(about="without velocities", hide=(".vel",)),
-    "raw_poses": Variant(about="raw poses only: no symmetric yaw, nothing relative", hide=RELATIVE),
-    "no_near_field": Variant(about="without the steep components of small offsets", hide=NEAR_FIELD),
-    "recovery": Variant(about="30 % deliberate misses with recovery", generate=("--miss-probability", "0.3")),
-    "a_third": Variant(about="a third of the episodes", share=1 / 3),
-    "a_tenth": Variant(about="a tenth of the episodes", share=0.1),
-    "execute_1": Variant(about="one action at a time", execute=1),
-    "execute_8": Variant(about="half of the chunk of 16", execute=8),
-    "chunk_32": Variant(about="chunk of 32, 16 executed", chunk=32, execute=16),
 }
 
 
@@ -120,12 +102,11 @@ def make_dataset(variant: Variant, args: argparse.Namespace) -> Path:
         *("generate-dataset", "--out", run, "--task", args.task, "--num-episodes", str(args.episodes)),
         *("--split", "train", "--workers", str(args.workers), "--no-export", "--cameras", "none", *variant.generate),
     )
-    count = max(1, round(args.episodes * variant.share))
-    dataset = run / f"dataset_{variant.action}_{count}"
+    dataset = run / f"dataset_{variant.action}"
     if not dataset.exists():
         command(
             *("demorec", "export", "lerobot", run, "--out", dataset, "--action", variant.action),
-            *("--episodes", f"0:{count}", "--privileged"),
+            *("--episodes", f"0:{args.episodes}", "--privileged"),
         )
     return Path(dataset)
 
@@ -143,7 +124,7 @@ def load(dataset: Path, variant: Variant) -> Data:
         columns[ACTION] = torch.from_numpy(plain_increments(dataset))
     stats = {name: statistics(values) for name, values in columns.items()}
     for i, component in enumerate(info["features"][ENVIRONMENT]["names"]):
-        if any(part in component for part in variant.hide) or not re.fullmatch(variant.see or ".*", component):
+        if not re.fullmatch(variant.see or ".*", component):
             stats[ENVIRONMENT]["std"][i] = SWITCHED_OFF
     return Data(columns=columns, end=torch.from_numpy(np.searchsorted(episode, episode, side="right")), stats=stats)
 
@@ -190,7 +171,7 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
             n_heads=4,
             dim_feedforward=512,
             n_encoder_layers=2,
-            chunk_size=variant.chunk,
+            chunk_size=CHUNK,
             n_action_steps=variant.execute,
             pretrained_backbone_weights=None,
             device=args.device,
@@ -208,10 +189,10 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
     generator = torch.Generator().manual_seed(seed)
     count = len(data.end)
     policy.train()
-    started, smooth, curve = time.process_time(), 0.0, []
-    for step in range(args.steps):
+    started = time.process_time()
+    for _ in range(args.steps):
         rows = torch.randint(count, (args.batch_size,), generator=generator)
-        ahead = rows[:, None] + torch.arange(variant.chunk)
+        ahead = rows[:, None] + torch.arange(CHUNK)
         last = data.end[rows][:, None] - 1
         batch = {name: values[rows] for name, values in data.columns.items()}
         batch[ACTION] = data.columns[ACTION][torch.minimum(ahead, last)]
@@ -223,14 +204,11 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
         optimizer.step()
         schedule.step()
-        smooth = loss.item() if step == 0 else 0.98 * smooth + 0.02 * loss.item()
-        if (step + 1) % 250 == 0:
-            curve.append({"step": step + 1, "loss": smooth, "cpu_seconds": time.process_time() - started})
     seconds = time.process_time() - started
     policy.save_pretrained(out)
     before.save_pretrained(out)
     after.save_pretrained(out)
-    (out / "training.json").write_text(json.dumps({"cpu_seconds": seconds, "curve": curve}, indent=1))
+    (out / "training.json").write_text(json.dumps({"cpu_seconds": seconds}, indent=1))
     return seconds
 
 
@@ -269,43 +247,7 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
         "high": high,
         "by_seed": [r.successes for r in results],
         "train_cpu_seconds": float(np.mean([s["cpu_seconds"] for s in seconds])),
-        "curve": seconds[0]["curve"],
     }
-
-
-def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Success of every variant with its interval, and the training loss of its first seed, as an image."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    height = max(2.6, 0.8 + 0.42 * len(rows))
-    figure, (bars, curves) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
-    for place, row in enumerate(rows):
-        rate = 100 * row["success"] / row["trials"]
-        bars.barh(len(rows) - 1 - place, rate, color=f"C{place % 10}", height=0.62)
-        interval = [100 * row["low"], 100 * row["high"]]
-        bars.plot(interval, [len(rows) - 1 - place] * 2, color="black", linewidth=1.2)
-        curve = row["curve"]
-        curves.plot(
-            [point["cpu_seconds"] / 60 for point in curve],
-            [point["loss"] for point in curve],
-            color=f"C{place % 10}",
-            label=row["variant"],
-        )
-    labels = [f"{row['variant']}\n{row['success']} of {row['trials']}" for row in reversed(rows)]
-    bars.set_yticks(range(len(rows)), labels, fontsize=8)
-    bars.set_xlim(0, 100)
-    bars.set_xlabel("strict success in closed loop, % (line: 95 % interval)")
-    curves.set_yscale("log")
-    curves.set_xlabel("training, CPU minutes")
-    curves.set_ylabel("loss (L1, normalised actions)")
-    curves.legend(fontsize=7)
-    for axes in (bars, curves):
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
-    figure.savefig(path, dpi=110)
 
 
 def main() -> None:
@@ -324,7 +266,6 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("outputs/learning"))
-    parser.add_argument("--plot", type=Path, help="also draw the table and the training curves into this PNG")
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -340,8 +281,6 @@ def main() -> None:
             flush=True,
         )
     (args.out / "learning.json").write_text(json.dumps(rows, indent=1))
-    if args.plot is not None:
-        plot(rows, args.plot)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
     generate-dataset $flags --num-episodes 500 --out ../outputs/things
     demorec export lerobot ../outputs/things --out ../outputs/things/policy_data --repo-id me/things --privileged \
         --features observation.environment_state --action ee_delta
-    lerobot-train --config_path=../examples/act_numbers.json --dataset.root=../outputs/things/policy_data \
+    lerobot-train-fast --config_path=../examples/act_numbers.json --dataset.root=../outputs/things/policy_data \
         --dataset.repo_id=me/things --steps=5000 --scheduler.num_decay_steps=5000 --output_dir=../outputs/act_things
     for split in train eval; do demorec evaluate --policy ../outputs/act_things --task one_thing:OneThing \
         --object-split $split --num-episodes 100 --allow one_thing --out ../outputs/on_$split; done

@@ -1,4 +1,4 @@
-"""Reading a dataset for training: demorec's reader against LeRobot's own, with equal arguments, in one interleaved run.
+"""Reading a dataset for training: the plug-in's reader against LeRobot's, with equal arguments, in one interleaved run.
 
     python benchmarks/reading.py                                    everything, smallest sample
     python benchmarks/reading.py --sizes 224 --workers 0 --batches 8 --rounds 3
@@ -120,7 +120,7 @@ def compare(name: str, root: Path, windows: dict[str, list[float]], workers: int
     import torch
     from lerobot.datasets import LeRobotDataset
 
-    from demorec.learn.training import FastDataset
+    from lerobot_policy_act_keypoints import FastDataset
 
     arguments = {"root": root, "video_backend": args.backend, "return_uint8": True, "delta_timestamps": windows}
     datasets = {

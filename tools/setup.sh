@@ -77,6 +77,9 @@ flags=$(.venv/bin/python -c "import sysconfig; print(sysconfig.get_config_var('C
 export CFLAGS="${CFLAGS-$flags -g0}" CXXFLAGS="${CXXFLAGS-$flags -g0}"
 quietly "$uv" pip install -p .venv -c constraints.txt -e . --group dev "${arguments[@]}" "${plugins[@]}"
 quietly .venv/bin/python -c "import pybullet"
+# It decodes with the machine's FFmpeg. Without one, LeRobot would print 184 lines of tracebacks at each start; with this
+# package gone, it decodes with PyAV.
+.venv/bin/python -c "import torchcodec" >>"$log" 2>&1 || quietly "$uv" pip uninstall -p .venv torchcodec
 echo "Compiling the renderer for this machine"
 echo "Warming" >>"$log"
 quietly .venv/bin/python -c "from demorec.render.raster import warm_up; warm_up()"

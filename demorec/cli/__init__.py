@@ -26,7 +26,6 @@ class Command(Protocol):
     """A dataclass whose fields are the flags and whose docstring is the help.
 
     A classmethod `defaults(args)`, where there is one, returns the instance whose values are the flags' defaults.
-    A field `others`, where there is one, is no flag: it takes the words that are not the command's own.
     """
 
     def run(self) -> int:
@@ -46,11 +45,8 @@ COMMANDS: Registry[type[Command]] = Registry(
         "report": "demorec.cli.report:Report",
         "replay": "demorec.cli.replay:Replay",
         "render": "demorec.cli.render:Render",
-        "pretrain": "demorec.cli.train:Pretrain",
-        "train": "demorec.cli.train:Train",
         "evaluate": "demorec.cli.evaluate:Evaluate",
         "correct": "demorec.cli.evaluate:Correct",
-        "improve": "demorec.cli.train:Improve",
         "recover": "demorec.cli.recover:Recover",
         "list": "demorec.cli.list_rows:ListRows",
     },

@@ -222,8 +222,7 @@ class Correct(RolloutFlags):
     The expert takes over when the policy strays from what the expert would do, gets stuck, runs out of time, or at a
     random moment. It stops the arm, brings what the hand holds to its goal or releases it, and finishes the task or
     hands back control. Every episode is one recording, in which the phase "policy" marks the policy's frames; it can be
-    replayed like any other. Run the same command again to continue where it stopped. demorec improve alternates this
-    with training.
+    replayed like any other. Run the same command again to continue where it stopped.
 
     Examples:
       demorec correct --policy outputs/train --num-episodes 100 --seed 1 --out fix1

@@ -15,13 +15,19 @@ from typing import TYPE_CHECKING
 from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.progress import duration
 from demorec.core.processes import available_cores
+from demorec.episode.features import ENVIRONMENT_STATE, observation_names
 from demorec.generate.contents import set_aside
 from demorec.generate.executor import Made
 from demorec.generate.options import RunOptions, RunResult
+from demorec.mcap import open_recording
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 if TYPE_CHECKING:
     from demorec.generate.reproduce import Original
+
+POLICY_CONFIG = Path("examples/act_numbers.json")
+"""Settings of README's training, relative to a checkout."""
+MAX_PROBED_EPISODES = 8
 
 
 def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> tuple[str, list[str]]:
@@ -101,7 +107,7 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
         rows.append(("checks", checked[0]))
     say(*aligned(rows))
     if run.successes:
-        say("", "Next:", *(f"  {command}" for command in next_commands(result, export)))
+        say("", "Next:", *(f"  {command}" for command in next_commands(result)))
     for failure in () if checked is None else checked[1][:10]:
         tell(f"Check failed: {failure}")
     if run.given_up:
@@ -133,23 +139,30 @@ def print_comparison(original: Original, result: RunResult) -> bool:
     return False
 
 
-def next_commands(result: RunResult, export: ExportRecord | None) -> list[str]:
+def next_commands(result: RunResult) -> list[str]:
     """What to type next, quoted for the shell."""
     folder = str(result.folder)
     allow = [word for module in result.run.config.modules for word in ("--allow", module)]
     commands = [[_program("demorec"), name, folder, *allow] for name in ("view", "check")]
-    # LeRobot's policies take images, or an environment state that this dataset does not have.
-    if export is not None and result.run.config.cameras and find_spec("torch") and find_spec("lerobot"):
-        commands.append(
-            [
-                _program("lerobot-train"),
-                f"--dataset.repo_id={export.repo_id}",
-                f"--dataset.root={result.folder / DATASET}",
-                "--policy.type=act",
-                "--policy.push_to_hub=false",
-            ]
-        )
+    if find_spec("torch") and find_spec("lerobot") and POLICY_CONFIG.is_file() and has_environment_state(result):
+        data = result.folder / "policy_data"
+        numbers = ["--privileged", "--features", ENVIRONMENT_STATE, "--action", "joint_increment"]
+        commands += [
+            [_program("demorec"), "export", "lerobot", folder, "--out", str(data), *numbers],
+            [_program("lerobot-train"), f"--config_path={POLICY_CONFIG}", f"--dataset.root={data}"],
+        ]
     return [shlex.join(command) for command in commands]
+
+
+def has_environment_state(result: RunResult) -> bool:
+    """Whether the first recordings have equally many numbers about objects, as a policy without images needs."""
+    lengths = set()
+    for attempt in result.run.successes[:MAX_PROBED_EPISODES]:
+        with open_recording(result.folder / attempt.file, simulated=True) as recording:
+            info = recording.info
+        names = observation_names(info.robot, info.scene, privileged=True)
+        lengths.add(len(names[ENVIRONMENT_STATE]))
+    return len(lengths) == 1
 
 
 def _program(name: str) -> str:

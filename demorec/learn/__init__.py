@@ -1,1 +1,1 @@
-"""Policies: reading datasets for training, pretraining, evaluation and correction."""
+"""Policies: evaluation in held-out scenes, and correction by the expert."""

@@ -202,8 +202,8 @@ def test_an_unforeseen_error_leaves_a_report(capsys: pytest.CaptureFixture[str],
     assert len(err.splitlines()) == 1
 
 
-POLICIES = ("correct", "evaluate", "improve", "pretrain", "train")
-"""Commands that read policies and the settings of trainings."""
+POLICIES = ("correct", "evaluate")
+"""Commands that read policies."""
 
 
 def test_every_command_is_tried() -> None:

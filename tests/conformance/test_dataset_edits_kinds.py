@@ -12,10 +12,10 @@ import av
 import numpy as np
 import pytest
 from av.video.stream import VideoStream
+from lerobot_datasets import DEPTH, write_by_lerobot
 from support.check import checked
 from support.commands import exit_code
 from support.datasets import TOP, items, same, write_with_lerobot
-from support.training import DEPTH, write_by_lerobot
 
 pytestmark = [
     pytest.mark.slow,

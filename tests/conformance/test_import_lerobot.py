@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from lerobot_datasets import CAMERA, DEPTH, write_by_lerobot
 from numpy.typing import NDArray
 from support.export import data_table, export, make_run, recordings
-from support.training import CAMERA, DEPTH, write_by_lerobot
 
 from demorec.cli import main
 from demorec.core.errors import DemorecError

@@ -22,8 +22,7 @@ from demorec.mcap import EpisodeWriter, Recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-PLUGIN = ["--env.discover_packages_path=demorec.lerobot_env", "--env.type=demorec", "--env.task=pick_place"]
-PLUGIN += ["--env.action=joint_increment"]
+PLUGIN = ["--env.type=demorec", "--env.task=pick_place", "--env.action=joint_increment"]
 ACT = [
     *("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=16"),
     *("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.n_encoder_layers=1", "--policy.use_vae=false"),
@@ -77,7 +76,7 @@ def test_lerobot_eval_runs_the_environment_and_writes_videos(trained: Path) -> N
 def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> None:
     from lerobot.envs.utils import env_to_policy_features
 
-    from demorec.lerobot_env import DemorecEnvConfig
+    from lerobot_env_demorec import DemorecEnvConfig
 
     info = json.loads((trained / "dataset" / "meta" / "info.json").read_text())["features"]
     found = env_to_policy_features(DemorecEnvConfig(action="joint_increment"))

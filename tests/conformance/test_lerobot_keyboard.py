@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from support.keyboard import KeyboardOperator
 
-from demorec.lerobot_robot import DemorecPanda, DemorecPandaConfig, DemorecSO101, DemorecSO101Config
 from demorec.mcap import Recording
+from lerobot_robot_demorec import DemorecPanda, DemorecPandaConfig, DemorecSO101, DemorecSO101Config
 
 
 class Listener:

@@ -16,9 +16,9 @@ from support.lerobot_tools import Command, plugin_names, run_commands
 
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
-from demorec.lerobot_robot import DemorecPanda, DemorecPandaConfig, DemorecSO101, DemorecSO101Config
 from demorec.mcap import Recording
 from demorec.robots.motors import CALIBRATIONS
+from lerobot_robot_demorec import DemorecPanda, DemorecPandaConfig, DemorecSO101, DemorecSO101Config
 
 SEED = 11
 NAMES = tuple(
@@ -218,4 +218,4 @@ def test_a_real_arm_can_do_what_we_export(ran: Path, dataset: Path) -> None:
 
 
 def test_the_plugins_are_called_as_lerobot_looks_for_them() -> None:
-    assert plugin_names() == ["lerobot_env_demorec", "lerobot_robot_demorec"]
+    assert plugin_names() == ["lerobot_env_demorec", "lerobot_policy_act_keypoints", "lerobot_robot_demorec"]

@@ -103,7 +103,6 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     taken = read_takeover(path)
     assert taken is not None
     assert (taken.reasons, taken.num_frames) == (("the policy is stuck",), len(phases) - handover)
-    assert taken.has_interventions
     options = ReplayOptions()
     report, _ = next(iter(replay_all([open_file(path, options)], options)))
     assert report.is_identical, report

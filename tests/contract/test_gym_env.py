@@ -55,7 +55,7 @@ def test_things_are_drawn_from_the_named_shelves_and_their_split() -> None:
     assert env.episode.info.scene == episode(3, task="pick_anything", variation="mild", **flags).info.scene
     assert env.episode.info.scene != episode(3, task="pick_anything", variation="mild", split="all").info.scene
     env.close()
-    plugin = pytest.importorskip("demorec.lerobot_env")
+    plugin = pytest.importorskip("lerobot_env_demorec")
     kwargs = plugin.DemorecEnvConfig(task="pick_anything", objects=["blocks"], object_split="eval").gym_kwargs
     assert (kwargs["objects"], kwargs["object_split"]) == (("blocks",), "eval")
 

@@ -30,7 +30,6 @@ ROWS: dict[str, tuple[int, str]] = {
     "export hdf5 RUN --out NEW.hdf5": (0, "1 episode, 24 frames"),
     "evaluate --policy RUN": (2, "No policy"),
     "correct --policy RUN": (2, "No policy"),
-    "improve RUN --config-path MAPPING --out NEW": (2, EXTERNAL),
     "generate --config RUN --out NEW": (2, EXTERNAL),
     "generate --config DATASET --out NEW": (2, EXTERNAL),
     "generate --config RECORDING --out NEW": (2, EXTERNAL),
@@ -65,9 +64,7 @@ def test_every_documented_command_has_a_row() -> None:
     readme = (Path(__file__).parents[2] / "docs" / "README.md").read_text()
     block = readme.partition("## Commands\n")[2].partition("Every command has `--help`")[0]
     commands = set(re.findall(r"^    demorec (\S+)", block, flags=re.MULTILINE))
-    # `list` tells of demorec alone; training on such datasets is in tests/conformance/test_training_reader.py, and that
-    # `pretrain` refuses those that lack TCP poses, in test_pretrain.py there.
-    assert commands - {row.split()[0] for row in ROWS} == {"list", "train", "pretrain"}
+    assert commands - {row.split()[0] for row in ROWS} == {"list"}  # which takes no path
 
 
 @pytest.mark.parametrize("row", ROWS)

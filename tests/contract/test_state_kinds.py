@@ -105,7 +105,7 @@ def test_a_policy_tells_which_state_it_takes(length: int, kind: str, tmp_path: P
 
 
 def test_lerobot_is_told_of_the_state() -> None:
-    from demorec.lerobot_env import DemorecEnvConfig
+    from lerobot_env_demorec import DemorecEnvConfig
 
     assert DemorecEnvConfig(state="joint_ee").features["agent_pos"].shape == (15,)
     plain = DemorecEnvConfig(sensed=["observation.wrench"])
@@ -117,7 +117,7 @@ def test_lerobot_is_told_of_the_state() -> None:
 
 
 def test_lerobot_gets_the_robot_that_it_asks_for() -> None:
-    from demorec.lerobot_env import DemorecEnvConfig
+    from lerobot_env_demorec import DemorecEnvConfig
 
     config = DemorecEnvConfig(robot="so101")
     assert config.features["action"].shape == (6,)  # five joints and the jaw

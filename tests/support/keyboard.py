@@ -9,8 +9,8 @@ import numpy as np
 
 from demorec.core.geometry import Array
 from demorec.episode.scene import yaw_of
-from demorec.lerobot_robot import DemorecSO101
 from demorec.tasks.grasping import hand_yaw
+from lerobot_robot_demorec import DemorecSO101
 
 Press = Callable[[str, bool], None]
 """Presses a key (True) or lets it go."""

@@ -36,7 +36,10 @@ NEW_FOLDER = "demorec.made_for_trial"
 @cache
 def _graph(*, with_type_checking: bool) -> grimp.ImportGraph:
     return grimp.build_graph(
-        "demorec", include_external_packages=True, exclude_type_checking_imports=not with_type_checking, cache_dir=None
+        *("demorec", "lerobot_policy_act_keypoints"),
+        include_external_packages=True,
+        exclude_type_checking_imports=not with_type_checking,
+        cache_dir=None,
     )
 
 

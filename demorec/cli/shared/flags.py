@@ -38,9 +38,6 @@ from demorec.core.registry import is_module_name, split_name
 
 FLAG_TYPES = ConstructorRegistry()
 
-OTHERS = "others"
-"""Field of a command that takes the words that are not its own, for another program."""
-
 _HOME = re.compile(r"^(--[\w-]+=|)~(?=/|$)")
 _NARROWEST = 40
 """Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
@@ -65,11 +62,10 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
         SystemExit: 0 after --help, 2 after a wrong flag, which is reported first.
     """
     defaults = command.defaults(args) if hasattr(command, "defaults") else MISSING_NONPROP
-    takes_others = OTHERS in command.__dataclass_fields__
-    if not takes_others:  # ~ within quotes and in --out=~/new, which bash leaves as it is
-        args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
+    # ~ within quotes and in --out=~/new, which bash leaves as it is
+    args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
     # Python would take an empty path for the current folder.
-    if not takes_others and any(not word and not before.startswith("--") for before, word in pairwise(["", *args])):
+    if any(not word and not before.startswith("--") for before, word in pairwise(["", *args])):
         tell(f"{prog}: one of the paths is empty (an unset variable of the shell?); the current folder is written as .")
         raise SystemExit(2)
     asks_for_help = "-h" in args or "--help" in args
@@ -78,14 +74,13 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
     try:
         with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err):
-            parsed = tyro.cli(  # type: ignore[call-overload]  # which knows True and False, but no bool
+            return tyro.cli(
                 command,
                 args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
                 prog=prog,
                 description=inspect.cleandoc(command.__doc__ or ""),
                 default=defaults,
                 config=(tyro.conf.OmitArgPrefixes,),
-                return_unknown_args=takes_others,
             )
     except SystemExit as end:
         for page, write in ((out, say), (err, tell)):  # tyro repeats what it does not understand as it is
@@ -95,10 +90,6 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
             if word.startswith("-") and Path(word).exists():
                 tell(f"{prog}: a path that begins with a dash is written ./{word}")
         raise
-    if not takes_others:
-        return parsed
-    instance, others = parsed
-    return dataclasses.replace(instance, **{OTHERS: tuple(others)})
 
 
 def _laid_out(page: str, width: int) -> list[str]:
@@ -119,7 +110,7 @@ def _with_hints(info: StructTypeInfo) -> StructConstructorSpec | None:
     if not isinstance(spec, StructConstructorSpec):
         return None
     fields = []
-    for field in (field for field in spec.fields if field.name != OTHERS):
+    for field in spec.fields:
         hint = "(required)" if field.default is MISSING_NONPROP else "" if field.default in (None, "", ()) else None
         kind: Any = field.type if hint is None else Annotated[field.type, tyro.conf.arg(help_behavior_hint=hint)]
         text = field.helptext() if callable(field.helptext) else field.helptext

@@ -1,9 +1,8 @@
-"""Does the data teach? A policy in closed loop over held-out scenes, with how sure its success rate is."""
+"""A policy in closed loop over held-out scenes: its success rate with an interval, and corrections by the expert."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 from demorec.core.errors import check_option
 
@@ -38,36 +37,3 @@ class TakeOver:
         check_option("stray_metres", self.stray_metres, 0.0, 2.0, "m")
         check_option("stray_radians", self.stray_radians, 0.0, 3.2, "rad")
         check_option("stray_seconds", self.stray_seconds, 0.0, 60.0, "s")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What decides the result of improving a policy in rounds, besides demonstrations and flags of lerobot-train."""
-
-    config_path: Path
-    """Settings for lerobot-train (JSON); its dataset, output folder and seed are replaced."""
-    num_rounds: int = 2
-    """Number of rounds of corrections."""
-    num_episodes: int = 50
-    """Scenes per round in which the policy is corrected."""
-    num_scenes: int = 50
-    """Held-out scenes on which each policy is evaluated."""
-    seed: int = 1
-    """Seed of the trainings; the scenes of round k use the root seed of the demonstrations plus SEED + k."""
-    action: str = "joint_increment"
-    """joint, joint_increment, ee or ee_delta."""
-    state: str = "joint"
-    """joint or joint_ee, as in demorec export lerobot."""
-    privileged: bool = False
-    """As in demorec export lerobot: let the policy see observation.environment_state."""
-    features: tuple[str, ...] = ()
-    """As in demorec export lerobot: the features to learn from; all by default."""
-    takeover: TakeOver = field(default_factory=TakeOver)
-    """When the expert takes over."""
-
-    def validate(self) -> None:
-        """Raise OptionError for impossible values."""
-        check_option("num_rounds", self.num_rounds, 0, 1000)
-        check_option("num_episodes", self.num_episodes, 1, 1_000_000)
-        check_option("num_scenes", self.num_scenes, 1, 1_000_000)
-        self.takeover.validate()

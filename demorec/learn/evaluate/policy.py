@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import logging
+import reprlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -36,20 +38,24 @@ def find_checkpoint(path: Path) -> Path:
     )
 
 
-def policy_summary(checkpoint: Path) -> tuple[dict[str, Any], str]:
-    """The policy's config as plain data, and the first 16 hex digits of the SHA-256 of its config and weights."""
+def policy_config(checkpoint: Path) -> dict[str, Any]:
+    """Read the policy's config as plain data. Raises ConfigError if that fails."""
+    try:
+        return read_json_object(checkpoint / CONFIG_NAME)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{CONFIG_NAME} of the policy cannot be used ({describe_error(error)}): {checkpoint}"
+        ) from error
+
+
+def policy_digest(checkpoint: Path) -> str:
+    """The first 16 hex digits of the SHA-256 of the policy's config and weights."""
     sha = hashlib.sha256()
     for path in sorted(checkpoint.iterdir()):
         # The training's own settings name folders of the machine that trained.
         if path.suffix in (".json", ".safetensors") and path.name != TRAIN_CONFIG_NAME:
             sha.update(path.name.encode() + b"\0" + path.read_bytes())
-    try:
-        config = read_json_object(checkpoint / CONFIG_NAME)
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{CONFIG_NAME} of the policy cannot be used ({describe_error(error)}): {checkpoint}"
-        ) from error
-    return config, sha.hexdigest()[:16]
+    return sha.hexdigest()[:16]
 
 
 def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
@@ -103,7 +109,7 @@ class Policy:
 
     Raises:
         ConfigError: LeRobot cannot load it, or it has no such setting.
-        MissingDependencyError: torch is not installed.
+        MissingDependencyError: LeRobot, or the package that registers this type of policy, is not installed.
     """
 
     def __init__(self, checkpoint: Path, *, action_steps: int | None = None, device: str = "cpu") -> None:
@@ -112,8 +118,6 @@ class Policy:
             from lerobot.configs import PreTrainedConfig
             from lerobot.envs.utils import preprocess_observation
             from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-
-            import demorec.lerobot_policy  # noqa: F401  # which registers its policy's type
         except ImportError as error:
             raise MissingDependencyError(
                 "Running a policy", error.name or "lerobot", "pip install 'demorec[train]'"
@@ -121,6 +125,10 @@ class Policy:
         if device == "cpu":
             torch.set_num_threads(1)
         self._torch, self._preprocess = torch, preprocess_observation
+        kind = str(policy_config(checkpoint).get("type", ""))
+        not_imported = _register_plugins()
+        if kind not in PreTrainedConfig.get_known_choices():
+            raise _missing_plugin(kind, not_imported)
         try:
             config = PreTrainedConfig.from_pretrained(checkpoint)
             config.device = device
@@ -156,6 +164,45 @@ class Policy:
         with self._torch.inference_mode():
             action = self._after(self._policy.select_action(self._before(batch)))
         return np.asarray(action.to("cpu").numpy()[0], dtype=np.float32)
+
+
+class _PluginErrors(logging.Filter):
+    """Collects the errors that LeRobot logs, each with its traceback, about plug-ins that it cannot import."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.errors: list[BaseException] = []
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Keep a record with an error from being logged."""
+        error = record.exc_info[1] if record.exc_info else None
+        if error is not None:
+            self.errors.append(error)
+        return error is None
+
+
+def _register_plugins() -> list[BaseException]:
+    """Let LeRobot import all installed plug-ins; returns the errors of those that cannot be imported."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    collected = _PluginErrors()
+    root = logging.getLogger()
+    root.addFilter(collected)
+    try:
+        register_third_party_plugins()
+    finally:
+        root.removeFilter(collected)
+    return collected.errors
+
+
+def _missing_plugin(kind: str, not_imported: Iterable[BaseException]) -> MissingDependencyError:
+    """The error for a policy of a type that no imported package registers."""
+    feature = f"A policy of type {reprlib.repr(kind)}"
+    for error in not_imported:
+        if isinstance(error, ImportError) and error.name:
+            return MissingDependencyError(feature, error.name, f"pip install {error.name}")
+    name = f"lerobot_policy_{reprlib.repr(kind)[1:-1]}"
+    return MissingDependencyError(feature, name, "docs/install.md names demorec's own plug-ins")
 
 
 def _batched(observation: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, describe_error
+from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, describe_error
 from demorec.core.files import read_json_object, replace_text
 from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
@@ -42,7 +42,14 @@ from demorec.generate.executor import Raised
 from demorec.generate.local import LocalExecutor
 from demorec.gym_env import DemorecEnv
 from demorec.learn.evaluate import TakeOver
-from demorec.learn.evaluate.policy import Policy, check_steps, find_checkpoint, policy_summary, trained_action
+from demorec.learn.evaluate.policy import (
+    Policy,
+    check_steps,
+    find_checkpoint,
+    policy_config,
+    policy_digest,
+    trained_action,
+)
 from demorec.learn.evaluate.statistics import Rate, factors_of
 from demorec.learn.evaluate.turns import Turns
 from demorec.learn.evaluate.watch import correcting_behaviour
@@ -138,7 +145,7 @@ def settings_for(
     """
     checkpoint = find_checkpoint(policy)
     check_steps(checkpoint, allowed)
-    plain, digest = policy_summary(checkpoint)
+    plain = policy_config(checkpoint)
     try:
         inputs = {name: _shape(value["shape"]) for name, value in (plain.get("input_features") or {}).items()}
         images = {name.removeprefix(IMAGE_PREFIX): shape for name, shape in inputs.items()
@@ -163,7 +170,7 @@ def settings_for(
     return Settings(
         policy=str(policy),
         policy_type=str(plain.get("type", "")),
-        policy_digest=digest,
+        policy_digest=policy_digest(checkpoint),
         config=config,
         action=action,
         action_steps=action_steps,
@@ -211,6 +218,8 @@ def evaluate(
     with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
         for report in chain.from_iterable(executor.carry_out(functools.partial(next, iter(due), None))):
             if isinstance(report, Raised):
+                if report.kind == MissingDependencyError.__name__:
+                    raise DemorecError(report.message)
                 raise DemorecError(
                     f"Episode {report.plan.episode_index}: {report.kind}: {report.message.rstrip('.')}; the same "
                     "command goes on."

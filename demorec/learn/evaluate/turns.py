@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.episode.episode import HALT_PHASE, POLICY_PHASE, Action, Event, Frame, interventions
+from demorec.episode.episode import HALT_PHASE, POLICY_PHASE, Action, Event, Frame
 from demorec.episode.scene import Goal
 from demorec.gym_env import SUCCESS_FRAMES, DemorecEnv
 from demorec.learn.evaluate import TakeOver
@@ -171,12 +171,10 @@ class TakenOver:
     Attributes:
         reasons: Why the expert took over, each time.
         num_frames: How many the expert acted in.
-        has_interventions: Whether it did more than stop the arm (`interventions`).
     """
 
     reasons: tuple[str, ...]
     num_frames: int
-    has_interventions: bool
 
 
 def read_takeover(path: Path) -> TakenOver | None:
@@ -193,5 +191,4 @@ def read_takeover(path: Path) -> TakenOver | None:
     return TakenOver(
         reasons=tuple(message.removeprefix(_MESSAGE) for message in messages),
         num_frames=sum(phase != POLICY_PHASE for phase in phases),
-        has_interventions=bool(interventions(phases).any()),
     )

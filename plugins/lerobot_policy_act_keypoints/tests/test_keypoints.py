@@ -14,7 +14,7 @@ STATE, FRONT = "observation.state", "observation.images.front"
 
 def test_a_keypoint_is_where_the_map_is_high() -> None:
     """A map that is high around one place of the image, which is told in [-1, 1], x to the right and y down."""
-    from demorec.lerobot_policy import KeypointEncoder
+    from lerobot_policy_act_keypoints.modeling_act_keypoints import KeypointEncoder
 
     encoder = KeypointEncoder(num_cameras=1, state_dim=2, num_keypoints=1, channels=4, num_targets=3).eval()
     encoder.eyes[0] = torch.nn.AvgPool3d((3, 4, 4))  # a map is the grey image, a quarter of its size
@@ -28,7 +28,7 @@ def test_a_keypoint_is_where_the_map_is_high() -> None:
 
 def test_a_place_is_the_same_in_any_batch_and_nearly_so_on_any_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """Convolutions in bfloat16, where a CPU has it, move keypoints by a twentieth of a pixel, none by a whole one."""
-    import demorec.lerobot_policy as policy
+    from lerobot_policy_act_keypoints import modeling_act_keypoints as policy
 
     torch.manual_seed(0)
     encoder = policy.KeypointEncoder(num_cameras=1, state_dim=2, num_keypoints=16, channels=16, num_targets=3).eval()
@@ -71,7 +71,7 @@ def batch(*index: int, is_black: Any = None) -> dict[str, Any]:
 
 
 def test_each_frame_is_encoded_once_and_its_image_is_not_needed_again() -> None:
-    from demorec.learn.training.encodings import Encodings
+    from lerobot_policy_act_keypoints.encodings import Encodings
 
     policy, reference, encodings = Policy(), Policy(), Encodings(100)
     encodings.serve(policy)
@@ -85,7 +85,7 @@ def test_each_frame_is_encoded_once_and_its_image_is_not_needed_again() -> None:
 
 def test_a_place_follows_the_instruction_and_not_the_other_sentences_of_a_batch() -> None:
     """The order of words matters, capitals and marks do not; words that were not learned are all one."""
-    from demorec.lerobot_policy import KeypointEncoder, vocabulary_of
+    from lerobot_policy_act_keypoints.modeling_act_keypoints import KeypointEncoder, vocabulary_of
 
     torch.manual_seed(0)
     texts = ["put the red cube onto the blue one", "put the blue cube onto the red one"]
@@ -112,6 +112,6 @@ def test_a_place_follows_the_instruction_and_not_the_other_sentences_of_a_batch(
 
 
 def test_where_all_instructions_are_the_same_none_is_read() -> None:
-    from demorec.lerobot_policy import vocabulary_of
+    from lerobot_policy_act_keypoints.modeling_act_keypoints import vocabulary_of
 
     assert vocabulary_of(["stack the cubes"] * 3) == vocabulary_of([]) == ()

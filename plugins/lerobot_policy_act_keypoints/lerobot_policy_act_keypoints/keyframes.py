@@ -1,4 +1,4 @@
-"""What an image encoder learns to predict before the policy is trained: where the hand will be at its next keyframes.
+"""Targets of the image encoder's pretraining: the hand's poses at its next keyframes.
 
 A keyframe is a moment at which the gripper is commanded to close or to open (James and Davison, "Q-attention", 2021;
 PerAct, Shridhar et al., 2022). Keyframes follow from the robot's own poses and commands, which real recordings have,
@@ -13,21 +13,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.episode.features import near_field
-
 COMMANDS = ("closing", "opening")
+NEAR_FIELD_M = 0.02
+"""Offset at which a near-field component is 0.5. A centimetre decides whether a grasp succeeds, but is a twentieth of a
+standard deviation of the plain offset, which a network learns last."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KeyframeTargets:
-    """What an image encoder learns to predict for each frame.
+    """Targets of the image encoder for each frame.
 
     Attributes:
         values: (N, K) metres, and sines and cosines of angles; NaN where no such keyframe is ahead.
-        names: Of the components.
-        offsets: (N, 3) places of the offset from the TCP to the keyframe that comes first, base frame, x, y, z.
+        names: Names of the components.
+        offsets: (N, 3) indices of the components that hold the offset from the TCP to the earlier keyframe (x, y, z in
+            the base frame).
     """
 
     values: NDArray[np.float32]
@@ -36,14 +38,14 @@ class KeyframeTargets:
 
 
 def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The next frames at which the gripper is commanded to close, and to open.
+    """Find the next frames at which the gripper is commanded to close, and to open.
 
     Args:
-        opening: (N,) commanded opening, in any unit. It is open above the middle of all that is commanded.
-        episode: (N,) number of each frame's episode; its frames follow one another.
+        opening: (N,) commanded opening, in any unit. Open is above the middle of its range.
+        episode: (N,) number of each frame's episode; the frames of an episode are contiguous.
 
     Returns:
-        (N, 2) indices of the next closing and of the next opening; -1 where the episode has none ahead.
+        (N, 2) indices of the next closing and of the next opening; -1 if the episode has none ahead.
     """
     is_open = opening > (opening.min() + opening.max()) / 2
     changes = np.flatnonzero((np.diff(is_open) != 0) & (np.diff(episode) == 0)) + 1
@@ -57,12 +59,12 @@ def find_keyframes(opening: NDArray[np.floating], episode: NDArray[np.integer]) 
 def keyframe_targets(
     position: NDArray[np.floating], quat_xyzw: NDArray[np.floating], keyframes: NDArray[np.int64]
 ) -> KeyframeTargets:
-    """The hand's poses at its next keyframes, as they are and as seen from where it is now.
+    """Compute the hand's poses at its next keyframes, absolute and relative to its current pose.
 
     Args:
-        position: (N, 3) of the TCP, metres, base frame.
-        quat_xyzw: (N, 4) of the TCP, base frame.
-        keyframes: As of `find_keyframes`.
+        position: (N, 3) position of the TCP, metres, base frame.
+        quat_xyzw: (N, 4) orientation of the TCP, base frame.
+        keyframes: Result of `find_keyframes`.
     """
     xyz = position.astype(np.float64)
     yaw = _yaw(quat_xyzw.astype(np.float64))
@@ -74,12 +76,12 @@ def keyframe_targets(
         for axis, name in enumerate("xyz"):
             columns[f"{command}.{name}"] = place[:, axis]
             columns[f"{command}.from_tcp.{name}"] = offset[:, axis]
-            columns[f"{command}.from_tcp.near_{name}"] = near_field(offset[:, axis])
+            columns[f"{command}.from_tcp.near_{name}"] = _near_field(offset[:, axis])
         x_in_hand = np.cos(yaw) * offset[:, 0] + np.sin(yaw) * offset[:, 1]
         y_in_hand = np.cos(yaw) * offset[:, 1] - np.sin(yaw) * offset[:, 0]
         for name, in_hand in (("x", x_in_hand), ("y", y_in_hand)):
             columns[f"{command}.from_tcp.hand_{name}"] = in_hand
-            columns[f"{command}.from_tcp.near_hand_{name}"] = near_field(in_hand)
+            columns[f"{command}.from_tcp.near_hand_{name}"] = _near_field(in_hand)
         for name, angle in (("yaw", turn), ("from_tcp.yaw", turn - yaw)):
             columns[f"{command}.{name}.sin2"] = np.sin(2 * angle)  # two fingers: half a turn is the same
             columns[f"{command}.{name}.cos2"] = np.cos(2 * angle)
@@ -92,6 +94,11 @@ def keyframe_targets(
 
 
 def _yaw(quat_xyzw: Array) -> Array:
-    """(N,) angle about the base's z of the x axes of frames, radians."""
+    """Angle (N,) of the frames' x axes about the base's z axis, radians."""
     x, y, z, w = quat_xyzw.T
     return np.asarray(np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)))
+
+
+def _near_field(offset: Array) -> Array:
+    """Near-field components d / (|d| + NEAR_FIELD_M) of offsets d in metres: in -1..1, and steep around 0."""
+    return np.asarray(offset / (np.abs(offset) + NEAR_FIELD_M), dtype=np.float64)

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
     joined=st.booleans(),
 )
 def test_rows_are_taken_from_any_chunks(lengths: list[int], rows: list[int], joined: bool) -> None:
-    from demorec.learn.training import columns
-    from demorec.learn.training.columns import Column
+    from lerobot_policy_act_keypoints import columns
+    from lerobot_policy_act_keypoints.columns import Column
 
     values = np.arange(3 * sum(lengths), dtype=np.float32).reshape(-1, 3)
     chunks = np.split(values, np.cumsum(lengths)[:-1])
@@ -44,6 +44,6 @@ def test_rows_are_taken_from_any_chunks(lengths: list[int], rows: list[int], joi
     ],
 )
 def test_what_is_no_array_of_numbers_is_left_to_lerobot(array: pa.Array) -> None:
-    from demorec.learn.training.columns import numbers
+    from lerobot_policy_act_keypoints.columns import numbers
 
     assert numbers(pa.chunked_array([array])) is None

@@ -1,8 +1,8 @@
-"""Images of video files at given times: those of a batch together, each decoded once.
+"""Images of video files at given times; those of a batch are decoded together, each once.
 
-LeRobot opens the file for every item, decodes from the key frame before the wanted one and makes colours of all that
-it passes. Here a file stays open, the frames of a batch are wanted in their order in the file, decoding goes on where
-it stands unless a key frame is nearer, and only what is wanted is converted.
+LeRobot opens the file for every item, decodes from the key frame before the wanted one and converts all frames on the
+way to RGB. Here a file stays open, the frames of a batch are decoded in their order in the file, decoding continues
+from the last frame unless a key frame is nearer, and only wanted frames are converted.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class VideoFile:
     """Frames of the first video stream, numbered in the order in which they are shown.
 
     Args:
-        path: Of the file.
-        pixel_format: What frames are converted to: rgb24 or gray12le.
+        path: Path of the file.
+        pixel_format: Format that frames are converted to: rgb24 or gray12le.
 
     Raises:
-        FrameTimestampError: There is no frame in it.
-        OSError: It cannot be opened or decoded.
+        FrameTimestampError: The file has no frame.
+        OSError: The file cannot be opened or decoded.
     """
 
     def __init__(self, path: str, pixel_format: str) -> None:
@@ -47,7 +47,7 @@ class VideoFile:
         self._format = pixel_format
         self._container = av.open(path)
         self._stream = self._container.streams.video[0]
-        # One thread: none has to be ended in a forked process, and none decodes ahead of what is wanted.
+        # One thread: more would have to be ended in a forked process, and would decode unwanted frames.
         self._stream.codec_context.thread_count = 1
         self._reformatter = VideoReformatter()
         pts, is_key = self._timetable()
@@ -63,14 +63,14 @@ class VideoFile:
         self._container.close()
 
     def numbers(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The frames nearest to these times."""
+        """Find the frames nearest to these times."""
         after = np.minimum(np.searchsorted(self._times_s, times_s), len(self._times_s) - 1)
         before = np.maximum(after - 1, 0)
         is_before = times_s - self._times_s[before] <= self._times_s[after] - times_s
         return np.where(is_before, before, after)
 
     def decode(self, numbers: Sequence[int]) -> Iterator[tuple[int, DecodedFrame]]:
-        """The frames of these numbers, which ascend."""
+        """Decode the frames of these ascending numbers."""
         for number in numbers:
             frame = self._reformatter.reformat(self._frame(number), format=self._format)
             pixels = torch.from_numpy(frame.to_ndarray())
@@ -83,7 +83,7 @@ class VideoFile:
             frame = self._decode_to(number)
             if frame is not None:
                 return frame
-        # Where frames are shown in another order than they are coded, a key frame may lie behind what is wanted.
+        # If the display order differs from the coding order, the key frame may follow the wanted frame.
         for start in sorted({key, max(0, key - 1), 0}, reverse=True):
             self._container.seek(int(self._pts[start]), backward=True, any_frame=False, stream=self._stream)
             self._decoded = self._container.decode(self._stream)
@@ -94,7 +94,7 @@ class VideoFile:
         raise FrameTimestampError(f"The frame at {self._times_s[number]:.6f} s cannot be decoded: {self._path}")
 
     def _decode_to(self, number: int) -> av.VideoFrame | None:
-        """Decode on to a frame; None when it does not come."""
+        """Continue decoding up to a frame; None if it does not come."""
         for frame in self._decoded:
             self._last = self._number(frame.pts)
             if self._last >= number:
@@ -103,14 +103,14 @@ class VideoFile:
         return None
 
     def _number(self, pts: int | None) -> float:
-        """Of a decoded frame; of one that has no place in the file, the number of the last that has."""
+        """Number of a decoded frame; that of the frame before if its time is not in the file."""
         if pts is None:
             return self._last
         number = int(np.searchsorted(self._pts, pts))
         return number if number < len(self._pts) and self._pts[number] == pts else self._last
 
     def _timetable(self) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Of all frames in the order in which they are shown: time in ticks, and whether it is a key frame."""
+        """Times in ticks, and whether it is a key frame, of all frames in display order."""
         packets = [(p.pts, p.is_keyframe) for p in self._container.demux(self._stream) if p.size and p.pts is not None]
         packets.sort()
         if not packets:
@@ -120,11 +120,11 @@ class VideoFile:
 
 _PYAV_NAMES = ("pyav", "video_reader")
 """LeRobot's names of the decoder; the second is an old one."""
-_OPEN_FILES = 64
+_MAX_OPEN_FILES = 64
 
 
 class FrameCache:
-    """Decoded frames within a limit of bytes; forgets those that have not been wanted for the longest time."""
+    """Decoded frames within a limit of bytes; drops the least recently used ones."""
 
     def __init__(self, limit_bytes: int) -> None:
         self._limit = limit_bytes
@@ -133,18 +133,18 @@ class FrameCache:
 
     @property
     def num_bytes(self) -> int:
-        """Of the images that are held."""
+        """Size of the images that are held."""
         return self._held
 
     def get(self, path: str, number: int) -> DecodedFrame | None:
-        """A frame of a file by its number there; None when it is not held."""
+        """Get a frame of a file by its number; None if it is not held."""
         frame = self._frames.get((path, number))
         if frame is not None:
             self._frames.move_to_end((path, number))
         return frame
 
     def put(self, path: str, number: int, frame: DecodedFrame) -> None:
-        """Hold a frame that is not held yet; its image must own its memory, and nobody may change it."""
+        """Hold a frame that is not held yet; its image must own its memory and never change."""
         if frame.image.nbytes > self._limit:
             return
         self._frames[path, number] = frame
@@ -155,12 +155,12 @@ class FrameCache:
 
 
 class ImageReader:
-    """Open files and the cache of frames of one process; its methods may be called from several threads.
+    """Open files and the frame cache of one process; its methods may be called from several threads.
 
     Args:
         backend: LeRobot's name of the decoder of colours.
-        tolerance_s: How far from the wanted time a frame may lie.
-        cache_bytes: Limit of the decoded frames that are kept, as uint8 or uint16.
+        tolerance_s: Maximum difference between the time of a frame and the wanted time.
+        cache_bytes: Maximum size of the decoded frames that are kept, as uint8 or uint16.
     """
 
     def __init__(self, backend: str, tolerance_s: float, cache_bytes: int) -> None:
@@ -172,19 +172,19 @@ class ImageReader:
         self._lock = Lock()
 
     def read(self, path: Path, times_s: NDArray[np.float64], *, is_depth: bool) -> list[torch.Tensor]:
-        """The images of several items from one file.
+        """Read the images of several items from one file.
 
         Args:
-            path: Of the file.
+            path: Path of the file.
             times_s: (B, T) seconds in the file.
             is_depth: Whether it holds codes of depth instead of colours.
 
         Returns:
-            B tensors (T, C, H, W) of their own memory, uint8 or uint16.
+            B tensors (T, C, H, W), uint8 or uint16.
 
         Raises:
             FrameTimestampError: The file has no frame within the tolerance of a time.
-            ValueError: There is no such backend.
+            ValueError: The backend is unknown.
         """
         with self._lock:
             decoder = self._decoder(str(path), is_depth)
@@ -216,7 +216,7 @@ class ImageReader:
         return frames
 
     def _decoder(self, path: str, is_depth: bool) -> VideoFile | _TorchcodecFile:
-        if self._backend == "torchcodec" and not is_depth:  # which reads no depth, as LeRobot has it
+        if self._backend == "torchcodec" and not is_depth:  # as in LeRobot, it does not read depth
             return _TorchcodecFile(self._torchcodec.get_decoder(path))
         if self._backend not in _PYAV_NAMES and not is_depth:
             raise ValueError(f"The video backend is {self._backend!r}, allowed are 'pyav' and 'torchcodec'.")
@@ -224,13 +224,13 @@ class ImageReader:
         if key not in self._files:
             self._files[key] = VideoFile(path, "gray12le" if is_depth else "rgb24")
         self._files.move_to_end(key)
-        while len(self._files) > _OPEN_FILES:
+        while len(self._files) > _MAX_OPEN_FILES:
             self._files.popitem(last=False)[1].close()
         return self._files[key]
 
 
 class _TorchcodecFile:
-    """A decoder of torchcodec, opened as LeRobot opens it, with the methods of `VideoFile`."""
+    """A decoder of torchcodec with the methods of `VideoFile`."""
 
     def __init__(self, decoder: Any) -> None:
         self._decoder = decoder
@@ -243,4 +243,4 @@ class _TorchcodecFile:
         if numbers:
             batch = self._decoder.get_frames_at(indices=list(numbers))
             for number, image, time_s in zip(numbers, batch.data, batch.pts_seconds.tolist(), strict=True):
-                yield number, DecodedFrame(image.clone(), time_s)  # else one frame would hold the memory of all
+                yield number, DecodedFrame(image.clone(), time_s)  # without this, one frame keeps the memory of all

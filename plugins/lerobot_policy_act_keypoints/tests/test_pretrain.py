@@ -1,7 +1,8 @@
-"""demorec pretrain and demorec train of the policy act_keypoints, by LeRobot's own training."""
+"""act-keypoints-pretrain, and training of the policy by lerobot-train-fast and by LeRobot's own command."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
@@ -14,27 +15,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.export import info
-from support.training import SMALL_ACT
+from lerobot_datasets import SMALL_ACT, write_demonstrations
 
-from demorec.cli import generate_dataset_main, main
+from lerobot_policy_act_keypoints.commands import act_keypoints_pretrain
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("hf_datasets_cache")]
+pytestmark = pytest.mark.slow
 
 POLICY: dict[str, Any] = {**SMALL_ACT, "type": "act_keypoints"}
 
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Settings of a training on three demonstrations with two small cameras."""
+    """Settings of a training on three demonstrations with a small camera."""
     folder = tmp_path_factory.mktemp("pretrain")
-    words = ["--num-episodes", "3", "--split", "train", "--cameras", "workspace", "wrist", "--width", "32"]
-    with pytest.raises(SystemExit) as ended:
-        generate_dataset_main([*words, "--height", "24", "--no-export", "--workers", "1", "--out", str(folder / "run")])
-    assert ended.value.code == 0
-    run, dataset = str(folder / "run"), folder / "dataset"
-    words = ["--no-verify", "--action", "ee_delta", "--state", "joint_ee"]
-    assert ends("export", "lerobot", run, "--out", str(dataset), *words) == 0
+    dataset = write_demonstrations(folder / "dataset", 3)
     plain = {
         "dataset": {"repo_id": "local/test", "root": str(dataset), "video_backend": "pyav"},
         "policy": POLICY,
@@ -51,14 +45,14 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def ends(*words: str) -> int:
     with pytest.raises(SystemExit) as ended:
-        main(list(words))
+        act_keypoints_pretrain(words)
     assert isinstance(ended.value.code, int)
     return ended.value.code
 
 
 def pretrain(settings: Path, out: Path, *more: str) -> int:
     words = [f"--config_path={settings}", "--out", str(out), "--num-updates", "6", "--frames-per-update", "4"]
-    return ends("pretrain", *words, *more)
+    return ends(*words, *more)
 
 
 def weights(folder: Path) -> dict[str, np.ndarray[Any, Any]]:
@@ -111,7 +105,7 @@ def test_lerobot_loads_the_policy_by_its_name_and_it_acts(pretrained: Path) -> N
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
-    import demorec.lerobot_env  # noqa: F401  # as --env.discover_packages_path does
+    import lerobot_policy_act_keypoints  # noqa: F401  # as LeRobot's commands do
 
     config = PreTrainedConfig.from_pretrained(pretrained)
     policy = get_policy_class(config.type).from_pretrained(pretrained)
@@ -119,13 +113,13 @@ def test_lerobot_loads_the_policy_by_its_name_and_it_acts(pretrained: Path) -> N
     batch: dict[str, Any] = {
         key: torch.randn(3, *feature.shape, generator=generator) for key, feature in config.input_features.items()
     }
-    batch["task"] = ["put the red cube on the green target"] * 3
+    batch["task"] = ["bring red to green"] * 3
     actions = policy.predict_action_chunk(batch)
     assert actions.shape == (3, config.chunk_size, 7)
-    changed = batch | {"observation.images.wrist": 5 * batch["observation.images.wrist"].flip(-1)}
+    changed = batch | {"observation.images.top": 5 * batch["observation.images.top"].flip(-1)}
     assert not torch.allclose(actions, policy.predict_action_chunk(changed), atol=1e-4)
-    changed = batch | {"task": ["move the red cube to the green target"] * 3}
-    assert {"put", "move", "red", "green"} <= set(config.vocabulary)
+    changed = batch | {"task": ["put the red square onto the green one"] * 3}
+    assert {"put", "bring", "red", "green"} <= set(config.vocabulary)
     assert not torch.equal(actions, policy.predict_action_chunk(changed))
 
 
@@ -135,7 +129,8 @@ def test_a_policy_that_reads_can_be_saved_from_a_gpu(tmp_path: Path, monkeypatch
     from lerobot.configs import FeatureType, PolicyFeature
     from safetensors.torch import save_model
 
-    from demorec.lerobot_policy import ActKeypointsConfig, ActKeypointsPolicy
+    from lerobot_policy_act_keypoints import ActKeypointsConfig
+    from lerobot_policy_act_keypoints.modeling_act_keypoints import ActKeypointsPolicy
 
     def as_on_a_gpu(module: torch.nn.RNNBase) -> None:
         weights = [weight for weight in module._flat_weights if weight is not None]
@@ -160,13 +155,13 @@ def test_a_policy_that_reads_can_be_saved_from_a_gpu(tmp_path: Path, monkeypatch
 
 @pytest.mark.long
 def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, pretrained: Path, tmp_path: Path) -> None:
-    from demorec.learn.training import pretrain as pretraining
-    from demorec.learn.training.command import training_config
+    from lerobot_policy_act_keypoints import pretrain as pretraining
+    from lerobot_policy_act_keypoints.training import training_config
 
     out = tmp_path / "killed"
     program = (
-        "import sys; from demorec.learn.training import pretrain as p; "
-        "from demorec.learn.training.command import training_config; "
+        "import sys; from lerobot_policy_act_keypoints import pretrain as p; "
+        "from lerobot_policy_act_keypoints.training import training_config; "
         "from pathlib import Path; "
         "p.pretrain(training_config([sys.argv[1]]), p.PretrainConfig(updates=6, batch_size=4, seed=1000), "
         "Path(sys.argv[2]), "
@@ -199,11 +194,11 @@ def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, pretrained: P
 def test_one_stopped_in_its_last_part_ends_with_the_same_weights(
     settings: Path, pretrained: Path, tmp_path: Path
 ) -> None:
-    from demorec.learn.training import pretrain as pretraining
-    from demorec.learn.training.command import training_config
+    from lerobot_policy_act_keypoints import pretrain as pretraining
+    from lerobot_policy_act_keypoints.training import training_config
 
     def stop(text: str) -> None:
-        if text.startswith("what it tells"):
+        if text.startswith("prediction layers"):
             raise KeyboardInterrupt
 
     plan = pretraining.PretrainConfig(updates=6, batch_size=4, seed=1000)
@@ -221,8 +216,8 @@ def test_one_stopped_in_its_last_part_ends_with_the_same_weights(
 def test_changed_images_are_the_same_after_a_stop(
     settings: Path, pretrained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from demorec.learn.training import pretrain as pretraining
-    from demorec.learn.training.command import training_config
+    from lerobot_policy_act_keypoints import pretrain as pretraining
+    from lerobot_policy_act_keypoints.training import training_config
 
     def stop(text: str) -> None:
         if text.startswith("update 2 "):
@@ -267,7 +262,7 @@ def test_damage_is_reported(
     (out / "pretraining.json").write_text(json.dumps({"settings": plain["settings"]}))
     (out / "unfinished.pt").write_bytes(b"PK\x03\x04 nothing of torch")
     assert pretrain(settings, out) == 1
-    assert "is damaged, delete it to begin anew" in capsys.readouterr().err
+    assert "is damaged, delete it to start again" in capsys.readouterr().err
     (out / "pretraining.json").write_text('{"settings": 3}')
     assert pretrain(settings, out) == 1
     assert "pretraining.json is damaged" in capsys.readouterr().err
@@ -277,8 +272,9 @@ def test_damage_is_reported(
     ("words", "sentence"),
     [
         (["--policy.type=diffusion"], "Only the encoder of one type of policy can be pretrained"),
-        (["--num-updates=0"], "--num-updates is 0"),
-        (["--config_path=nothing.json"], "There is no such file of settings: nothing.json"),
+        (["--num-updates=0"], "argument --num-updates: 0 is not within 1 to"),
+        (["--config_path=nothing.json"], "The settings file does not exist: nothing.json"),
+        (["--steps=60"], "--steps=60 is a flag of lerobot-train-fast: give --num-updates for the encoder."),
     ],
 )
 def test_wrong_requests(
@@ -290,7 +286,7 @@ def test_wrong_requests(
         plain["policy"] = {"type": "diffusion", "device": "cpu", "push_to_hub": False}
         given, words = [f"--config_path={tmp_path / 'other.json'}"], []
         (tmp_path / "other.json").write_text(json.dumps(plain))
-    assert ends("pretrain", *given, "--out", str(tmp_path / "out"), *words) == 2
+    assert ends(*given, "--out", str(tmp_path / "out"), *words) == 2
     assert sentence in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -300,31 +296,47 @@ def test_one_episode_is_too_few(settings: Path, tmp_path: Path, capsys: pytest.C
     assert "commanded to close or to open in 1 of the dataset's episodes: at least 2" in capsys.readouterr().err
 
 
-def test_a_dataset_without_tcp_poses_or_openings_is_refused(
+def test_a_dataset_without_tcp_poses_is_refused(
     settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, dataset = str(settings.parent / "run"), tmp_path / "joints"
-    features = ["observation.images.workspace", "observation.images.wrist"]
-    assert ends("export", "lerobot", run, "--out", str(dataset), "--no-verify", "--features", *features) == 0
-    assert "observation.ee_pose" not in info(dataset)["features"]
-    capsys.readouterr()
+    dataset = write_demonstrations(tmp_path / "unnamed", 2, names_tcp=False)
     assert pretrain(settings, tmp_path / "out", f"--dataset.root={dataset}") == 2
     assert "lacks tcp.x to tcp.qw in observation.ee_pose or observation.state, so where the hand will grasp is" in (
         capsys.readouterr().err
     )
 
 
-def train(settings: Path, out: Path, *more: str, program: str = "demorec train") -> tuple[list[float], Path]:
+def test_a_folder_in_the_dataset_or_in_use_is_refused(
+    settings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = settings.parent / "dataset"
+    assert pretrain(settings, dataset / "eye") == 2
+    assert "is inside the dataset" in capsys.readouterr().err
+    assert not (dataset / "eye").exists()
+    with (tmp_path / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert pretrain(settings, tmp_path) == 2
+    assert "Another process is training in this folder" in capsys.readouterr().err
+    assert pretrain(settings, Path("/proc/eye")) == 2
+    assert "cannot be written to" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_it_learns_to_see_where_a_hand_will_grasp(settings: Path, tmp_path: Path) -> None:
+    """To a centimetre, which is a pixel, where the mean of all is a decimetre off."""
+    dataset = write_demonstrations(tmp_path / "dataset", 120)
+    words = [f"--config_path={settings}", f"--dataset.root={dataset}", "--policy.num_keypoints=8"]
+    words += ["--policy.encoder_channels=8", "--num-updates", "600", "--frames-per-update", "32"]
+    assert ends(*words, "--learning-rate", "0.005", "--out", str(tmp_path / "eye")) == 0
+    found = json.loads((tmp_path / "eye" / "pretraining.json").read_text())["result"]
+    assert found["baseline_m"] > 0.1
+    assert found["median_m"] < 0.01
+    assert found["most_m"] < 0.02
+
+
+def train(program: str, settings: Path, out: Path, *more: str) -> tuple[list[float], Path]:
     """Losses, and the last checkpoint, of a training in a process of its own."""
-    name, *words = program.split()
-    plugin = [] if words else ["--env.discover_packages_path=demorec.lerobot_env"]
-    command = [
-        str(Path(sys.executable).parent / name),
-        *words,
-        f"--config_path={settings}",
-        f"--output_dir={out}",
-        *plugin,
-    ]
+    command = [str(Path(sys.executable).parent / program), f"--config_path={settings}", f"--output_dir={out}"]
     done = subprocess.run([*command, *more], capture_output=True, text=True, check=False)
     text = done.stdout + done.stderr
     assert done.returncode == 0, text[-3000:]
@@ -337,8 +349,8 @@ def train(settings: Path, out: Path, *more: str, program: str = "demorec train")
 def test_the_encoder_stays_as_it_was_pretrained(settings: Path, pretrained: Path, tmp_path: Path) -> None:
     """Each frame is encoded once, and the losses are those of a training by LeRobot's own command, which does not."""
     path = f"--policy.path={pretrained}"
-    kept, one = train(settings, tmp_path / "kept", path)
-    afresh, _ = train(settings, tmp_path / "afresh", path, program="lerobot-train")
+    kept, one = train("lerobot-train-fast", settings, tmp_path / "kept", path)
+    afresh, _ = train("lerobot-train", settings, tmp_path / "afresh", path)
     assert len(kept) >= 6
     assert kept == pytest.approx(afresh, abs=2e-3)
     before, after = weights(pretrained), weights(one)
@@ -367,7 +379,7 @@ def encoded(settings: Path, folder: Path) -> np.ndarray[Any, Any]:
 
 @pytest.mark.long
 def test_the_encoder_must_have_been_pretrained(settings: Path, tmp_path: Path) -> None:
-    command = [str(Path(sys.executable).parent / "demorec"), "train", f"--config_path={settings}"]
+    command = [str(Path(sys.executable).parent / "lerobot-train-fast"), f"--config_path={settings}"]
     done = subprocess.run([*command, f"--output_dir={tmp_path / 'out'}"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "is trained before the policy: demorec pretrain, then --policy.path with its --out." in done.stderr
+    assert "is trained before the policy: act-keypoints-pretrain, then --policy.path with its --out." in done.stderr

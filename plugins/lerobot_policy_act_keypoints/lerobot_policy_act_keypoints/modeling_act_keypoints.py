@@ -1,77 +1,42 @@
-"""A policy of LeRobot: ACT that gets keypoints in place of images.
+"""ACT that gets keypoints instead of images.
 
-    lerobot-eval --env.discover_packages_path=demorec.lerobot_env --env.type=demorec --policy.path=...
-
-Importing this package makes the policy known to LeRobot, which finds the parts below by their names.
-
-ACT's own ResNet gives maps of features, in which a place is hard to read to the millimetre. Here a small convolutional
-network makes a few maps of each image, and the policy gets the place that each map points at: its expectation under a
-softmax over the map (Finn et al., "Deep Spatial Autoencoders for Visuomotor Learning", 2016). Where episodes have
-different instructions, the instruction scales and shifts the network's last features (FiLM: Perez et al., 2018), so
-that a map can look for the thing that is named. What the network learns, before the policy does, is in
-`demorec.learn.training.pretrain`.
+ACT's own ResNet gives maps of features, from which a position is hard to read to the millimetre. Here a small
+convolutional network makes a few maps of each image, and the policy gets the position that each map points at: its
+expectation under a softmax over the map (Finn et al., "Deep Spatial Autoencoders for Visuomotor Learning", 2016). Where
+episodes have different instructions, the instruction scales and shifts the network's last features (FiLM: Perez et al.,
+2018), so that a map can look for the object that is named. The network is trained before the policy, by `pretrain`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACT, ACTPolicy
-from lerobot.policies.act.processor_act import make_act_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import nn
 
-__all__ = ["ActKeypointsConfig", "ActKeypointsPolicy", "KeypointEncoder", "make_act_keypoints_pre_post_processors"]
+from lerobot_policy_act_keypoints.configuration_act_keypoints import ActKeypointsConfig
 
-_HIDDEN = 256
-_WORD_SIZE, _INSTRUCTION_SIZE = 32, 64
+__all__ = ["ActKeypointsPolicy", "KeypointEncoder", "vocabulary_of"]
+
+_HIDDEN_SIZE = 256
+_WORD_SIZE = 32
+_INSTRUCTION_SIZE = 64
 _WORD = re.compile(r"\w+")
 _HEIGHT_SCALE = 0.1
-"""Of a map's maximum, beside its coordinates, which lie in [-1, 1]."""
-_LEAST_STD = 1e-4
-"""By which what hardly changes is divided."""
-
-
-@PreTrainedConfig.register_subclass("act_keypoints")
-@dataclass
-class ActKeypointsConfig(ACTConfig):  # type: ignore[misc]
-    """Flags `--policy.NAME=...`: those of ACT, of which the ones about the ResNet mean nothing here.
-
-    Attributes:
-        num_keypoints: Maps of each camera.
-        encoder_channels: Of the first convolutions; the later ones have twice as many.
-        num_targets: Numbers that the encoder predicts beside the keypoints; set by `demorec pretrain`.
-        vocabulary: Words of instructions that the encoder reads; none where all episodes have the same instruction; set
-            by `demorec pretrain`.
-        normalization_mapping: The encoder normalises its inputs by the dataset that it was trained on. LeRobot would by
-            each dataset that the policy is trained on, and images by ImageNet.
-    """
-
-    num_keypoints: int = 32
-    encoder_channels: int = 32
-    num_targets: int = 0
-    vocabulary: tuple[str, ...] = ()
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.IDENTITY,
-            "ACTION": NormalizationMode.MEAN_STD,
-        }
-    )
-
-
-make_act_keypoints_pre_post_processors = make_act_pre_post_processors
+"""Factor of a map's maximum, next to its coordinates in [-1, 1]."""
+_MIN_STD = 1e-4
+"""Divisor of inputs that hardly change."""
 
 
 def vocabulary_of(instructions: Iterable[str]) -> tuple[str, ...]:
-    """The words of instructions, sorted; none if there are not two instructions that differ."""
+    """Sorted words of instructions; empty if all instructions are equal."""
     different = set(instructions)
     return tuple(sorted({word for text in different for word in _words(text)})) if len(different) > 1 else ()
 
@@ -81,18 +46,18 @@ def _words(text: str) -> list[str]:
 
 
 class _Gru(nn.GRU):  # type: ignore[misc]
-    """One whose weights stay tensors of their own on a GPU, too: safetensors saves no parts of cuDNN's buffer."""
+    """A GRU whose weights stay separate tensors on a GPU: safetensors cannot save parts of cuDNN's buffer."""
 
     def flatten_parameters(self) -> None:
         """Do nothing."""
 
 
 class _InstructionReader(nn.Module):  # type: ignore[misc]
-    """From instructions to scale and shift of the features of each camera.
+    """Network from instructions to scale and shift of the features of each camera.
 
     Args:
-        vocabulary: Other words are all one.
-        num_cameras, num_features: Of the maps' last features.
+        vocabulary: Known words; all other words are treated as one.
+        num_cameras, num_features: Shape of the maps' last features.
     """
 
     def __init__(self, vocabulary: Sequence[str], num_cameras: int, num_features: int) -> None:
@@ -105,11 +70,11 @@ class _InstructionReader(nn.Module):  # type: ignore[misc]
         nn.init.zeros_(self.modulation.bias)
 
     def forward(self, instructions: Sequence[str]) -> torch.Tensor:
-        """(num_cameras, 2, B, num_features): by how much more than once features are scaled, and their shift."""
+        """Compute scale minus 1, and shift, of the features: (num_cameras, 2, B, num_features)."""
         different, device = sorted(set(instructions)), self.words.weight.device
         numbers = [[self._number.get(word, 0) for word in _words(text)] or [0] for text in different]
         sentences = [self.words(torch.tensor(row, device=device)) for row in numbers]
-        with torch.backends.cudnn.flags(enabled=False):  # which warns of weights that are no single buffer
+        with torch.backends.cudnn.flags(enabled=False):  # it warns about weights in separate buffers
             _, state = self.sentence(nn.utils.rnn.pack_sequence(sentences, enforce_sorted=False))
         found: torch.Tensor = self.modulation(state[0])
         place = {text: row for row, text in enumerate(different)}
@@ -117,12 +82,12 @@ class _InstructionReader(nn.Module):  # type: ignore[misc]
 
 
 class KeypointEncoder(nn.Module):  # type: ignore[misc]
-    """Images and the robot's state as numbers that say where things are.
+    """Network from images and the robot's state to keypoints and predicted targets.
 
     Args:
-        num_cameras: Each has a network of its own.
-        state_dim: Numbers of the robot's state.
-        num_keypoints, channels, num_targets, vocabulary: As of `ActKeypointsConfig`.
+        num_cameras: Number of cameras, each with its own network.
+        state_dim: Length of the robot's state.
+        num_keypoints, channels, num_targets, vocabulary: See `ActKeypointsConfig`.
     """
 
     def __init__(
@@ -143,9 +108,9 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
             self.register_buffer(f"{name}_std", torch.ones(shape))
         self.num_numbers = 3 * num_keypoints * num_cameras
         self.targets = nn.Sequential(
-            nn.Linear(self.num_numbers + state_dim, _HIDDEN), nn.ReLU(),
-            nn.Linear(_HIDDEN, _HIDDEN), nn.ReLU(),
-            nn.Linear(_HIDDEN, num_targets),
+            nn.Linear(self.num_numbers + state_dim, _HIDDEN_SIZE), nn.ReLU(),
+            nn.Linear(_HIDDEN_SIZE, _HIDDEN_SIZE), nn.ReLU(),
+            nn.Linear(_HIDDEN_SIZE, num_targets),
         )  # fmt: skip
         self.linear_targets = nn.Linear(self.num_numbers + state_dim, num_targets)
         self.reader = _InstructionReader(vocabulary, num_cameras, 2 * channels) if vocabulary else None
@@ -153,20 +118,20 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
     def forward(
         self, images: Sequence[torch.Tensor], state: torch.Tensor, instructions: Sequence[str] | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Keypoints (B, 3 K num_cameras) and targets (B, num_targets).
+        """Compute keypoints (B, 3 K num_cameras) and targets (B, num_targets).
 
         Args:
-            images: Of each camera, (B, 3, H, W) in [0, 1].
+            images: Images of each camera, (B, 3, H, W) in [0, 1].
             state: (B, S).
-            instructions: B texts; of use only with a vocabulary.
+            instructions: B texts; used only with a vocabulary.
 
         Raises:
             ValueError: Instructions are needed.
         """
         if self.reader is not None and instructions is None:
             raise ValueError("This act_keypoints reads instructions: its batches need the key 'task'.")
-        # Places are computed in float32: bfloat16 has 8 bits. That maps have no more moves a place by little: between
-        # CPUs with and without it, the next keyframe by 0.02 mm in the median, 0.14 mm for 99 of 100 frames.
+        # Coordinates are computed in float32, since bfloat16 has 8 bits. Maps in bfloat16 matter little: between CPUs
+        # with and without it, the next keyframe moves by 0.02 mm in the median, 0.14 mm for 99 of 100 frames.
         with torch.autocast(state.device.type, enabled=False):
             modulation = None if self.reader is None or instructions is None else self.reader(instructions)
             found = [
@@ -177,29 +142,29 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
             return keypoints, self.targets_of(keypoints, state)
 
     def targets_of(self, keypoints: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-        """(B, num_targets) from keypoints (B, 3 K num_cameras) and the state (B, S).
+        """Predict targets (B, num_targets) from keypoints (B, 3 K num_cameras) and the state (B, S).
 
-        Most are nearly linear in where things are seen; a network alone tells them half as precisely from afar.
+        Most targets are nearly linear in the keypoints; without the linear part, the error from afar doubles.
         """
         numbers = torch.cat([keypoints, self.normalized(state)], dim=1)
         targets: torch.Tensor = self.linear_targets(numbers) + self.targets(numbers)
         return targets
 
     def normalized(self, state: torch.Tensor) -> torch.Tensor:
-        """(B, S)."""
+        """Normalise the state, (B, S)."""
         return (state.float() - self.state_mean) / self.state_std
 
     def normalize_by(self, stats: Mapping[str, Mapping[str, Any]], cameras: Sequence[str]) -> None:
-        """Take the mean and the standard deviation of images and state from a dataset's statistics."""
+        """Set mean and standard deviation of images and state from a dataset's statistics."""
         for moment in ("mean", "std"):
             images = [torch.as_tensor(stats[camera][moment]).reshape(3, 1, 1) for camera in cameras]
             getattr(self, f"image_{moment}").copy_(torch.stack(images))
             getattr(self, f"state_{moment}").copy_(torch.as_tensor(stats[OBS_STATE][moment]).reshape(-1))
-        self.state_std.clamp_(min=_LEAST_STD)
-        self.image_std.clamp_(min=_LEAST_STD)
+        self.state_std.clamp_(min=_MIN_STD)
+        self.image_std.clamp_(min=_MIN_STD)
 
     def _keypoints(self, camera: int, image: torch.Tensor, modulation: torch.Tensor | None) -> torch.Tensor:
-        """(B, 3 K): expected x, expected y, and height, of the maps of one camera."""
+        """Compute expected x, expected y, and height of the maps of one camera, (B, 3 K)."""
         image = (image - self.image_mean[camera]) / self.image_std[camera]
         eye, image = self.eyes[camera], image.contiguous(memory_format=torch.channels_last)
         with torch.autocast(image.device.type, torch.bfloat16, enabled=_has_bfloat16(image.device)):
@@ -217,12 +182,12 @@ class KeypointEncoder(nn.Module):  # type: ignore[misc]
 
 
 def _has_bfloat16(device: torch.device) -> bool:
-    """Whether a CPU computes with bfloat16 by itself: convolutions then take less than half the time."""
+    """Whether the device is a CPU with native bfloat16, which halves the time of convolutions."""
     return device.type == "cpu" and bool(torch.cpu._is_avx512_bf16_supported())
 
 
 def _maps(channels: int, num_keypoints: int) -> nn.Module:
-    """From an image to maps of a quarter of its width and height."""
+    """Network from an image to maps of a quarter of its width and height."""
     layers: list[nn.Module] = []
     sizes = [3, channels, channels, 2 * channels, 2 * channels, 2 * channels]
     for number, (before, after) in enumerate(pairwise(sizes)):
@@ -233,11 +198,11 @@ def _maps(channels: int, num_keypoints: int) -> nn.Module:
 
 
 class ActKeypointsPolicy(ACTPolicy):  # type: ignore[misc]
-    """ACT whose environment state is what a `KeypointEncoder` makes of the images; only ACT is trained.
+    """ACT whose environment state is the output of a `KeypointEncoder`; only ACT is trained.
 
     Args:
-        config: With images and a state among its inputs.
-        **kwargs: LeRobot gives more than is needed.
+        config: Settings, with images and a state among the inputs.
+        **kwargs: Further arguments of LeRobot, which are ignored.
     """
 
     config_class = ActKeypointsConfig
@@ -262,33 +227,33 @@ class ActKeypointsPolicy(ACTPolicy):  # type: ignore[misc]
         self.reset()
 
     def train(self, mode: bool = True) -> ActKeypointsPolicy:
-        """As of a module; the encoder's statistics stay."""
+        """Set the mode; the encoder stays in evaluation mode, so its statistics do not change."""
         super().train(mode)
         self.encoder.eval()
         return self
 
     def forward(self, batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Loss of a batch, as ACT has it."""
+        """Compute ACT's loss of a batch."""
         loss: tuple[torch.Tensor, dict[str, Any]] = super().forward(self._numbers(batch))
         return loss
 
     def predict_action_chunk(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(B, chunk_size, D) actions."""
+        """Predict actions (B, chunk_size, D)."""
         return super().predict_action_chunk(self._numbers(batch))
 
     def encode(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(B, N) keypoints and targets."""
+        """Encode images into keypoints and targets, (B, N)."""
         with torch.no_grad():
             images = [batch[key] for key in self.config.image_features]
             return torch.cat(self.encoder(images, batch[OBS_STATE], batch.get("task")), dim=1)
 
     def _numbers(self, batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """What ACT gets."""
+        """Replace images by numbers, as ACT's inputs."""
         return batch | {OBS_STATE: self.encoder.normalized(batch[OBS_STATE]), OBS_ENV_STATE: self.encode(batch)}
 
 
 def _without_images(config: ActKeypointsConfig, num_numbers: int) -> ACTConfig:
-    """Settings of an ACT that gets numbers in place of the images."""
+    """Settings of an ACT that gets numbers instead of images."""
     own = ACTConfig.__dataclass_fields__
     inner = ACTConfig(**{name: value for name, value in vars(config).items() if name in own and own[name].init})
     inner.input_features = {

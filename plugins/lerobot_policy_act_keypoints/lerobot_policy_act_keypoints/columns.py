@@ -1,11 +1,11 @@
 """Columns of a table as arrays, from which the rows of a whole batch are taken at once.
 
-A table of LeRobot is a memory-mapped Arrow file in chunks. Long columns stay where they are, and several processes
-share them; short ones are joined, so that one index is enough to take rows from them.
+A table of LeRobot is a memory-mapped Arrow file in chunks. Long columns stay in that memory, which several processes
+share; short ones are joined, so that one index is enough to take rows from them.
 
-Language columns hold a list of statements in each row, the same in most rows of an episode. The package datasets walks
-through every value of every statement, since one of their fields may hold JSON. Here only the rows in which one does
-are left to it, and what is equal is read once.
+Language columns hold a list of statements in each row, the same in most rows of an episode. The package datasets
+converts every value of every statement, since one of their fields may hold JSON. Here it converts only rows with JSON,
+and equal rows are converted once.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import torch
 from numpy.typing import NDArray
 
 _JOINED_BYTES = 64 << 20
-"""Columns of up to so many bytes are joined."""
+"""Maximum size of a column whose chunks are joined."""
 
 
 class Column:
     """Numbers of one feature, a row for each frame.
 
     Args:
-        chunks: Arrays of (n, ...) one after the other; (0, ...) at least.
+        chunks: Consecutive arrays (n, ...), at least one.
     """
 
     def __init__(self, chunks: Sequence[NDArray[Any]]) -> None:
@@ -39,7 +39,7 @@ class Column:
         return int(self._starts[-1])
 
     def take(self, rows: NDArray[np.int64]) -> NDArray[Any]:
-        """The given rows, an array of `rows.shape` and the shape of a value, in memory of its own."""
+        """Take rows: an array of `rows.shape` and the shape of a value, in new memory."""
         if len(self._chunks) == 1:
             return self._chunks[0][rows]
         flat = rows.reshape(-1)
@@ -53,7 +53,7 @@ class Column:
         return taken.reshape(*rows.shape, *taken.shape[1:])
 
     def tensor(self, rows: NDArray[np.int64]) -> torch.Tensor:
-        """The given rows with the type that `torch.tensor` gives to numbers of Python."""
+        """Take rows as a tensor of the type that `torch.tensor` gives to numbers of Python."""
         values = torch.from_numpy(self.take(rows))
         if values.dtype.is_floating_point:
             return values.to(torch.get_default_dtype())
@@ -61,7 +61,7 @@ class Column:
 
 
 def numbers(column: pa.ChunkedArray) -> Column | None:
-    """The column as arrays; None when it holds anything but numbers of one shape without gaps."""
+    """Convert a column to arrays; None unless it holds only numbers of one shape, without gaps."""
     chunks = [_array(chunk) for chunk in column.chunks if len(chunk)]
     known = [chunk for chunk in chunks if chunk is not None]
     if not known or len(known) < len(chunks) or len({chunk.shape[1:] for chunk in known}) > 1:
@@ -70,7 +70,7 @@ def numbers(column: pa.ChunkedArray) -> Column | None:
 
 
 def _array(chunk: pa.Array) -> NDArray[Any] | None:
-    """(n, ...) of a chunk, a view of its memory unless it holds bits (bool); None as of `numbers`."""
+    """View a chunk as an array (n, ...), a copy if it holds bits (bool); None as in `numbers`."""
     shape = [len(chunk)]
     while True:
         if chunk.null_count:
@@ -97,16 +97,16 @@ def _array(chunk: pa.Array) -> NDArray[Any] | None:
 
 
 Statement = dict[str, Any]
-_MOST_KEPT = 1024
-"""Lists of statements, of some 40 each, that are kept: one an episode, as a rule."""
+_MAX_KEPT_LISTS = 1024
+"""Lists of about 40 statements that are kept, usually one per episode."""
 _BITS = {pa.float32(): pa.int32(), pa.float64(): pa.int64()}
 
 
 class Statements:
-    """Rows of one language column, as LeRobot gives them, in memory of their own.
+    """Rows of one language column, as LeRobot returns them.
 
     Args:
-        table: Of the package datasets, with this column alone.
+        table: Table of the package datasets, with this column alone.
     """
 
     def __init__(self, table: Any) -> None:
@@ -119,7 +119,7 @@ class Statements:
         self._known: dict[tuple[pa.Scalar, pa.Scalar], int] = {}
 
     def take(self, rows: NDArray[np.int64]) -> list[list[Statement] | None]:
-        """What stands in the given rows (B,)."""
+        """Take the given rows (B,)."""
         return [self._at(row) for row in rows.tolist()]
 
     def _at(self, row: int) -> list[Statement] | None:
@@ -135,17 +135,17 @@ class Statements:
                 if found is None:
                     of_table: list[Statement] = self._table[row][self._name]
                     return of_table
-                if len(self._kept) >= _MOST_KEPT:
+                if len(self._kept) >= _MAX_KEPT_LISTS:
                     self._places.fill(-1)
                     self._kept.clear()
                     self._known.clear()
                 self._known[key] = len(self._kept)
                 self._kept.append(found)
             place = self._places[row] = self._known[key]
-        return [dict(statement) for statement in self._kept[place]]  # whoever gets it may change it
+        return [dict(statement) for statement in self._kept[place]]  # the caller may change it
 
     def _read(self, row: int) -> list[Statement] | None:
-        """None where a value is more than text or a number."""
+        """Convert a row; None if a value is more than text or a number."""
         statements = self._lists[row].values
         values = statements.flatten()
         if statements.null_count or not all(map(_is_plain, values)):
@@ -161,15 +161,15 @@ class Statements:
 
 
 def _is_plain(values: pa.Array) -> bool:
-    """Whether NumPy makes of these values what Python would."""
+    """Whether NumPy converts these values as Python does."""
     if values.null_count == len(values) or pa.types.is_string(values.type):
         return True
     return bool(pa.types.is_floating(values.type)) and not values.null_count
 
 
 def _as_bits(lists: pa.ListArray) -> pa.ListArray:
-    """The same with the bits of its numbers, so that 0.0 is not -0.0 and NaN is NaN."""
-    if lists.null_count:  # Arrow takes no mask beside offsets that begin within an array
+    """Replace floats by their bits, so that 0.0 differs from -0.0 and NaN equals NaN."""
+    if lists.null_count:  # Arrow takes no mask with offsets that begin within an array
         lists = lists.take(pa.array(range(len(lists))))
     statements = lists.values
     values = [array.view(_BITS[array.type]) if array.type in _BITS else array for array in statements.flatten()]

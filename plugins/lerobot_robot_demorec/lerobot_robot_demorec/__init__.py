@@ -1,12 +1,12 @@
-"""Our simulated arms as robots of LeRobot, which its own commands drive with any of its teleoperators.
+"""demorec's simulated arms as robots of LeRobot, whose own commands drive them with any of its teleoperators.
 
     lerobot-teleoperate --robot.type=demorec_so101 --robot.task=stack --fps=30 --teleop.type=so101_leader ...
 
-LeRobot's `keyboard` says which keys are held, its `gamepad` increments of the hand; both move the hand. What
-`lerobot-record` writes is what the teleoperator says: it needs one that says joints.
+LeRobot's `keyboard` reports which keys are held, its `gamepad` increments of the hand; both move the hand.
+`lerobot-record` writes the teleoperator's output, so it needs one that gives joints.
 
-Each action is one control step of 1/fps s, however long it took to come. LeRobot has no word for a new scene, so that
-a connection has one; `--robot.record=DIR` writes it as an ordinary recording.
+Each action is one control step of 1/fps s, no matter how long it took to arrive. LeRobot has no command for a new
+scene, so each connection has one scene; `--robot.record=DIR` writes it as an ordinary recording.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Outcome
 from demorec.episode.features import state_names
 from demorec.gym_env import DemorecEnv
-from demorec.lerobot_robot.config import DemorecPandaConfig, DemorecSO101Config, SimulatedArmConfig
 from demorec.mcap import EpisodeWriter
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
 from demorec.robots.so101 import SO101_FOLLOWER
+from lerobot_robot_demorec.config import DemorecPandaConfig, DemorecSO101Config, SimulatedArmConfig
 
 __all__ = ["DemorecPanda", "DemorecPandaConfig", "DemorecSO101", "DemorecSO101Config"]
 

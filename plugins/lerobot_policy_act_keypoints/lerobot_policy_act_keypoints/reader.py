@@ -1,6 +1,6 @@
-"""A dataset to train on that takes the place of LeRobot's own; its items are made for a whole batch at once.
+"""A faster `LeRobotDataset`: it makes the items of a whole batch at once.
 
-They are those of LeRobot's reader, key for key and bit-exact.
+The items are those of LeRobot's reader, key for key and bit-exact.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError
-from demorec.learn.training.columns import Column, Statements, is_statements, numbers
-from demorec.learn.training.images import ImageReader
+from lerobot_policy_act_keypoints.columns import Column, Statements, is_statements, numbers
+from lerobot_policy_act_keypoints.errors import RequestError
+from lerobot_policy_act_keypoints.images import ImageReader
 
 INTERVENTION = "intervention"
 """Column of LeRobot's DAgger: true where the expert acts in an episode that a policy began."""
@@ -29,11 +29,11 @@ STRETCH_COLUMNS = ("index", "episode_index", INTERVENTION)
 
 
 def expert_acts(episode: NDArray[Any], intervention: NDArray[Any]) -> NDArray[np.bool_]:
-    """(N,) whether the expert acts in a frame: everywhere in the episodes that it did not correct.
+    """Whether the expert acts in each frame, (N,): also in all frames of episodes without corrections.
 
     Args:
         episode: (N,) number of each frame's episode.
-        intervention: N times whether it acts, having taken over from a policy.
+        intervention: (N,) or (N, 1) whether the expert acts after it took over from a policy.
     """
     acts = intervention.reshape(-1).astype(bool)
     return np.asarray(acts | ~np.isin(episode, episode[acts]))
@@ -43,13 +43,13 @@ class Stretches:
     """The stretches of frames in which the expert acts; an episode without corrections is one stretch.
 
     Args:
-        index: (N,) of each row of the table in the whole dataset.
-        episode_index: (N,) its episode.
-        intervention: (N,) whether the expert acts in it, having taken over from a policy.
+        index: (N,) index of each row of the table in the whole dataset.
+        episode_index: (N,) episode of each row.
+        intervention: (N,) whether the expert acts in it after it took over from a policy.
 
     Attributes:
-        shown: (N,) row that is given for each row: itself where the expert acts; the rows of the policy are spread
-            evenly over those of the expert.
+        shown: (N,) row that replaces each row: itself where the expert acts; rows of the policy are replaced by rows of
+            the expert, all equally often.
         first, end: (N,) index of the first frame of a row's stretch, and the one after its last.
     """
 
@@ -72,12 +72,12 @@ Item = dict[str, Any]
 
 
 class FastReader(DatasetReader):  # type: ignore[misc]
-    """Reads what LeRobot's reader reads.
+    """Reader of whole batches.
 
     Args:
-        reader: LeRobot's, ready to read or not; its settings and its table are taken over.
-        cache_bytes: Limit of the decoded frames that each process keeps.
-        expert_only: As of `FastDataset`.
+        reader: LeRobot's reader, whose settings and table are taken over.
+        cache_bytes: Maximum size of the decoded frames that each process keeps.
+        expert_only: See `FastDataset`.
     """
 
     def __init__(self, reader: DatasetReader, cache_bytes: int, *, expert_only: bool = False) -> None:
@@ -90,21 +90,21 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         self.left_out: NDArray[np.bool_] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Settings and LeRobot's table: a worker process finds its own arrays and opens its own files."""
+        """Settings and LeRobot's table; a worker process makes its own arrays and opens its own files."""
         return {**self.__dict__, "_tables": None, "_images": None}
 
     def get_item(self, idx: int) -> Item:
-        """One item; IndexError for an index beyond the table."""
+        """Get one item. Raises IndexError for an index beyond the table."""
         return self.get_items([idx])[0]
 
     def get_items(self, indices: Sequence[int]) -> list[Item]:
-        """The items of a batch, in the given order.
+        """Get the items of a batch, in the given order.
 
         Args:
             indices: Rows of the table (of the chosen episodes), negative ones counted from its end.
 
         Raises:
-            IndexError: One lies beyond the table.
+            IndexError: An index is beyond the table.
             FrameTimestampError: A video has no frame at the time of a row.
         """
         tables = self._current_tables()
@@ -137,14 +137,14 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         return self._tables
 
     def _current_images(self) -> ImageReader:
-        """Of this process: a forked one shares the places in the files that its parent has opened."""
+        """The image reader of this process: a forked process must not share file positions with its parent."""
         if self._images is None or self._process != os.getpid():
             self._images = ImageReader(self._video_backend, self._tolerance_s, self._cache_bytes)
             self._process = os.getpid()
         return self._images
 
     def _values(self, tables: _Tables, name: str, rows: Rows) -> Sequence[Any]:
-        """A feature's value for each item: of its row (B,), or stacked of the rows of its window (B, T)."""
+        """Values of a feature for each item: of its row (B,), or stacked from the rows of its window (B, T)."""
         if name in tables.numbers:
             return list(tables.numbers[name].tensor(rows).unbind(0))
         if name in tables.statements and rows.ndim == 1:
@@ -163,8 +163,7 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         windows: dict[str, Rows],
         is_wanted: NDArray[np.bool_],
     ) -> dict[str, list[torch.Tensor]]:
-        """Video feature -> images of each item, (C, H, W) or (T, C, H, W), as LeRobot gives them; black ones of the
-        items that are not wanted."""
+        """Video feature -> images of each item, (C, H, W) or (T, C, H, W); black ones for items that are not wanted."""
         now_s = np.array([time.item() for time in times], np.float64)[:, None]
         videos: dict[str, list[torch.Tensor]] = {}
         for key in self._meta.video_keys:
@@ -187,11 +186,11 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         return videos
 
     def _color(self, images: torch.Tensor) -> torch.Tensor:
-        """As it is, or as float32 in 0..1."""
+        """Convert to float32 in 0..1, unless uint8 is wanted."""
         return images if self._return_uint8 else images.to(torch.float32) / 255
 
     def _depth(self, key: str, codes: torch.Tensor) -> torch.Tensor:
-        """Distances in the wanted unit, float32."""
+        """Convert codes to distances in the wanted unit, float32."""
         coder = self._depth_encoder_configs[key]
         depth: torch.Tensor = dequantize_depth(
             codes,
@@ -204,7 +203,7 @@ class FastReader(DatasetReader):  # type: ignore[misc]
         return depth
 
     def _finish(self, item: Item, colors: Iterable[str], tasks: Sequence[str]) -> None:
-        """What is made of an item's values one by one: transforms (they may draw random numbers), units, the task."""
+        """Apply image transforms (which may draw random numbers) and units to one item, and add its task."""
         if self._image_transforms is not None:
             for key in colors:
                 item[key] = self._image_transforms(item[key])
@@ -215,19 +214,19 @@ class FastReader(DatasetReader):  # type: ignore[misc]
 
 
 class _Tables:
-    """A dataset's tables, ready for batches.
+    """Tables of a dataset, ready for batches.
 
     Attributes:
-        source: The table of rows that they were made from.
-        names: Its columns in order.
-        numbers: Those that are arrays.
-        others: The rest, each as a table that LeRobot's conversion is applied to: images, texts, gaps.
-        statements: Those of them that are language columns.
+        source: Table of rows that they were made from.
+        names: Columns in order.
+        numbers: Columns that are arrays.
+        others: Other columns (images, texts, gaps), each as a table to which LeRobot's conversion is applied.
+        statements: Language columns among `others`.
         video_paths: Video feature -> its files.
         video_file: Video feature -> number of the file of each episode, (E,).
-        video_start_s: Video feature -> where each episode begins in its file, in seconds, (E,) float64.
+        video_start_s: Video feature -> start of each episode in its file, in seconds, (E,) float64.
         tasks: Instructions by task index.
-        stretches: Where the expert acts, if only that counts.
+        stretches: Stretches in which the expert acts, if only these count.
     """
 
     def __init__(self, reader: FastReader) -> None:
@@ -264,8 +263,8 @@ class _Tables:
     def window(
         self, rows_now: Rows, absolute: Rows, episodes: Rows, deltas: Iterable[int]
     ) -> tuple[Rows, NDArray[np.bool_]]:
-        """Rows beside those of a batch, held at the ends of their episodes (or of the expert's stretches), and which
-        of them lie beyond: (B, T).
+        """Rows of the windows of a batch (B, T), clipped to their episodes (or to the expert's stretches), and whether
+        each was clipped.
 
         Raises:
             KeyError: A chosen episode lacks rows in the table.
@@ -276,7 +275,7 @@ class _Tables:
             first, end = self.stretches.first[rows_now][:, None], self.stretches.end[rows_now][:, None]
         rows = np.clip(wanted, first, end - 1)
         is_beyond = (wanted < first) | (wanted >= end)
-        if self._row_of is None:  # the table has all episodes, so that row and index are the same
+        if self._row_of is None:  # the table has all episodes, so row and index are equal
             return rows, is_beyond
         found = self._row_of[rows]
         if (found < 0).any():
@@ -285,7 +284,7 @@ class _Tables:
 
 
 def _columns(table: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Column -> its memory, not copied, of a table of the package datasets."""
+    """Columns of a table of the package datasets, without copying."""
     arrow = table.with_format("arrow")[:]
     return {name: arrow.column(name) for name in names}
 
@@ -312,15 +311,15 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
     order in the file. It can be pickled and forked; each process opens its own files and has its own cache.
 
     Args:
-        *args: As of `LeRobotDataset`.
-        frame_cache_bytes: Limit of the decoded frames that each process keeps for later batches, in bytes; 0 for none.
-        expert_only: Of episodes that an expert corrected (the column `intervention`), learn from what the expert did
-            alone: a frame of the policy gives one of the expert's instead, all of these equally often, and no window
-            of actions goes on into frames of the policy.
-        **kwargs: As of `LeRobotDataset`.
+        *args: Arguments of `LeRobotDataset`.
+        frame_cache_bytes: Maximum size of the decoded frames that each process keeps for later batches; 0 for none.
+        expert_only: In episodes that an expert corrected (column `intervention`), learn from the expert alone: a frame
+            of the policy is replaced by a frame of the expert, all equally often, and windows of actions end where
+            frames of the policy begin.
+        **kwargs: Arguments of `LeRobotDataset`.
 
     Raises:
-        ConfigError: Only the expert's frames are wanted, and the dataset does not state which these are.
+        RequestError: `expert_only` is set, and the dataset has no column `intervention`.
     """
 
     _frame_cache_bytes = DEFAULT_CACHE_BYTES
@@ -333,24 +332,24 @@ class FastDataset(LeRobotDataset):  # type: ignore[misc]
         self._expert_only = expert_only
         super().__init__(*args, **kwargs)
         if expert_only and INTERVENTION not in self.meta.features:
-            raise ConfigError(
+            raise RequestError(
                 f"The dataset does not state which frames are the expert's: export it with --intervention: {self.root}"
             )
 
     def __getitems__(self, indices: Sequence[int]) -> list[Item]:
-        """The items of a batch, in the given order: what `DataLoader` calls; errors as of an item."""
+        """Get the items of a batch, in the given order. `DataLoader` calls this."""
         if self.writer is not None and not self._is_finalized:
-            return [self[index] for index in indices]  # which LeRobot refuses
+            return [self[index] for index in indices]  # LeRobot raises its own error
         reader = self._ensure_reader()
         if reader.hf_dataset is None:
             reader.load_and_activate()
         return reader.get_items(indices)
 
     def leave_out_images(self, left_out: NDArray[np.bool_]) -> None:
-        """From now on give black images in place of the frames that are marked here.
+        """Return black images for the marked frames from now on.
 
         Args:
-            left_out: (total_frames,) by the dataset's index; what is changed in it later holds from then on.
+            left_out: (total_frames,) by the dataset's index; later changes of the array have an effect.
         """
         self._ensure_reader().left_out = left_out
 

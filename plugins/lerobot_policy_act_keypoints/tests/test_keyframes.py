@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from demorec.learn.training.keyframes import find_keyframes, keyframe_targets
+from lerobot_policy_act_keypoints.keyframes import find_keyframes, keyframe_targets
 
 
 def test_the_next_changes_are_found_and_never_those_of_another_episode() -> None:

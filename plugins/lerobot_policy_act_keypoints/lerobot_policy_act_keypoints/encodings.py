@@ -1,4 +1,4 @@
-"""What an encoder that is not trained makes of a dataset's frames: every image is decoded and encoded once."""
+"""Cache of an encoder's output: every image of a dataset is decoded and encoded once."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-_TOGETHER = 32
-"""Frames that are encoded at once. Always as many (with copies), so that what comes out of a frame does not depend, in
-its last bits, on how many others are new."""
+_BATCH_SIZE = 32
+"""Frames that are encoded at once. Smaller batches are filled with copies, since the last bits of an encoding depend on
+the size of the batch."""
 
 
 class Encodings:
-    """The numbers that the encoder of an `act_keypoints` policy makes of each frame, kept from the first time on.
+    """Encoded frames of an `act_keypoints` policy.
 
     Attributes:
-        known: (num_frames,) by the dataset's index; the images of these are not asked for again.
+        known: (num_frames,) whether a frame, by its index in the dataset, is encoded; its images are not needed again.
     """
 
     def __init__(self, num_frames: int) -> None:
@@ -25,7 +25,7 @@ class Encodings:
         self._kept: torch.Tensor | None = None
 
     def serve(self, policy: Any) -> None:
-        """Answer in place of a policy's encoder, for batches that have the key "index", as those of a dataset do."""
+        """Replace the encoder of a policy for batches that have the key "index", as those of a dataset do."""
         encode = policy.encode
 
         def look_up(batch: dict[str, Any]) -> torch.Tensor:
@@ -34,15 +34,15 @@ class Encodings:
                 return found
             index = batch["index"].reshape(-1).cpu().numpy()
             new = np.flatnonzero(~self.known[index])
-            for start in range(0, len(new), _TOGETHER):
-                self._keep(index, new[start : start + _TOGETHER], batch, encode)
+            for start in range(0, len(new), _BATCH_SIZE):
+                self._keep(index, new[start : start + _BATCH_SIZE], batch, encode)
             assert self._kept is not None
             return self._kept[index].to(batch["index"].device)
 
         policy.encode = look_up
 
     def _keep(self, index: NDArray[np.int64], places: NDArray[np.int64], batch: dict[str, Any], encode: Any) -> None:
-        padded = np.resize(places, _TOGETHER)
+        padded = np.resize(places, _BATCH_SIZE)
         part = {key: value[padded] for key, value in batch.items() if key.startswith("observation.")}
         if "task" in batch:
             part["task"] = [batch["task"][place] for place in padded]
