@@ -81,7 +81,7 @@ def _images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str,
         for plan in episode.rows.cameras.values():
             taken.setdefault(plan.topic, []).append(plan.taken)
     wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
-    decoder, counts = BagDecoder(bag.num_bytes), dict.fromkeys(wanted, 0)
+    decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
     for message in bag.messages([], wanted.keys()):
         topic = message.channel.topic
         number, counts[topic] = counts[topic], counts[topic] + 1
