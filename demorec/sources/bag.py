@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -20,7 +20,7 @@ from demorec.core.errors import ConfigError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
 from demorec.mcap.scan import ScannedMessage
 from demorec.runs.find import BAG_SUFFIXES, IMPORT_WORDS, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, name_of
-from demorec.sources.bag_files import MAX_TIME_NS, BagError, Report, read_mcap, read_ros1, read_sqlite
+from demorec.sources.bag_files import MAX_TIME_NS, BagError, Report, Topics, read_mcap, read_ros1, read_sqlite
 from demorec.sources.words import in_natural_order
 
 _SUFFIXES = (".mcap", *BAG_SUFFIXES)
@@ -62,7 +62,7 @@ class Bag:
         """Digests of its files, by which the bag is known again."""
         return tuple((path.name, sha256_of(path)) for path in self.files)
 
-    def messages(self, problems: list[str], topics: Collection[str] | None = None) -> Iterator[ScannedMessage]:
+    def messages(self, problems: list[str], topics: Topics = None) -> Iterator[ScannedMessage]:
         """Read its messages, file after file.
 
         Args:
@@ -81,9 +81,7 @@ class Bag:
                     problems.append(problem)
 
             with _unpacked(path) as (plain, magic):
-                for message in _READERS[magic](plain, report):
-                    if topics is not None and message.channel.topic not in topics:
-                        continue
+                for message in _READERS[magic](plain, topics, report):
                     if not 0 <= message.log_ns < MAX_TIME_NS:
                         report(f"a message of {message.channel.topic} was recorded at no possible time")
                         continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -14,6 +14,8 @@ from demorec.mcap.scan import CutOffError, ScannedChannel, ScannedMessage, scan
 
 MAX_TIME_NS = 1 << 62
 """Latest time of a message, in the year 2116: the difference of two fits 64 bits."""
+Topics = Collection[str] | None
+"""Topics that are wanted; None: all."""
 Report = Callable[[str], None]
 """Called with the reason, for the inside of a sentence, when part of a file cannot be read."""
 
@@ -22,7 +24,7 @@ class BagError(DemorecError):
     """A bag cannot be read, or does not hold what its mapping says."""
 
 
-def read_mcap(path: Path, report: Report) -> Iterator[ScannedMessage]:
+def read_mcap(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
     """Read an MCAP file in the order of the file: with or without chunks and an index, whole or cut off.
 
     `mcap`'s own readers make an object of each field's bytes, which makes the import of a bag a tenth dearer.
@@ -31,7 +33,7 @@ def read_mcap(path: Path, report: Report) -> Iterator[ScannedMessage]:
         file.seek(len(MCAP_MAGIC))
         try:
             for item in scan(file, Unpacked(Limits.of_file(path.stat().st_size))):
-                if isinstance(item, ScannedMessage):
+                if isinstance(item, ScannedMessage) and (topics is None or item.channel.topic in topics):
                     yield item
         except MemoryError:
             raise
@@ -40,7 +42,7 @@ def read_mcap(path: Path, report: Report) -> Iterator[ScannedMessage]:
             report(str(error) if is_own else f"a record is damaged: {describe_error(error)}")
 
 
-def read_sqlite(path: Path, report: Report) -> Iterator[ScannedMessage]:
+def read_sqlite(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
     """Read a .db3 file of rosbag2 in the order of the times of recording; BagError when it is damaged."""
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -48,19 +50,21 @@ def read_sqlite(path: Path, report: Report) -> Iterator[ScannedMessage]:
     if journal.is_file() and journal.stat().st_size:
         report(f"messages in {journal.name} are not read: open a copy of the bag with sqlite3, which takes them in")
     reader = Sqlite3Reader(Path(quote(str(path.resolve()))))  # which makes a URI of it
-    yield from _rosbags_messages(reader, path, report, advice="")
+    yield from _rosbags_messages(reader, path, topics, report, advice="")
 
 
-def read_ros1(path: Path, report: Report) -> Iterator[ScannedMessage]:
+def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
     """Read a bag of ROS 1 in the order of the times of recording; BagError when it is damaged, or has no index."""
     from rosbags.rosbag1 import Reader
 
     advice = f"; rosbag reindex {path.name} restores the index of one that was not finished"
-    yield from _rosbags_messages(Reader(path), path, report, advice=advice)
+    yield from _rosbags_messages(Reader(path), path, topics, report, advice=advice)
 
 
-def _rosbags_messages(reader: Any, path: Path, report: Report, *, advice: str) -> Iterator[ScannedMessage]:
-    """Read all messages with a reader of `rosbags`."""
+def _rosbags_messages(
+    reader: Any, path: Path, topics: Topics, report: Report, *, advice: str
+) -> Iterator[ScannedMessage]:
+    """Read messages with a reader of `rosbags`; BagError with `advice` when it cannot open the file."""
     try:
         reader.open()
     except (MemoryError, OSError):
@@ -68,8 +72,9 @@ def _rosbags_messages(reader: Any, path: Path, report: Report, *, advice: str) -
     except Exception as error:  # its own errors, and those of what it does not foresee
         raise BagError(f"The bag is damaged ({describe_error(error).rstrip('.')}){advice}: {path}") from error
     try:
-        channels = {connection.id: _channel(connection) for connection in reader.connections}
-        for connection, time_ns, data in reader.messages(reader.connections):
+        wanted = [connection for connection in reader.connections if topics is None or connection.topic in topics]
+        channels = {connection.id: _channel(connection) for connection in wanted}
+        for connection, time_ns, data in reader.messages(wanted) if wanted else ():
             yield ScannedMessage(channels[connection.id], time_ns, data)
     except MemoryError:
         raise
