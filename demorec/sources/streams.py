@@ -30,7 +30,6 @@ from demorec.sources.fields import (
     SourceReader,
     converted,
     follow,
-    frame_id_of,
     image_bytes,
     parse_path,
     reader_of,
@@ -69,7 +68,6 @@ class Stream:
         heads: (N,) what is known of each image; empty for others.
         sums: CRC-32 of each message's bytes.
         image_sums: CRC-32 of each image's bytes; empty for others.
-        frame_ids: Coordinate frames that messages name, in the order of their first occurrence.
         num_malformed: Messages that cannot be read or lack something.
         first_problem: What is wrong with the first of them.
         first_refusal: Why the first message was left to another publisher.
@@ -87,7 +85,6 @@ class Stream:
     heads: ImageHeads = field(default_factory=ImageHeads)
     sums: array[int] = field(default_factory=lambda: array("I"))
     image_sums: array[int] = field(default_factory=lambda: array("I"))
-    frame_ids: list[str] = field(default_factory=list)
     num_malformed: int = 0
     first_problem: str = ""
     first_refusal: str = ""
@@ -114,8 +111,6 @@ class Stream:
         self.logged.append(message.log_ns)
         self.stamped.append(NO_STAMP if stamp is None else stamp)
         self.sums.append(checksum)
-        if len(self.frame_ids) < 16 and (frame_id := frame_id_of(values)) not in self.frame_ids:
-            self.frame_ids.append(frame_id)
 
     def malformed(self, problem: str) -> None:
         """Count a message that cannot be used."""
@@ -275,7 +270,7 @@ class BagStreams:
         if topic in self.texts:
             self._add_text(topic, message, values)
         if topic in self._info_topics:
-            kept = {key: values[key] for key in _INFO_FIELDS if key in values} | {"frame_id": frame_id_of(values)}
+            kept = {key: values[key] for key in _INFO_FIELDS if key in values}
             self.infos.setdefault(self._info_topics[topic], kept)
 
     def _add_text(self, topic: str, message: ScannedMessage, values: Values) -> None:

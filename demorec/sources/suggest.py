@@ -206,8 +206,8 @@ def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
         stamp = "" if topic.has_stamp else ", no times in its headers"
         yield f"#   {name}  {topic.type}, {rate}{topic.count} messages{stamp}"
         fields = [f"{key}: {_short(value)}" for key, value in (topic.first or {}).items() if key not in _TIMES]
-        shown = "; ".join(fields)[:160]
-        yield f"#     {topic.problem or shown or ('none of its messages can be read' if topic.first is None else 'no fields')}"
+        shown = "; ".join(fields)[:160] or ("no fields" if topic.first else "none of its messages can be read")
+        yield f"#     {topic.problem or shown}"
 
 
 def _short(value: Any) -> str:
