@@ -42,8 +42,6 @@ from demorec.sources.words import quoted
 NO_STAMP = -(2**63)
 Key = tuple[str, int] | str
 """A stream: (feature, number of its source), or the name of a camera."""
-_MAX_NUMBERS = 16_384
-"""Of all features together, in a row."""
 _MAX_TEXT = 10_000
 _MAX_URDF = 4 << 20
 _SHOWN_JOINTS = 40
@@ -309,9 +307,6 @@ class BagStreams:
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
             if stream.reader is not None and stream.reader.others:
                 problems.append(_unnamed_joints(stream, stream.reader))
-        count = sum(len(stream.names) for stream in self.all.values())
-        if count > _MAX_NUMBERS:
-            problems.append(f"its features have {count:,} numbers, at most {_MAX_NUMBERS:,} are read")
         problems += self._double_names()
         for stream in self.all.values():
             if stream.part.stamp == "header" and len(stream) and max(stream.stamped) <= 0:

@@ -24,6 +24,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from numpy.typing import NDArray
 from PIL import Image
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -326,10 +327,8 @@ def write_rosbag2(
     return path
 
 
-def write_ros1(notes: Notes, path: Path, *, compression: Any = None) -> Path:
+def write_ros1(notes: Notes, path: Path, *, compression: Ros1Writer.CompressionFormat | None = None) -> Path:
     """A bag of ROS 1, by `rosbags`."""
-    from rosbags.rosbag1 import Writer as Ros1Writer
-
     store = _store(is_ros1=True)
     writer = Ros1Writer(path)
     if compression is not None:
