@@ -17,6 +17,7 @@ import zstandard
 from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 from PIL import Image
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 from support.fuzz import LimitedCommands, problem_of
@@ -163,7 +164,7 @@ def a_chunk_of_zeros(folder: Path) -> Path:
     note = bags.Note(
         topic="/image", type="sensor_msgs/msg/Image", log_ns=bags.EPOCH_NS, header_ns=bags.EPOCH_NS, body=body
     )
-    return bags.write_ros1([note], folder / "bag.bag", compression=bags.Ros1Writer.CompressionFormat.BZ2)
+    return bags.write_ros1([note], folder / "bag.bag", compression=Ros1Writer.CompressionFormat.BZ2)
 
 
 BAGS = (
