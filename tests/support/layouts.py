@@ -185,7 +185,6 @@ def trajectory_part(topic: str, names: Sequence[str]) -> Part:
 
 UR = tuple(f"{name}_joint" for name in ("shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "shoulder_pan"))
 FR3 = tuple(f"fr3_joint{k}" for k in range(1, 8))
-FINGERS = ("fr3_finger_joint1", "fr3_finger_joint2")
 OMX = ("joint1", "joint2", "joint3", "joint4", "joint5", "gripper_joint_1")
 SIX = tuple(f"joint_{k}" for k in range(1, 7))
 
