@@ -145,7 +145,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
         names = [element for line in lines.sources(name) for element in line.stream.names]
         features[name] = {"dtype": "float32", "shape": (len(names),), "names": names}
     dataset = LeRobotDataset.create("local/x", fps=FPS, features=features, root=out / "dataset", use_videos=True)
-    decoder, kept = BagDecoder(opened.num_bytes), {name: list[NDArray[np.uint8]]() for name in rows.cameras}
+    decoder, kept = BagDecoder(), {name: list[NDArray[np.uint8]]() for name in rows.cameras}
     packets: dict[str, list[bytes]] = {name: [] for name in rows.cameras}
     topics = {camera.topic: name for name, camera in known.cameras.items()}
     for message in opened.messages([], topics.keys()):
@@ -177,7 +177,7 @@ def decoding_and_coding(bag: Path) -> None:
     from demorec.sources.decoding import BagDecoder
     from demorec.sources.image_messages import decode_image
 
-    decoder = BagDecoder(open_bag(bag).num_bytes)
+    decoder = BagDecoder()
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}
     for message in open_bag(bag).messages([], CAMERAS):
         encoders[message.channel.topic].encode(decode_image(decoder.values(message)))

@@ -1,22 +1,30 @@
-"""Where the programs `demorec` and `generate-dataset` begin, and `python -m demorec`.
+"""Entry points of the programs `demorec` and `generate-dataset`, and of `python -m demorec`.
 
-Nothing is imported before Ctrl-C is an exit code: loading the command line takes a third of a second, in which people
-have time to think better of it.
+Commands that read files continue in a limited child process, forked before anything heavy is imported. Ctrl-C while
+the command line loads, a third of a second, is an exit code.
 """
+
+from __future__ import annotations
+
+import sys
 
 
 def main() -> None:
     """`demorec`."""
-    _start("main")
+    _start("main", is_limited=True)
 
 
 def generate_dataset() -> None:
     """`generate-dataset`."""
-    _start("generate_dataset_main")
+    _start("generate_dataset_main", is_limited=False)
 
 
-def _start(program: str) -> None:
+def _start(program: str, *, is_limited: bool) -> None:
     try:
+        if is_limited:
+            from demorec.core.limited import continue_in_child
+
+            continue_in_child(sys.argv[1:])
         from demorec import cli
 
         getattr(cli, program)()

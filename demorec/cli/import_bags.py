@@ -27,7 +27,7 @@ _WORDS = ", ".join(f"{word} ({form.name})" for word, form in FORMATS.items())
 
 @dataclass(frozen=True, kw_only=True)
 class Import:
-    """Make a run of another robot's bags (MCAP, .db3, rosbag2 folders; without ROS), HDF5 files or LeRobot dataset.
+    """Make a run of another robot's bags (MCAP, rosbag2, ROS 1; without ROS), HDF5 files or LeRobot dataset.
 
     A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
     holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the

@@ -18,6 +18,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from demorec.core.limited import remove_cpu_limit
+
 _PATIENCE_S = 3.0
 """How long a program may take to end when it is asked to."""
 _LATER_S = 0.02
@@ -170,6 +172,7 @@ def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[An
 
 
 def _stand_between(command: Sequence[str]) -> int:
+    remove_cpu_limit()
     program = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the program, too
 

@@ -197,7 +197,6 @@ class Readers:
         order: "<" or ">", of the bytes of numbers.
         is_aligned: Whether they are aligned, as CDR has them; those of ROS 1 are not.
         text: What becomes of the bytes of a string.
-        take: Called with how many values are made next, before they are.
     """
 
     def __init__(
@@ -207,9 +206,8 @@ class Readers:
         order: str = "<",
         is_aligned: bool = True,
         text: Callable[[bytes], str] = strict_text,
-        take: Callable[[int], None] = lambda count: None,
     ) -> None:
-        self._types, self._order, self._is_aligned, self._decode, self._take = types, order, is_aligned, text, take
+        self._types, self._order, self._is_aligned, self._decode = types, order, is_aligned, text
         self._made: dict[str, tuple[Reader, int]] = {}
 
     def of(self, kind: str) -> Reader:
@@ -229,12 +227,10 @@ class Readers:
         parts = [(field.name, *self._field(field, depth)) for field in self._types[kind]]
         height = max((below for _, _, below in parts), default=0)
         readers = [(name, reader) for name, reader, _ in parts]
-        take, count = self._take, 1 + len(readers)
         if not readers and self._is_aligned:  # ROS 2 gives a type without fields a byte
             return lambda data, position: ({}, position + 1), height
 
         def read(data: memoryview, position: int) -> tuple[Values, int]:
-            take(count)
             values = {}
             for field, read_field in readers:
                 values[field], position = read_field(data, position)
@@ -305,13 +301,12 @@ class Readers:
         return read
 
     def _list(self, read_element: Reader, count: int | None) -> Reader:
-        count_of, take = self._count(count), self._take
+        count_of = self._count(count)
 
         def read(data: memoryview, position: int) -> tuple[list[Any], int]:
             number, position = count_of(data, position)
             if number > len(data) - position:  # each element takes a byte at least
                 raise ValueError("a list reaches beyond its end")
-            take(number)
             values = []
             for _ in range(number):
                 value, position = read_element(data, position)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from demorec.core.errors import ConfigError, RecordingError
+from demorec.core.errors import ConfigError
 
 VARIABLE = "DEMOREC_UNPACKED_MB"
 _DEFAULT_MB = 64
@@ -27,10 +27,6 @@ _BYTES_PER_RECORD = 16
 
 class LimitError(ValueError):
     """A file would unpack to more than is allowed, or a message holds more; `str` is the reason and what to do."""
-
-
-class SpentError(RecordingError):
-    """A file holds more in all than is read of one of its size: what is left of it is never silently left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,40 +89,6 @@ class Unpacked:
         self._num_records += num_records
         self.limits.check_total(self._num_bytes)
         self.limits.check_records(self._num_records)
-
-
-class Budget:
-    """How much of something may be built from a file, taken bit by bit: what is built counts, whatever the file says.
-
-    Args:
-        total: The most that all calls of `take` may take together.
-        each: The most after each `begin`.
-        what: It is, in the plural ("values").
-
-    Attributes:
-        used: Of it until now.
-        begun: `used` at the last `begin`.
-    """
-
-    def __init__(self, total: int, each: int, what: str) -> None:
-        self._total, self._each, self._what = total, each, what
-        self.used = 0
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin with the next message, or whatever `each` is of."""
-        self.begun = self.used
-        self._most = min(self._total, self.used + self._each)
-
-    def take(self, count: int = 1) -> None:
-        """Count so many; LimitError when they are too many for one, SpentError for all."""
-        if self.used + count > self._total:
-            raise SpentError(
-                f"The bag holds more than {self._total:,} {self._what}, too many for its size; {VARIABLE} raises this"
-            )
-        if self.used + count > self._most:
-            raise LimitError(f"it holds more than {self._each:,} {self._what}")
-        self.used += count
 
 
 def _check(size: int, allowed: int) -> None:

@@ -57,17 +57,19 @@ IMPORT_WORDS: dict[PathKind, str] = {"dataset": "lerobot", "hdf5": "hdf5"}
 """The word after `demorec import` by which each kind is imported that is no bag (`demorec.sources.formats`)."""
 ROSBAG2 = "metadata.yaml"
 """In a folder that is a bag of rosbag2."""
-BAG_SUFFIXES = (".db3", ".mcap.zstd", ".db3.zstd")
+BAG_SUFFIXES = (".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 """Of files that are bags, beside .mcap, which may be a recording."""
 OUR_METADATA = b"demorec."
 """How the names of our recordings' metadata begin."""
+SQLITE_MAGIC = b"SQLite format 3\0"
+ROS1_MAGIC = b"#ROSBAG V"
 _HEAD_BYTES = 1 << 16
 _MAGICS: tuple[tuple[bytes, PathKind], ...] = (
     (MCAP_MAGIC, "recording"),
     *((magic, "rrd") for magic in RERUN_MAGICS),
     (HDF5_MAGIC, "hdf5"),
-    (b"#ROSBAG", "rosbag"),
-    (b"SQLite format 3", "rosbag"),
+    (ROS1_MAGIC, "rosbag"),
+    (SQLITE_MAGIC, "rosbag"),
 )
 _SUFFIXES: dict[str, PathKind] = {".mcap": "recording", ".part": "unfinished", ".rrd": "rrd", ".hdf5": "hdf5"}
 _MARKS: tuple[tuple[str, PathKind], ...] = (

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.geometry import signs_of_course
-from demorec.episode.features import ACTION, STATE
-from demorec.episode.info import DEPTH_UNITS
-from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
-from demorec.sources.fields import frame_id_of
+from demorec.episode.features import ACTION
+from demorec.sources.clock import NS, SKEW_S, Numbers, Timeline
 from demorec.sources.findings import (
-    FROZEN,
     GAP,
     LOST,
     NOTE,
@@ -25,16 +19,10 @@ from demorec.sources.findings import (
     of_stream,
     stream_findings,
 )
-from demorec.sources.mapping import SourceMapping
 from demorec.sources.rows import RATE, EpisodeRows, Timelines
-from demorec.sources.streams import BagStreams
 
 _EPOCH_S = 1e8
 """Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
-_DEGREES = (40.0, 80.0)
-"""Times the range of the same joints, of which one is in degrees: 57, and a leader does not reach as far as its arm."""
-_FULL_TURNS = 4 * np.pi
-"""Beyond which no joint angle is in rad."""
 _RESTS = 0.02
 """Of the range of all elements, within which they stay while a robot stands still."""
 _SLOW = 1.15
@@ -61,14 +49,8 @@ def _findings(bag: Timelines) -> Iterator[Finding]:
     yield from _extent_findings(regular)
     yield from _offset_findings(lines)
     yield from _mixed_findings(bag, lines)
-    yield from _camera_findings(bag.streams)
     yield from _frozen_findings(lines)
     yield from _slow_findings(regular, bag.mapping.clock.fps)
-    for line in lines:
-        largest = float(np.nanmax(np.abs(line.stream.values), initial=0.0)) if line.stream.unit == "rad" else 0.0
-        if largest > _FULL_TURNS:
-            yield of_stream(line.stream, "unit", f"angles reach {largest:.4g}, which is hardly rad")
-    yield from _action_findings(bag.streams, bag.mapping)
 
 
 def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
@@ -141,23 +123,6 @@ def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
             yield Finding(kind="clock_offset", stream=label, text=text)
 
 
-def _camera_findings(streams: BagStreams) -> Iterator[Finding]:
-    """Cameras whose messages are those of another one, by coordinate frame or image."""
-    for name, stream in streams.cameras.items():
-        frame = frame_id_of(streams.infos.get(name, {}))
-        if frame and stream.frame_ids and stream.frame_ids[0] and frame != stream.frame_ids[0]:
-            text = f"its images are of {stream.frame_ids[0]!r}, its calibration is of {frame!r}"
-            yield of_stream(stream, "swapped", text)
-        elif stream.heads[0].encoding not in DEPTH_UNITS and (other := _claimed_by(name, streams)):  # registered to one
-            text = f"its coordinate frame {stream.frame_ids[0]!r} is named like the topic of {other}"
-            yield of_stream(stream, "swapped", text)
-    for (name, stream), (other_name, other_stream) in pairwise(sorted(streams.cameras.items())):
-        shared = min(len(stream), len(other_stream))
-        if shared >= FROZEN and np.mean(np.isin(stream.image_sums, other_stream.image_sums)) > 0.9:
-            text = f"{stream.topic} and {other_stream.topic} show the same images"
-            yield Finding(kind="same_pictures", stream=f"camera {name}, camera {other_name}", text=text)
-
-
 def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
     """Cameras that hang. A rendered one repeats its image while the robot stands still for a moment."""
     for line in lines:
@@ -187,25 +152,6 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
     return bool(moves) and not any(moves)
 
 
-def _claimed_by(name: str, streams: BagStreams) -> str:
-    """The camera to whose topic a camera's coordinate frame belongs by its words, where it is not its own."""
-
-    def words(text: str) -> set[str]:
-        return {word for word in text.lower().replace("/", " ").replace("_", " ").split() if word not in _COMMON}
-
-    stream = streams.cameras[name]
-    frame = words(stream.frame_ids[0]) if stream.frame_ids else set()
-    own = words(stream.topic)
-    for other, other_stream in streams.cameras.items():
-        theirs = words(other_stream.topic)
-        if other != name and frame & (theirs - own) and not frame & (own - theirs):
-            return f"camera {other}"
-    return ""
-
-
-_COMMON = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "optical", "frame", "link", "rgb", "depth"}
-
-
 def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
     """Streams that are slower than the rows; cameras only where none has an image for each row."""
     slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
@@ -215,30 +161,6 @@ def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
         if not line.stream.heads or not is_filmed:
             advice = f": use fps = {max(1, round(rate))}" if line.stream.heads else ""
             yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times{advice}")
-
-
-def _action_findings(streams: BagStreams, mapping: SourceMapping) -> Iterator[Finding]:
-    """State and action that do not speak of the same thing."""
-    if any(source.next for source in mapping.features[ACTION]):
-        return
-    state, action = streams.all[STATE, 0], streams.all[ACTION, 0]
-    shared = [(state.names.index(name), column) for column, name in enumerate(action.names) if name in state.names]
-    moving = [pair for pair in shared if _spread(action.values[:, pair[1]]) > 0.05]
-    dead = [pair for pair in moving if _spread(state.values[:, pair[0]]) == 0.0]
-    if dead:
-        name = state.names[dead[0][0]]
-        yield of_stream(state, "stuck", f"{name!r} never changes while the action of the same name does")
-    ratios = [_spread(state.values[:, ours]) / _spread(action.values[:, theirs]) for ours, theirs in moving]
-    ratio = float(np.median(ratios)) if len(ratios) > 1 else 1.0
-    wide, narrow = (state, action) if ratio > 1 else (action, state)
-    if _DEGREES[0] < max(ratio, 1 / max(ratio, 1e-9)) < _DEGREES[1]:
-        text = f"in degrees, it seems: joints move {max(ratio, 1 / ratio):.3g} times as far as those of {narrow.topic}"
-        yield of_stream(wide, "unit", text)
-
-
-def _spread(numbers: NDArray[Any]) -> float:
-    finite: Int = numbers[np.isfinite(numbers)]
-    return float(np.ptp(finite)) if len(finite) else 0.0
 
 
 def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:

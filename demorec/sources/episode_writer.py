@@ -30,9 +30,6 @@ from demorec.sources.import_file import BagReport
 from demorec.sources.planning import PlannedBag, PlannedEpisode
 from demorec.sources.rows import CameraRows
 
-_MAX_WAITING = 1 << 29
-"""Bytes of images that wait for earlier ones, which come later in the bag."""
-
 
 def write_bag(planned: PlannedBag, folder: Path, video: VideoConfig) -> tuple[BagReport, list[Attempt]]:
     """Write a bag's episodes into a run, each while the bag's images pass once more.
@@ -81,7 +78,7 @@ def _images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str,
         for plan in episode.rows.cameras.values():
             taken.setdefault(plan.topic, []).append(plan.taken)
     wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
-    decoder, counts = BagDecoder(bag.num_bytes), dict.fromkeys(wanted, 0)
+    decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
     for message in bag.messages([], wanted.keys()):
         topic = message.channel.topic
         number, counts[topic] = counts[topic], counts[topic] + 1
@@ -104,7 +101,6 @@ class _CameraImages:
         plan: Of the camera.
         num_missing: How many of the taken ones are still to come.
         waiting: Of the taken ones -> the image.
-        num_bytes: Of those that wait.
         num_written: How many are written.
     """
 
@@ -112,7 +108,7 @@ class _CameraImages:
         self.plan = plan
         self.num_missing = len(plan.taken)
         self.waiting: dict[int, Any] = {}
-        self.num_bytes = self.num_written = 0
+        self.num_written = 0
         self._first = int(plan.taken.min()) if len(plan.taken) else 0
         self._places = np.full(int(plan.taken.max(initial=self._first - 1)) - self._first + 1, -1)
         self._places[plan.taken - self._first] = np.arange(len(plan.taken))
@@ -164,14 +160,10 @@ class ImportedEpisodeWriter(Closing):
         is_coded = images.plan.kept and images.plan.kept not in DEPTH_UNITS
         data: Any = image_bytes(values) if is_coded else decode_image(values)
         images.waiting[place] = data
-        images.num_bytes += memoryview(data).nbytes
         while images.num_written in images.waiting:
             image = images.waiting.pop(images.num_written)
-            images.num_bytes -= memoryview(image).nbytes
             self._writer.image(name, int(images.plan.stamps_ns[images.num_written]), image)
             images.num_written += 1
-        if images.num_bytes > _MAX_WAITING:
-            raise BagError(f"The images of {images.plan.topic} are too far out of order to be read in bounded memory.")
 
     def _write_rows(self) -> None:
         while self._next_row < len(self._rows.times_ns) and all(

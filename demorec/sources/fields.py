@@ -124,13 +124,6 @@ def whole(values: Mapping[str, Any], name: str) -> int:
     raise FieldError(f"its {name} is no number of 32 bits")
 
 
-def frame_id_of(values: Values) -> str:
-    """The coordinate frame that a message names; "" for none."""
-    header = values.get("header")
-    found = header.get("frame_id") if isinstance(header, Mapping) else values.get("frame_id")
-    return found if isinstance(found, str) else ""
-
-
 def image_bytes(values: Mapping[str, Any]) -> bytes:
     """The bytes of an image; JSON has them in base64."""
     data = values["data"]

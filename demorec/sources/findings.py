@@ -1,4 +1,4 @@
-"""What is odd in a stream of a bag, found from times, numbers and image heads alone, with names for each kind.
+"""What is odd in a stream of a bag: lost, repeated and late messages, clocks, images, with names for each kind.
 
 The limits are such that sensors with ordinary jitter and latency, and robots that stand still for a while, give none.
 Nothing is repaired: a finding tells what the rows hold.
@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.geometry import signs_of_course
-from demorec.episode.features import ACTION
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.streams import NO_STAMP, Stream
 
@@ -25,19 +23,9 @@ GAP = 5.0
 _STEP_S = 0.05
 """By which a clock must jump, or drift in a bag, to be reported."""
 STILL_S = 0.5
-"""For which a sensor with noise never gives the same number."""
+"""How much later than others a stream may begin, or earlier end; a camera repeats no image for that long."""
 FROZEN = 5
 """Images in a row with the same bytes: no camera without noise."""
-_SPIKE = 25.0
-"""Times the usual step of an element."""
-_LEAST_JUMP = 1e-4
-"""rad, m: what no sensor tells from noise."""
-_AS_FAST = 1.5
-"""Times the largest step of what goes on."""
-_GOES_ON = 0.1
-"""Share of a step that the next one, or the one before, has in the same direction where something moves."""
-_NOISE = 5.0
-"""Times the usual step of an element that rests, beyond which it moves."""
 _EARLY_S = 0.05
 """By which a header may be later than its recording, in which it was no more: clocks that NTP sets differ by less."""
 LOST = 1.6
@@ -63,8 +51,8 @@ class Finding:
 
 def stream_findings(line: Timeline, skew: Numbers) -> Iterator[Finding]:
     """What is odd in a stream; (K,) its skews, as they compare with those of the others."""
-    found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skew))
-    for kind, text in (*found, *_image_findings(line), *_value_findings(line)):
+    found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skew), *_image_findings(line))
+    for kind, text in found:
         yield of_stream(line.stream, kind, text)
 
 
@@ -80,8 +68,6 @@ def _message_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
     if unstamped and not line.is_log_asked:
         yield "unstamped", f"{unstamped} of {len(stream)} headers have no time"
-    if len(stream.frame_ids) > 1:
-        yield "frame_id", f"its messages name several coordinate frames ({', '.join(stream.frame_ids[:4])})"
 
 
 def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
@@ -151,95 +137,6 @@ def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
         yield "clock_jump", f"its clock jumps by {-step:+.3f} s"
     elif abs(total) > _STEP_S and abs(total) > 0.7 * np.abs(np.diff(smooth)).sum():
         yield "clock_drift", f"its clock drifts by {-total:+.3f} s in the bag"
-
-
-def _value_findings(line: Timeline) -> Iterator[tuple[str, str]]:
-    stream = line.stream
-    if not stream.names or len(line.order) < 2:
-        return
-    yield from _number_findings(line)
-    for start in stream.quaternions:
-        off = float(np.abs(np.linalg.norm(_quaternion(line, start), axis=1) - 1).max())
-        if off > 1e-3:
-            yield "quaternion", f"the length of a quaternion is off by {off:.3g}"
-    if len(stream.names) > 1 and not any(_finite(line, column).any() for column in range(len(stream.names))):
-        yield "zeros", "all numbers are 0"
-        return
-    # What is sent may hold until the bag ends.
-    yield from _still_findings(line, may_rest=stream.label == ACTION)
-    for name, change in _changes(line):
-        steps = np.linalg.norm(change, axis=1)
-        usual = float(np.percentile(steps, 90))
-        # What begins to move after a long rest goes on, as an opening gripper does. At a low rate a shorter way takes
-        # one step, but no larger one than those of the longer.
-        beside, least = (change[1:] * change[:-1]).sum(axis=1), _GOES_ON * steps**2
-        goes_on = np.append(beside > least[:-1], False) | np.insert(beside > least[1:], 0, False)
-        limit = max(_SPIKE * usual, _LEAST_JUMP, _AS_FAST * float(steps[goes_on].max(initial=0.0)))
-        # Fingers at rest that shut on something within a message go on a little, and rest.
-        rests, settles = steps <= _NOISE * usual, np.zeros(len(steps), dtype=np.bool_)
-        settles[1:-2] = rests[:-3] & (beside[1:-1] > _NOISE * usual * steps[1:-2]) & rests[3:]
-        steps[goes_on | settles] = 0.0
-        largest = int(steps.argmax())
-        if usual > 0 and steps[largest] > limit:
-            at = (line.times_ns[largest + 1] - line.times_ns[0]) / NS
-            yield "jump", f"{name!r} jumps by {steps[largest]:.3g} at {at:.2f} s, usual are {usual:.2g}"
-            break
-
-
-def _changes(line: Timeline) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """(T - 1, n) from each message to the next, of every element and of every rotation as a whole."""
-    quaternions = line.stream.quaternions
-    turns = {start + part for start in quaternions for part in range(4)}
-    for column, name in enumerate(line.stream.names):
-        if column in quaternions:
-            quaternion = _quaternion(line, column)
-            yield name, np.diff(quaternion * signs_of_course(quaternion)[:, None], axis=0)
-        elif column not in turns:
-            yield name, np.diff(_finite(line, column))[:, None]
-
-
-def _finite(line: Timeline, columns: int | slice) -> NDArray[np.float64]:
-    """(T,) of an element, or (T, n) of some, in the order of the times; 0 in place of what is no finite number.
-
-    One at a time: all at once take several times the stream's memory.
-    """
-    part = line.stream.values[line.order, columns].astype(np.float64)
-    return np.nan_to_num(part, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def _quaternion(line: Timeline, start: int) -> NDArray[np.float64]:
-    """(T, 4) of the elements from one on."""
-    return _finite(line, slice(start, start + 4))
-
-
-def _number_findings(line: Timeline) -> Iterator[tuple[str, str]]:
-    """Numbers that are none."""
-    are_finite = np.asarray(np.isfinite(line.stream.values).all(axis=1))
-    rows = line.stream.values[line.order[~are_finite[line.order]]]
-    if len(rows):
-        column = int(np.flatnonzero(~np.isfinite(rows[0]))[0])
-        kind = "nan" if np.isnan(rows).any() else "infinite"
-        yield kind, f"{len(rows)} messages hold no finite number, the first in {line.stream.names[column]!r}"
-
-
-def _still_findings(line: Timeline, *, may_rest: bool) -> Iterator[tuple[str, str]]:
-    """Elements with noise that suddenly have none; those that `may_rest` do so in the end, and at a joint's limit."""
-    stuck = []
-    for column, name in enumerate(line.stream.names):
-        element = _finite(line, column)
-        begin, end = _longest_run(element)
-        seconds = (line.times_ns[end] - line.times_ns[begin]) / NS
-        others = np.concatenate((element[:begin], element[end + 1 :]))
-        rests = may_rest and (end == len(element) - 1 or element[begin] in (element.min(), element.max()))
-        if seconds < STILL_S or end - begin < 10 or len(others) < 10 or rests:
-            continue
-        if np.mean(np.diff(others) != 0) > 0.8:
-            stuck.append((name, seconds, (line.times_ns[begin] - line.times_ns[0]) / NS))
-    waits = may_rest and len(stuck) >= max(len(line.stream.names) - 1, 2)  # an arm, while its gripper moves
-    if stuck and not waits:
-        name, seconds, at = stuck[0]
-        more = f" and {len(stuck) - 1} more elements" if len(stuck) > 1 else ""
-        yield "stuck", f"{name!r}{more} gives the very same number for {seconds:.2f} s from {at:.2f} s on"
 
 
 def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:

@@ -131,8 +131,6 @@ _SEQUENCE_BYTES = 24
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
 
 
-_FREE_SETS, _FRAMES_OF_A_SET = 40, 20
-"""Decoding an image takes up to a tenth of a second: cameras have one set of parameters, or a few."""
 _HEAD_BYTES = 12
 """ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
 
@@ -217,7 +215,7 @@ def image_head(values: Values) -> ImageHead:
         raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
     if not _starts_by_itself(codec, data):
         return ImageHead(codec, "", 0, 0, False)
-    return _checked(ImageHead(codec, "", *_sizes.of(codec, data), True))
+    return _checked(ImageHead(codec, "", *_keyframe_size(codec, data), True))
 
 
 def _checked(head: ImageHead) -> ImageHead:
@@ -277,32 +275,19 @@ def _starts_by_itself(codec: str, data: bytes) -> bool:
     return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
 
 
-class _VideoSizes:
-    """Sizes of keyframes: their parameter sets say them, in bits, and one image of each kind is decoded for it."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[str, bytes], tuple[int, int]] = {}
-        self._num_seen = self._num_decoded = 0
-
-    def of(self, codec: str, data: bytes) -> tuple[int, int]:
-        """Width and height of a keyframe; FieldError when it gives no image."""
-        self._num_seen += 1
-        key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
-        size = self._known.get(key)
-        if size is None:
-            if self._num_decoded > _FREE_SETS + self._num_seen // _FRAMES_OF_A_SET:
-                raise FieldError(f"its {codec} video has other parameters at every keyframe")
-            self._num_decoded += 1
-            frame = next(_frames(codec, [data]), None)
-            if frame is None:
-                raise FieldError(f"its {codec} keyframe gives no image")
-            if len(self._known) > 1000:
-                self._known.clear()
-            size = self._known[key] = (frame.width, frame.height)
-        return size
+_sizes: dict[tuple[str, bytes], tuple[int, int]] = {}
+"""(codec, parameter sets) -> width and height of the keyframes, one of which was decoded for it."""
 
 
-_sizes = _VideoSizes()
+def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
+    """Width and height of a keyframe; FieldError when it gives no image."""
+    key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
+    if key not in _sizes:
+        frame = next(_frames(codec, [data]), None)
+        if frame is None:
+            raise FieldError(f"its {codec} keyframe gives no image")
+        _sizes[key] = (frame.width, frame.height)
+    return _sizes[key]
 
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:

@@ -251,12 +251,7 @@ class SourceMapping:
     @cached_property
     def digest(self) -> str:
         """16 hex digits of all that it says of its kind of source."""
-        said = _said(self, self.kind)
-        del said[KIND]
-        said["clock"]["fps"] = self.clock.fps or None  # as it was when runs were begun that may be continued
-        if self.kind == "bag":
-            said["episodes"] |= {"start_topic": "", "stop_topic": ""}  # the same
-        return digest(said)
+        return digest(_said(self, self.kind))
 
     @property
     def topics(self) -> frozenset[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import tomllib
 import typing
 from collections.abc import Iterator
@@ -20,12 +19,7 @@ from demorec.episode.validity import MAX_CAMERAS, MAX_FEATURES
 from demorec.sources.mapping import CONVERSIONS, KIND, MAX_FPS, MAX_SECONDS, Source, SourceKind, SourceMapping
 
 _MAX_FILE_BYTES = 1 << 20
-_MAX_TABLES, _MAX_VALUES = 1000, 50_000
-_MAX_TEXT = 10_000
 _KINDS: dict[SourceKind, str] = {"bag": "bags", "hdf5": "HDF5 files"}
-_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{16}}")
-"""What no mapping has: each part of a key makes a table, and takes as long as all before it."""
 
 
 def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
@@ -36,18 +30,13 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
             often cause the latter.
     """
     try:
-        text = read_text_limited(path, _MAX_FILE_BYTES)
-        if _DEEP_KEY.search(text):
-            raise ValueError("a key has more than 16 parts")
-        data = tomllib.loads(text)
+        data = tomllib.loads(read_text_limited(path, _MAX_FILE_BYTES))
     except FileNotFoundError as error:
         raise ConfigError(f"There is no mapping (demorec import ... --suggest > FILE writes one): {path}") from error
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"The mapping is no valid TOML ({describe_error(error)}): {path}") from error
-    if excess := _excess(data):
-        raise ConfigError(f"The mapping cannot be used: {excess}: {path}")
     if problems := list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_LISTED)):
         for other in _KINDS:
             if not any(_unknown_keys(data, SourceMapping, "", other)):
@@ -63,25 +52,6 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
     if problems := list(_problems(mapping)):
         raise ConfigError(f"The mapping cannot be used: {listed(problems)}: {path}")
     return mapping
-
-
-def _excess(data: Any) -> str:
-    """What a mapping has too much of; "" for nothing."""
-    values, tables, waiting = 0, 0, [data]
-    while waiting:
-        value = waiting.pop()
-        values += 1
-        if isinstance(value, dict):
-            tables += 1
-            waiting += [*value, *value.values()]
-        elif isinstance(value, list):
-            waiting += value
-        elif isinstance(value, str) and len(value) > _MAX_TEXT:
-            return f"a text has {len(value):,} characters, at most {_MAX_TEXT:,} are read"
-    for count, most, what in ((tables, _MAX_TABLES, "tables"), (values, _MAX_VALUES, "values")):
-        if count > most:
-            return f"it has {count:,} {what}, at most {most:,} are read"
-    return ""
 
 
 def _unknown_keys(value: Any, kind: Any, place: str, of: SourceKind) -> Iterator[str]:

@@ -17,7 +17,6 @@ from demorec.core.plain import listed
 from demorec.episode.info import Camera, EpisodeInfo, Feature, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
-from demorec.mcap.limits import LimitError, Limits
 from demorec.mcap.video import size_problem
 from demorec.runs.external import differences
 from demorec.sources.bag import Bag, Files
@@ -107,7 +106,6 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
         for episode in episodes:
             if different := differences(episodes[0].info, episode.info):
                 raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {bag.path}")
-        _check_images(bag, episodes)
     except BagError as error:
         raise BagError(f"{error}: {bag.path}") from error
     report = BagReport(
@@ -320,15 +318,6 @@ def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
         if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
             yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
             return
-
-
-def _check_images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> None:
-    """BagError when the images unpack to more than a bag of its size holds: a PNG file of zeros is small."""
-    plans = [plan for episode in episodes for plan in episode.rows.cameras.values()]
-    try:
-        Limits.of_file(bag.num_bytes).check_total(sum(len(plan.taken) * plan.num_bytes for plan in plans))
-    except LimitError as error:
-        raise BagError(f"The images of the bag cannot be used, since {error}") from error
 
 
 def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str) -> EpisodeReport:

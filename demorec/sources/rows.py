@@ -9,7 +9,6 @@ from typing import cast
 import numpy as np
 
 from demorec.episode.info import DEPTH_UNITS, Kept
-from demorec.mcap.limits import VARIABLE, Limits
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, Chosen, Int, Numbers, Timeline, followed, grid, timeline
 from demorec.sources.image_messages import KEPT_FORMATS, VIDEO_FORMATS, ImageHead
@@ -21,13 +20,6 @@ RATE = 0.05
 episode. Where fps is the rate rounded, half an image a second is more."""
 _SAME_COUNT = 2
 """Images that cameras of one rate differ by: one more or less at each end of an episode."""
-
-_ROW_BYTES_PER_BYTE = 32
-"""Bytes of rows for each of the bag: a long bag may be brought to a faster clock than any of its streams has."""
-_BYTES_OF_WRITING = 100
-"""That count for each row in addition to its own: writing one takes some 15 microseconds."""
-_ROWS_OF_EPISODE = 300
-"""That count for an episode in addition to its own: millions of empty ones would take hours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,12 +73,6 @@ class CameraRows:
     positions: Int
 
     @property
-    def num_bytes(self) -> int:
-        """Of one in memory: of its pixels, or about those of what stays encoded."""
-        pixels = self.head.width * self.head.height
-        return pixels // 10 if self.kept and self.kept not in DEPTH_UNITS else 3 * pixels
-
-    @property
     def description(self) -> str:
         """What becomes of them, for people."""
         shown = len(np.unique(self.positions))
@@ -135,11 +121,6 @@ class Timelines:
     def __init__(self, streams: BagStreams, mapping: SourceMapping) -> None:
         self.streams, self.mapping = streams, mapping
         self.lines = {key: timeline(stream, mapping.clock) for key, stream in streams.all.items()}
-        # A row takes of a stream, while an episode is made, its numbers, which message, and how old that is.
-        self._bytes_of_row = _BYTES_OF_WRITING + sum(32 + 8 * len(stream.names) for stream in streams.all.values())
-        self._free_bytes = self._most_bytes = (
-            Limits.of_file(streams.num_bytes).floor // 2 + _ROW_BYTES_PER_BYTE * streams.num_bytes
-        )
         if empty := [line for line in self.lines.values() if not len(line.times_ns)]:
             raise BagError(f"No message of {empty[0].label} has a time at which it could be used")
 
@@ -152,7 +133,6 @@ class Timelines:
 
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
-        self._reserve(_ROWS_OF_EPISODE)
         begin, end = self._extent(window)
         times, follows = self._times(window, begin, end)
         if len(times) < 2:
@@ -217,9 +197,7 @@ class Timelines:
             # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a
             # stream that jitters is off by a few hundredths.)
             slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
-            self._reserve(max(0, (end - begin) * clock.fps // NS + 1))
             return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
-        self._reserve(len(times))
         return times, follows
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
@@ -250,15 +228,6 @@ class Timelines:
         are_latest = all(self.lines[name].sample == "latest" for name in cameras)
         others = [self.lines[name].times_ns for name in cameras[1:]] if are_latest else []
         return followed(lead, others, period_ns=line.period_ns, end_ns=end)
-
-    def _reserve(self, count: int) -> None:
-        """Raise BagError for more rows, in all episodes, than a bag of this size gives; before memory is taken."""
-        self._free_bytes -= count * self._bytes_of_row
-        if self._free_bytes < 0:
-            raise BagError(
-                f"The mapping makes more rows and episodes of the bag, {self._most_bytes / 1e6:,.0f} MB of them, than "
-                f"one of its size is read for: lower clock.fps, import a part (episodes.times_s), or raise {VARIABLE}"
-            )
 
 
 def _first(line: Timeline, window: Window) -> int:

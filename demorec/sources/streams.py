@@ -21,17 +21,15 @@ from demorec.core.errors import describe_error
 from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
 from demorec.mcap.cdr import Values
-from demorec.mcap.limits import SpentError
 from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.decoding import BagDecoder, Budgets, UnknownEncodingError
+from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import (
     OtherPublisherError,
     SourceReader,
     converted,
     follow,
-    frame_id_of,
     image_bytes,
     parse_path,
     reader_of,
@@ -44,12 +42,6 @@ from demorec.sources.words import quoted
 NO_STAMP = -(2**63)
 Key = tuple[str, int] | str
 """A stream: (feature, number of its source), or the name of a camera."""
-_BYTES_OF_MESSAGE = 40
-"""That a stream keeps of each, beside its numbers."""
-_VALUES_OF_ADDING = 15
-"""As long as reading so many takes to give a message to a stream, of which a topic may have many."""
-_MAX_NUMBERS = 16_384
-"""Of all features together, in a row."""
 _MAX_TEXT = 10_000
 _MAX_URDF = 4 << 20
 _SHOWN_JOINTS = 40
@@ -64,7 +56,6 @@ class Stream:
     Attributes:
         label: Which it is: "observation.state" or "camera front".
         part: What the mapping says of it.
-        budgets: What may still be made of the bag.
         type: Of its messages.
         reader: Of a source's numbers, since its first message.
         logged, stamped: `log_ns` and `header_ns` as they grow.
@@ -75,7 +66,6 @@ class Stream:
         heads: (N,) what is known of each image; empty for others.
         sums: CRC-32 of each message's bytes.
         image_sums: CRC-32 of each image's bytes; empty for others.
-        frame_ids: Coordinate frames that messages name, in the order of their first occurrence.
         num_malformed: Messages that cannot be read or lack something.
         first_problem: What is wrong with the first of them.
         first_refusal: Why the first message was left to another publisher.
@@ -83,7 +73,6 @@ class Stream:
 
     label: str
     part: Source | CameraSource
-    budgets: Budgets
     type: str = ""
     reader: SourceReader | None = None
     logged: array[int] = field(default_factory=lambda: array("q"))
@@ -94,7 +83,6 @@ class Stream:
     heads: ImageHeads = field(default_factory=ImageHeads)
     sums: array[int] = field(default_factory=lambda: array("I"))
     image_sums: array[int] = field(default_factory=lambda: array("I"))
-    frame_ids: list[str] = field(default_factory=list)
     num_malformed: int = 0
     first_problem: str = ""
     first_refusal: str = ""
@@ -103,8 +91,6 @@ class Stream:
         """Take one message."""
         self.type = self.type or message.channel.type
         try:
-            self.budgets.values.take(_VALUES_OF_ADDING)
-            self.budgets.numbers.take(_BYTES_OF_MESSAGE)
             if isinstance(self.part, Source):
                 self.reader = self.reader or reader_of(self.part, values)
                 self._add_vector(self.reader.read(values))
@@ -123,8 +109,6 @@ class Stream:
         self.logged.append(message.log_ns)
         self.stamped.append(NO_STAMP if stamp is None else stamp)
         self.sums.append(checksum)
-        if len(self.frame_ids) < 16 and (frame_id := frame_id_of(values)) not in self.frame_ids:
-            self.frame_ids.append(frame_id)
 
     def malformed(self, problem: str) -> None:
         """Count a message that cannot be used."""
@@ -137,7 +121,6 @@ class Stream:
         elif self.dtype != vector.dtype:  # float64 holds both
             self.vectors = bytearray(np.frombuffer(self.vectors, self.dtype).astype(np.float64).data)
             self.dtype = np.dtype(np.float64)
-        self.budgets.numbers.take(self.dtype.itemsize * len(vector))
         self.vectors += vector.astype(self.dtype, copy=False).data
 
     def __len__(self) -> int:
@@ -217,7 +200,6 @@ class BagStreams:
 
     Args:
         mapping: Of the bag.
-        num_bytes: Of the bag's files.
 
     Attributes:
         all: Key -> stream, the sources of features before cameras.
@@ -225,22 +207,20 @@ class BagStreams:
         infos: Name of a camera -> its first calibration message.
         texts: Topic -> its texts.
         problems: Why parts of the bag could not be read.
-        num_bytes: As given.
     """
 
-    def __init__(self, mapping: SourceMapping, num_bytes: int) -> None:
-        self._mapping, self.num_bytes = mapping, num_bytes
+    def __init__(self, mapping: SourceMapping) -> None:
+        self._mapping = mapping
         self.problems: list[str] = []
-        self._decoder = BagDecoder(num_bytes)
-        budgets = self._decoder.budgets
+        self._decoder = BagDecoder()
         self.all: dict[Key, Stream] = {
-            (name, index): Stream(label=_label(name, source, sources), part=source, budgets=budgets)
+            (name, index): Stream(label=_label(name, source, sources), part=source)
             for name, sources in mapping.features.items()
             for index, source in enumerate(sources)
             if source.topic
         }
         for name, camera in mapping.cameras.items():
-            self.all[name] = Stream(label=f"camera {name}", part=camera, budgets=budgets)
+            self.all[name] = Stream(label=f"camera {name}", part=camera)
         self._of_topic: dict[str, list[Stream]] = {}
         for stream in self.all.values():
             self._of_topic.setdefault(stream.topic, []).append(stream)
@@ -286,12 +266,9 @@ class BagStreams:
         for stream in streams:
             stream.add(number, message, values, checksum)
         if topic in self.texts:
-            if not self._decoder.may_keep(message):
-                self._refused[topic] = "it holds too much to be kept in memory"
-                return
             self._add_text(topic, message, values)
         if topic in self._info_topics:
-            kept = {key: values[key] for key in _INFO_FIELDS if key in values} | {"frame_id": frame_id_of(values)}
+            kept = {key: values[key] for key in _INFO_FIELDS if key in values}
             self.infos.setdefault(self._info_topics[topic], kept)
 
     def _add_text(self, topic: str, message: ScannedMessage, values: Values) -> None:
@@ -330,9 +307,6 @@ class BagStreams:
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
             if stream.reader is not None and stream.reader.others:
                 problems.append(_unnamed_joints(stream, stream.reader))
-        count = sum(len(stream.names) for stream in self.all.values())
-        if count > _MAX_NUMBERS:
-            problems.append(f"its features have {count:,} numbers, at most {_MAX_NUMBERS:,} are read")
         problems += self._double_names()
         for stream in self.all.values():
             if stream.part.stamp == "header" and len(stream) and max(stream.stamped) <= 0:
@@ -367,11 +341,8 @@ def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:
     Raises:
         BagError: The mapping does not fit the bag; one message tells all problems.
     """
-    streams = BagStreams(mapping, bag.num_bytes)
-    try:
-        for message in bag.messages(streams.problems):
-            streams.add(message)
-    except SpentError as error:
-        raise BagError(f"{error}: {bag.path}") from error
+    streams = BagStreams(mapping)
+    for message in bag.messages(streams.problems):
+        streams.add(message)
     streams.check(bag)
     return streams

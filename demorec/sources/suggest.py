@@ -1,7 +1,6 @@
-"""A mapping from what is in a bag: the likely choices made, the doubtful ones commented out, everything listed.
+"""A mapping suggested from what is in a bag: every topic is listed with its type, recognised ones are mapped.
 
-What a topic's words say of its numbers, and what is taken of them, is in `candidates`. A topic whose words say
-neither what the robot does nor what it shall do is not guessed at, unless it is the only one.
+`candidates` recognises topics. What is recognised but not taken is a source that is commented out.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import math
 import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,10 @@ import numpy as np
 
 from demorec.episode.info import DEPTH_UNITS
 from demorec.mcap.cdr import Values
-from demorec.mcap.limits import SpentError
 from demorec.mcap.scan import ScannedMessage
 from demorec.sources.bag import Bag, open_bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.candidates import Vector, choose_features, transforms_of, vectors_of
+from demorec.sources.candidates import Candidate, Choice, candidates_of, choose_features, of_publishers
 from demorec.sources.clock import NS, SKEW_S
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import FieldError, follow, stamp_of
@@ -31,10 +29,8 @@ from demorec.sources.image_messages import ImageHead, image_head
 from demorec.sources.mapping import Clock
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
-_KEPT = 64
-"""Messages of a topic that are looked into."""
-_MAX_PUBLISHERS = 64
-"""Of a topic, by the names in their messages."""
+_MAX_DECODED = 64
+"""Messages of a topic that are decoded."""
 _MAX_OFFERED = 24
 """Sources that are commented out."""
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
@@ -47,45 +43,48 @@ _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 
 @dataclass(kw_only=True, eq=False)
 class _Topic:
-    """What a topic has shown.
+    """Contents of a topic.
 
     Attributes:
-        count: Of its messages.
-        first_ns, last_ns: When they were recorded.
-        values: Of the first ones.
-        vectors: Numbers in them that a feature may be made of.
-        publishers: Names of joints in a message -> when such messages were recorded, nanoseconds; () where none are.
-        has_stamp: Whether these have headers with a time.
-        stamps_ns: Of the headers of those that were looked into.
-        skew_ns: By which the first was recorded after the time of its header.
-        problem: Why none can be read; "".
+        count: Number of messages.
+        first_ns, last_ns: Range of the times of recording.
+        first: First message; None where none can be read.
+        head: Head of its first image; None where its messages are no images.
+        candidates: Numbers in it that a feature may take.
+        publishers: Names of joints in its messages, each list once.
+        stamps_ns: Header times of the decoded messages.
+        has_stamp: Whether headers have a time.
+        skew_ns: By how much the first was recorded after the time of its header.
+        problem: Why no message can be read; "" otherwise.
     """
 
+    name: str
     type: str
     count: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    values: list[Values] = field(default_factory=list)
-    vectors: list[Vector] = field(default_factory=list)
-    publishers: dict[tuple[str, ...], array[int]] = field(default_factory=dict)
-    has_stamp: bool = True
+    first: Values | None = None
+    head: ImageHead | None = None
+    candidates: list[Candidate] = field(default_factory=list)
+    publishers: dict[tuple[str, ...], None] = field(default_factory=dict)
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    has_stamp: bool = True
     skew_ns: int = 0
     problem: str = ""
 
     @property
-    def head(self) -> ImageHead | None:
-        """Of its first image; None where its messages are none."""
-        return _head(self.values[0]) if self.values else None
-
-    @property
     def rate_hz(self) -> float:
-        """Of its messages, on average."""
+        """Mean rate of its messages; 0 for fewer than two."""
         seconds = (self.last_ns - self.first_ns) / NS
         return (self.count - 1) / seconds if self.count > 1 and seconds > 0 else 0.0
 
+    @property
+    def is_text(self) -> bool:
+        """Whether its messages are texts."""
+        return self.first is not None and self.head is None and isinstance(self.first.get("data"), str)
+
     def rate_by(self, stamp: str) -> float:
-        """Its usual rate by the times that rows follow; simulated time is slower, or faster, than that of recording."""
+        """Rate by the times that rows follow; simulated time is slower, or faster, than that of recording."""
         if stamp == "log" or not self.has_stamp or len(self.stamps_ns) < 3:
             return self.rate_hz
         steps = np.diff(np.unique(self.stamps_ns))
@@ -97,7 +96,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     """The lines of a mapping for a bag, with what is in it as comments.
 
     Args:
-        path: Of the bag.
+        path: The bag.
         tell: Called with what the user has to decide before the mapping can be used.
 
     Raises:
@@ -110,26 +109,32 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     if not topics:
         raise BagError(f"The bag holds no messages{f' ({problems[0]})' if problems else ''}: {path}")
     cameras = _cameras(topics)
-    vectors = [
-        replace(vector, has_stamp=topic.has_stamp)
-        for name, topic in sorted(topics.items())
-        for vector in _vectors(name, topic)
-    ]
-    state, action, others, warning = choose_features(vectors)
+    choice = choose_features(
+        [
+            candidate
+            for _, topic in sorted(topics.items())
+            for found in topic.candidates
+            for candidate in of_publishers(found, list(topic.publishers))
+        ]
+    )
     lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
-    if warning:
+    if not choice.state:
+        warning = (
+            "No topic was recognised as the state of an arm or a base: write its source from the topics that the "
+            "mapping lists; the import refuses the mapping as it is."
+        )
         tell(warning)
         lines += [f"# ATTENTION: {warning}", "#"]
     lines += [f"# {problem}" for problem in problems[:5]]
-    lines += list(_listed(topics))
+    lines += _listed(topics)
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
     models = (name for name in topics if name.endswith("robot_description"))
     model = min(models, key=lambda name: (name.count("/"), name), default="")  # those below may be of objects
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
-    lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action])]
-    lines += [*_subtasks(topics), *_features(state, action, others)]
+    lines += ["", "[clock]", *_clock(topics, cameras, [*choice.state, *choice.action])]
+    lines += [*_subtasks(topics), *_features(choice, topics)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}"]
         info = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0] + "/camera_info"
@@ -139,23 +144,23 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
 
 
 def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
+    """Look through a bag."""
     topics: dict[str, _Topic] = {}
-    decoder = BagDecoder(bag.num_bytes)
+    decoder = BagDecoder()
     for message in bag.messages(problems):
-        topic = topics.setdefault(message.channel.topic, _Topic(type=message.channel.type, first_ns=message.log_ns))
+        name, type_name = message.channel.topic, message.channel.type
+        topic = topics.setdefault(name, _Topic(name=name, type=type_name, first_ns=message.log_ns))
         topic.count += 1
         topic.first_ns, topic.last_ns = min(topic.first_ns, message.log_ns), max(topic.last_ns, message.log_ns)
-        if (len(topic.values) < _KEPT or any(topic.publishers)) and not topic.problem:
+        if topic.count <= _MAX_DECODED and not topic.problem:
             _look_into(topic, message, decoder)
-        else:
-            topic.publishers.setdefault((), array("q")).append(message.log_ns)
     return topics
 
 
 def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> None:
     try:
         values = decoder.values(message)
-    except (UnknownEncodingError, SpentError) as error:
+    except UnknownEncodingError as error:
         topic.problem = str(error)
         return
     except (ValueError, RecursionError, OverflowError, TypeError):
@@ -165,26 +170,21 @@ def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> N
     if stamp and 0 < stamp < 2**63:
         topic.skew_ns = topic.skew_ns or message.log_ns - stamp
         topic.stamps_ns.append(stamp)
-    if len(topic.values) < 2 or (len(topic.values) < _KEPT and _head(values) is None):
-        if decoder.may_keep(message):
-            topic.values.append(values)
-        elif not topic.values:
-            topic.problem = "the bag holds too much to look into all of it"
-            return
-        if not topic.vectors and _head(values) is None:
-            topic.vectors = list(vectors_of(message.channel.topic, topic.type, values))
-    names = next((names for vector in topic.vectors if (names := _names(vector, values))), ())
-    if names in topic.publishers or len(topic.publishers) < _MAX_PUBLISHERS:
-        topic.publishers.setdefault(names, array("q")).append(message.log_ns)
+    if topic.first is None:
+        topic.first, topic.head = values, _head(values)
+    if topic.head is None:
+        topic.candidates = topic.candidates or candidates_of(topic.name, topic.type, values)
+        for candidate in topic.candidates:
+            topic.publishers |= dict.fromkeys([_names(candidate, values)])
 
 
-def _names(vector: Vector, values: Values) -> tuple[str, ...]:
-    """Those of the joints in a message whose first fields hold them."""
-    steps = vector.reader.names_steps
-    if steps is None or (len(steps) > 1 and isinstance(values.get(str(steps[0])), Mapping)):
-        return ()  # a robot's own message has one publisher
+def _names(candidate: Candidate, values: Values) -> tuple[str, ...]:
+    """Names of the joints in a message; () where it has none, or not one for each number."""
+    steps = candidate.reader.names_steps
+    if steps is None:
+        return ()
     try:
-        names, count = follow(values, steps), np.size(follow(values, vector.reader.steps))
+        names, count = follow(values, steps), np.size(follow(values, candidate.reader.steps))
     except ValueError:
         return ()
     are_texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
@@ -205,8 +205,8 @@ def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
         rate = f"{topic.rate_hz:.1f} Hz, " if topic.rate_hz else ""
         stamp = "" if topic.has_stamp else ", no times in its headers"
         yield f"#   {name}  {topic.type}, {rate}{topic.count} messages{stamp}"
-        fields = [f"{key}: {_short(value)}" for key, value in (topic.values or [{}])[0].items() if key not in _TIMES]
-        shown = "; ".join(fields)[:160] or ("no fields" if topic.values else "none of its messages can be read")
+        fields = [f"{key}: {_short(value)}" for key, value in (topic.first or {}).items() if key not in _TIMES]
+        shown = "; ".join(fields)[:160] or ("no fields" if topic.first else "none of its messages can be read")
         yield f"#     {topic.problem or shown}"
 
 
@@ -222,34 +222,6 @@ def _short(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value[:40])
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _vectors(name: str, topic: _Topic) -> Iterator[Vector]:
-    """The numbers of a topic, those of several publishers apart: joints that always come together stay together."""
-    yield from transforms_of(name, topic.type, topic.values)
-    for vector in topic.vectors:
-        groups: dict[frozenset[int], list[str]] = {}
-        if vector.reader.joints and any(topic.publishers):
-            for joint in dict.fromkeys(joint for names in topic.publishers for joint in names):
-                of = frozenset(place for place, names in enumerate(topic.publishers) if joint in names)
-                groups.setdefault(of, []).append(joint)
-        times = list(topic.publishers.values())
-        for of, joints in groups.items():
-            yield _timed(vector.of_joints(joints, topic.values), [times[place] for place in of])
-        if not groups:
-            yield _timed(vector, times)
-
-
-def _timed(vector: Vector, parts: Sequence[Sequence[int]]) -> Vector:
-    times = np.sort(np.concatenate([np.asarray(part) for part in parts]))
-    steps = np.diff(times) / NS
-    if not steps.any():
-        return vector
-    usual = float(np.median(steps))
-    is_regular = np.mean((steps > 0.3 * usual) & (steps < 1.7 * usual)) > 0.6  # else it is sent when it changes
-    needed = 2 * usual if is_regular else float(steps.max())
-    age = math.ceil(needed * 10) / 10 if needed > Clock(fps=1).max_age_s else 0.0
-    return replace(vector, rate_hz=len(steps) / float(steps.sum()), age_s=age)
 
 
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
@@ -278,22 +250,18 @@ def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
 
 
 def _task_topics(topics: Mapping[str, _Topic]) -> list[str]:
-    return [name for name, topic in sorted(topics.items()) if _TASK.search(name.lower()) and _is_text(topic)]
+    return [name for name, topic in sorted(topics.items()) if _TASK.search(name.lower()) and topic.is_text]
 
 
 def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
     """Texts that may say what the robot does."""
     others = {*_task_topics(topics)[:1], *(name for name in topics if name.endswith("robot_description"))}
-    for name in (name for name in sorted(topics) if name not in others and _is_text(topics[name])):
+    for name in (name for name in sorted(topics) if name not in others and topics[name].is_text):
         yield from ("", "# [subtasks]", f"# topic = {quoted(name)}  # if its texts say what the robot does")
 
 
-def _is_text(topic: _Topic) -> bool:
-    return any(isinstance(values.get("data"), str) and _head(values) is None for values in topic.values)
-
-
-def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Sequence[Vector]) -> list[str]:
-    mapped = {*cameras.values(), *(vector.topic for vector in vectors)}
+def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[Candidate]) -> list[str]:
+    mapped = {*cameras.values(), *(part.topic for part in parts)}
     skews = [topics[name].skew_ns for name in mapped if topics[name].has_stamp]
     # One clock for all where that of the headers is far from that of recording, which some topics have alone.
     is_mixed = 0 < len(skews) < len(mapped) and abs(float(np.median(skews))) > SKEW_S * NS
@@ -305,7 +273,7 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Se
     }
     colour = colour or rates
     slowest = min(colour, key=lambda topic: colour[topic], default="")
-    rate = colour.get(slowest, min([30.0, *(vector.rate_hz for vector in vectors if vector.rate_hz)]))
+    rate = colour.get(slowest, min([30.0, *(hz for part in parts if (hz := topics[part.topic].rate_hz))]))
     lines = [f"fps = {max(1, round(rate))}"]
     if slowest:
         lines += [f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic']
@@ -314,57 +282,42 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], vectors: Se
     return [*lines, 'when_old = "error"  # or "drop_episode"']
 
 
-def _features(state: Sequence[Vector], action: Sequence[Vector], others: Sequence[Vector]) -> Iterator[str]:
-    yield from _chosen("observation.state", state)
-    if not state:
-        yield from ("", "# No topic is known to hold the robot's state.")
-    yield from _chosen("action", action)
-    if not action:
-        offers = any(vector.role == "action" for vector in others)
-        found = (
-            "No topic is sure to be the command (see those below)" if offers else "No topic says that it is a command"
-        )
-        yield from ("", f"# {found}, so the next state is the action.")
+def _features(choice: Choice, topics: Mapping[str, _Topic]) -> Iterator[str]:
+    yield from _chosen("observation.state", choice.state, topics)
+    yield from _chosen("action", choice.action, topics)
+    if not choice.action:
+        yield from ("", "# No recognised topic is the command of this state, so the next state is the action.")
         yield from ("[[features.action]]", 'next = "observation.state"')
-    poses = [vector for vector in others if vector.kind == "pose" and vector.role != "action"]
-    poses = [vector for vector in poses if vector.is_robot] or poses
-    is_sure = bool(state) and len({vector.topic for vector in poses}) == 1 and poses[0].field == "pose"
-    for vector in poses if is_sure else ():
-        yield from _source("observation.ee_pose", vector, prefix="")
-    offered = [vector for vector in others if not (is_sure and vector in poses)]
-    offered.sort(key=lambda vector: vector.field.startswith("transforms["))
-    for vector in offered[:_MAX_OFFERED]:
-        name = {"state": "observation.state", "action": "action"}.get(vector.role, "observation.extra")
-        name = "observation.state" if not state and not vector.role else name
-        for line in _source(name, vector, prefix=""):
+    for pose in choice.poses:
+        yield from _source("observation.ee_pose", pose, topics)
+    for candidate in choice.others[:_MAX_OFFERED]:
+        for line in _source("action" if candidate.is_action else "observation.state", candidate, topics):
             yield f"# {line}" if line else ""
-    if len(offered) > _MAX_OFFERED:
-        yield f"# and {len(offered) - _MAX_OFFERED} more"
+    if len(choice.others) > _MAX_OFFERED:
+        yield f"# and {len(choice.others) - _MAX_OFFERED} more"
 
 
-def _chosen(feature: str, vectors: Sequence[Vector]) -> Iterator[str]:
-    """The sources of a feature; where names clash, with words in front by which their topics and fields differ."""
-    prefixes = []
-    for vector in vectors:
-        rivals = [set(other.place) for other in vectors if vector is not other and {*vector.labels} & {*other.labels}]
-        own = [word for word in vector.place if word not in set.intersection(*rivals, set(vector.place))]
-        prefixes.append("_".join(own) + "_" if rivals else "")
-    names = [prefix + label for prefix, vector in zip(prefixes, vectors, strict=True) for label in vector.labels]
-    for number, (prefix, vector) in enumerate(zip(prefixes, vectors, strict=True), 1):
-        yield from _source(feature, vector, prefix=prefix if len(set(names)) == len(names) else f"{number}_")
+def _chosen(feature: str, parts: Sequence[Candidate], topics: Mapping[str, _Topic]) -> Iterator[str]:
+    """The sources of a feature; where names clash, with prefixes of the words by which their topics differ."""
+    for number, part in enumerate(parts, 1):
+        rivals = [other for other in parts if other is not part and {*part.labels} & {*other.labels}]
+        own = [word for word in part.words if not all(word in rival.words for rival in rivals)]
+        prefix = "_".join(own or [str(number)]) + "_" if rivals else ""
+        yield from _source(feature, part, topics, prefix=prefix)
 
 
-def _source(feature: str, vector: Vector, *, prefix: str) -> Iterator[str]:
+def _source(feature: str, part: Candidate, topics: Mapping[str, _Topic], *, prefix: str = "") -> Iterator[str]:
     key = feature if "." not in feature else quoted(feature)
-    yield from ("", f"[[features.{key}]]", f"topic = {quoted(vector.topic)}")
-    yield f"field = {quoted(vector.field)}" + (f"  # first: {vector.first}" if vector.first else "")
-    if vector.reader.joints:
-        yield f"joints = [{', '.join(map(quoted, vector.reader.joints))}]"
-    if vector.names:
-        yield f"names = [{', '.join(map(quoted, vector.names))}]"
-    if prefix or vector.prefix:
-        yield f"prefix = {quoted(prefix + vector.prefix)}"
-    if vector.age_s:
-        yield f"max_age_s = {vector.age_s:.1f}  # its messages are that far apart"
-    if not vector.has_stamp:
+    topic = topics[part.topic]
+    yield from ("", f"[[features.{key}]]", f"topic = {quoted(part.topic)}")
+    yield f"field = {quoted(part.field)}" + (f"  # first: {part.first}" if part.first else "")
+    if part.reader.joints:
+        yield f"joints = [{', '.join(map(quoted, part.reader.joints))}]"
+    if part.name:
+        yield f"names = [{quoted(part.name)}]"
+    if prefix or part.prefix:
+        yield f"prefix = {quoted(prefix + part.prefix)}"
+    if topic.rate_hz and (age_s := 2 / topic.rate_hz) > Clock(fps=1).max_age_s:
+        yield f"max_age_s = {math.ceil(age_s * 10) / 10:.1f}  # its messages are that far apart"
+    if not topic.has_stamp:
         yield _LOG

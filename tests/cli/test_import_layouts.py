@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from support import bags
 from support.commands import exit_code
-from support.layout_topics import Layout, Part
-from support.layouts import LAYOUTS, UR
+from support.layouts import LAYOUTS, Layout, Part
 
 from demorec.mcap import Recording
 
@@ -32,9 +31,7 @@ def _expected(notes: bags.Notes, parts: Sequence[Part], time_ns: int, layout: La
 
 
 @pytest.mark.parametrize("name", sorted(LAYOUTS))
-def test_a_suggestion_is_right_unedited_or_refused(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_suggestion_is_right_unedited(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     layout = LAYOUTS[name]
     notes = layout.notes()
     bag = layout.write(notes, tmp_path)
@@ -43,14 +40,6 @@ def test_a_suggestion_is_right_unedited_or_refused(
     mapping = tmp_path / "robot.toml"
     mapping.write_text(text)
     code = exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
-    if layout.unsure:
-        assert "The arm is left out" in warned
-        assert "# ATTENTION: The arm is left out" in text
-        assert code != 0
-        assert "observation.state" in capsys.readouterr().err
-        mapping.write_text(_uncommented(text, layout.unsure))
-        assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
-        return
     assert (code, warned) == (0, ""), capsys.readouterr().err
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         columns = recording.columns()
@@ -74,42 +63,37 @@ def test_a_suggestion_is_right_unedited_or_refused(
             assert set(columns.image_stamps[camera.name].tolist()) == stamps
 
 
-def _uncommented(text: str, field: str) -> str:
-    """The mapping with the comment signs of the source that has a field removed."""
-    blocks = text.split("\n\n")
-    (block,) = [block for block in blocks if f'field = "{field}"' in block]
-    plain = block.replace("# [[", "[[").replace("\n# ", "\n")
-    return text.replace(block, plain)
-
-
-def test_the_fault_of_a_gripper_alone_is_loud(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A bag whose arm nobody recorded: its gripper is no state of an arm."""
-    notes = [note for note in LAYOUTS["Franka"].notes() if "robot_state" not in note.topic]
-    bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
+def test_an_arm_that_is_not_recognised_is_loud(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A gripper alone is no state of an arm, and a topic of frames may be anything: it is listed with its type."""
+    moments = bags.times(50, 1.0)
+    notes = bags.joints("/franka_gripper/joint_states", bags.FRANKA_FINGERS, moments)
+    notes += [
+        bags.Note(topic="/tf", type="tf2_msgs/msg/TFMessage", log_ns=moment, header_ns=moment,
+                  body={"transforms": [{"child_frame_id": "tool0"}]})
+        for moment in moments
+    ]  # fmt: skip
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
     assert exit_code("import", "--suggest", bag) == 0
     text, warned = capsys.readouterr()
-    assert "The arm is left out: the only joints that are known to be measured are a gripper's (fr3_finger" in warned
-    assert "observation.state" not in tomllib.loads(text).get("features", {})
+    assert warned.startswith("No topic was recognised as the state of an arm")
+    assert f"# ATTENTION: {warned}" in text
+    assert "#   /tf  tf2_msgs/msg/TFMessage, 50.0 Hz, 50 messages" in text
+    assert '# topic = "/franka_gripper/joint_states"' in text
+    assert "observation.state" not in tomllib.loads(text)["features"]
     mapping = tmp_path / "robot.toml"
     mapping.write_text(text)
-    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") != 0
+    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 2
+    assert "there is no feature 'observation.state'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("way", ["its publisher ends", "messages name fewer"])
-def test_a_joint_that_stops_coming_is_a_finding(way: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes = LAYOUTS["two publishers"].notes()
-    late = bags.EPOCH_NS + bags.NS
-    arm, grip = UR[-1], "robotiq_85_left_knuckle_joint"
-    lost = grip if way == "its publisher ends" else arm
-
-    def without(note: bags.Note) -> bags.Note | None:
-        if note.topic != "/joint_states" or note.header_ns < late or lost not in note.body["name"]:
-            return note
-        left = [k for k, name in enumerate(note.body["name"]) if name != lost]
-        names, position = note.body["name"], note.body["position"]
-        return bags.with_body(note, name=[names[k] for k in left], position=position[left]) if left else None
-
-    bag = bags.write_mcap([left for note in notes if (left := without(note)) is not None], tmp_path / "bag.mcap")
+def test_joints_that_stop_coming_are_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    late, lost = bags.EPOCH_NS + bags.NS, "robotiq_85_left_knuckle_joint"
+    notes = [
+        note
+        for note in LAYOUTS["two publishers"].notes()
+        if note.topic != "/joint_states" or note.header_ns < late or lost not in note.body["name"]
+    ]
+    bag = bags.write_mcap(notes, tmp_path / "bag.mcap")
     assert exit_code("import", "--suggest", bag) == 0
     mapping = tmp_path / "robot.toml"
     mapping.write_text(capsys.readouterr().out)

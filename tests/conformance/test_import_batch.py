@@ -277,7 +277,7 @@ def _importing(batch: tuple[Path, Path], run: Path) -> subprocess.Popen[str]:
 
 
 def _workers(program: subprocess.Popen[str]) -> list[psutil.Process]:
-    found = psutil.Process(program.pid).children()
+    found = psutil.Process(program.pid).children(recursive=True)
     return [process for process in found if any("spawn_main" in word for word in process.cmdline())]
 
 
@@ -300,9 +300,10 @@ def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone
     with _importing(batch, run) as program:
         while not list(run.glob("episodes/*.mcap")) and program.poll() is None:
             time.sleep(0.001)
-        workers = _workers(program)
+        children = psutil.Process(program.pid).children(recursive=True)
         program.kill()
-    psutil.wait_procs(workers, timeout=30)
+    _, alive = psutil.wait_procs(children, timeout=30)
+    assert not alive
     import_bags([batch[0]], batch[1], run, skip_bad=True)
     assert _content(run) == _content(alone)
     assert load_any_run_file(run).digest == load_any_run_file(alone).digest

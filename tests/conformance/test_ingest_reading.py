@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from mcap.writer import IndexType
 from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from support import bags
 
 from demorec.mcap.scan import ScannedChannel, ScannedMessage
-from demorec.sources.bag import Bag, open_bag
+from demorec.sources.bag import Bag, bags_in, open_bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import stamp_of
@@ -75,6 +76,47 @@ def test_mcap_files(notes: bags.Notes, is_ros1: bool, compression: str, is_bare:
     _assert_same(notes, found)
 
 
+@pytest.mark.parametrize("compression", [None, *Ros1Writer.CompressionFormat])
+def test_ros_1(notes: bags.Notes, compression: Ros1Writer.CompressionFormat | None, tmp_path: Path) -> None:
+    found, problems = _read(open_bag(bags.write_ros1(notes, tmp_path / "bag.bag", compression=compression)))
+    assert not problems
+    _assert_same(notes, found)
+
+
+def test_a_folder_of_ros_1_bags(notes: bags.Notes, tmp_path: Path) -> None:
+    """In the natural order of their names; other files are ignored."""
+    for number in (10, 2):
+        bags.write_ros1(notes, tmp_path / f"run_{number}.bag")
+    (tmp_path / "notes.txt").write_text("of the day")
+    found = bags_in(tmp_path)
+    assert [path.name for path in found] == ["run_2.bag", "run_10.bag"]
+    for path in found:
+        _assert_same(notes, _read(open_bag(path))[0])
+
+
+@pytest.mark.parametrize("damage", ["no index", "cut off", "half a chunk"])
+def test_a_bag_of_ros_1_that_was_not_finished(damage: str, notes: bags.Notes, tmp_path: Path) -> None:
+    path = bags.write_ros1(notes, tmp_path / "bag.bag", compression=Ros1Writer.CompressionFormat.BZ2)
+    whole = path.read_bytes()
+    place = whole.index(b"index_pos=") + len(b"index_pos=")
+    index = int.from_bytes(whole[place : place + 8], "little")
+    assert 0 < index < len(whole)
+    data = {
+        "no index": whole[:place] + bytes(8) + whole[place + 8 :],
+        "cut off": whole[: index - 10],
+        "half a chunk": whole[: index // 2] + bytes(50) + whole[index // 2 + 50 :],
+    }[damage]
+    assert data != whole
+    path.write_bytes(data)
+    if damage == "half a chunk":
+        found, problems = _read(open_bag(path))
+        assert len(found) < len(notes)
+        assert problems[0].startswith("bag.bag: it is damaged")
+        return
+    with pytest.raises(BagError, match=r"rosbag reindex bag\.bag restores the index .*: /.*bag\.bag$"):
+        _read(open_bag(path))
+
+
 def test_protobuf_of_another_writer(tmp_path: Path) -> None:
     from google.protobuf.timestamp_pb2 import Timestamp
     from mcap_protobuf.writer import Writer as ProtobufWriter
@@ -128,7 +170,7 @@ def test_a_damaged_chunk_is_told(notes: bags.Notes, tmp_path: Path) -> None:
     assert 0 < len(found) < len(notes)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"[:5]])
+@pytest.mark.parametrize("content", [b"", b"hello", b"#ROSBAG", b"\x89MCAP0\r\n"[:5]])
 def test_no_bag(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     path.write_bytes(content)

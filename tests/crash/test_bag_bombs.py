@@ -6,7 +6,6 @@ Expected is what the file itself says, by its format's definition; what it takes
 from __future__ import annotations
 
 import io
-import json
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -18,9 +17,9 @@ import zstandard
 from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 from PIL import Image
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
-from support.commands import exit_code
 from support.fuzz import LimitedCommands, problem_of
 from support.fuzz_bags import MAPPING
 
@@ -58,27 +57,6 @@ def two_fields_a_type(folder: Path) -> Path:
     """2^31 fields of 31 types."""
     schema = _nested("a/T%d x\na/T%d y\n", 31, "uint8[0] x\n")
     return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2msg", schema, "cdr", [b"\x00\x01\x00\x00" + bytes(5000)] * 2)
-
-
-def two_empty_fields_a_type(folder: Path) -> Path:
-    """2^31 fields, of which ROS 1 writes no byte."""
-    return _mcap(folder / "bag.mcap", "a/T0", "ros1msg", _nested("a/T%d x\na/T%d y\n", 31, ""), "ros1", [bytes(9)] * 2)
-
-
-def a_thousand_of_a_thousand(folder: Path) -> Path:
-    """10^18 elements of no bytes."""
-    schema = _nested("a/T%d[1000] x\n", 6, "uint8[0] x\n")
-    return _mcap(folder / "bag.mcap", "a/T0", "ros1msg", schema, "ros1", [bytes(9000)] * 2)
-
-
-def a_definition_of_empty_lines(folder: Path) -> Path:
-    return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2msg", b"\n" * 900_000, "cdr", [b"\x00\x01\x00\x00"])
-
-
-def a_definition_in_brackets(folder: Path) -> Path:
-    """The parser of IDL tries each bracket sixty times over."""
-    text = f"module a {{ module msg {{ const long X = {'(' * 9}1{')' * 9}; struct T0 {{ double x; }}; }}; }};"
-    return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2idl", text.encode(), "cdr", [b"\x00\x01\x00\x00"])
 
 
 def a_definition_that_computes(folder: Path) -> Path:
@@ -142,20 +120,6 @@ def columns_that_compute(folder: Path) -> Path:
     )
 
 
-def a_column_called_rowid(folder: Path) -> Path:
-    """By which all would have to be sorted."""
-    return _database(folder, "ALTER TABLE messages ADD COLUMN rowid INTEGER;")
-
-
-def definitions_that_compute(folder: Path) -> Path:
-    return _database(
-        folder,
-        f"""DROP TABLE IF EXISTS message_definitions; CREATE TABLE message_definitions (k, topic_type AS (k), encoding
-        AS ('ros2msg'), encoded_message_definition AS (hex(zeroblob(400000)))); {_MANY}
-        INSERT INTO message_definitions (k) SELECT k FROM n;""",
-    )
-
-
 def a_view_of_messages(folder: Path) -> Path:
     return _database(
         folder,
@@ -172,23 +136,9 @@ def _folder(folder: Path, metadata: Callable[[str], str]) -> Path:
     return bag
 
 
-def aliases(folder: Path) -> Path:
-    """10^9 elements."""
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]
-    names = "  relative_file_paths: *a8\n"
-    return _folder(folder, lambda text: "\n".join(lines) + "\nrosbag2_bagfile_information:\n" + names)
-
-
 def merge_keys(folder: Path) -> Path:
     lines = ["a0: &a0 {x: 1}"] + [f"a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}], y{k}: 1}}" for k in range(1, 40)]
     return _folder(folder, lambda text: "\n".join(lines) + "\n" + text)
-
-
-def many_names(folder: Path) -> Path:
-    return _folder(
-        folder, lambda text: text.replace("relative_file_paths:\n", "relative_file_paths:\n" + "  - b\n" * 120_000)
-    )
 
 
 def images_of_nothing(folder: Path) -> Path:
@@ -207,42 +157,28 @@ def images_of_nothing(folder: Path) -> Path:
     return bags.write_mcap(bags.in_order(notes), folder / "bag.mcap")
 
 
-def lists_in_every_message(folder: Path) -> Path:
-    """Ten million elements of no bytes in all, few enough in one; never imported in part."""
-    schema = _nested("a/T%d[500] x\n", 1, "")
-    return _mcap(folder / "bag.mcap", "a/T0", "ros1msg", schema, "ros1", [bytes(500)] * 20_000)
-
-
-def many_messages(folder: Path) -> Path:
-    """Forty-five thousand, as JSON."""
-    text = json.dumps({"header": {"stamp": {"sec": 1, "nsec": 1}}, "position": [0.5] * 4}).encode()
-    return _mcap(folder / "bag.mcap", "x", "jsonschema", b"{}", "json", [text] * 45_000)
+def a_chunk_of_zeros(folder: Path) -> Path:
+    """A bag of ROS 1 whose image unpacks to 300 MB, by bzip2."""
+    zeros = np.zeros(300_000_000, np.uint8)
+    body = {"encoding": "rgb8", "width": 10_000, "height": 10_000, "step": 30_000, "data": zeros}
+    note = bags.Note(
+        topic="/image", type="sensor_msgs/msg/Image", log_ns=bags.EPOCH_NS, header_ns=bags.EPOCH_NS, body=body
+    )
+    return bags.write_ros1([note], folder / "bag.bag", compression=Ros1Writer.CompressionFormat.BZ2)
 
 
 BAGS = (
-    two_fields_a_type,
-    a_definition_that_computes, empty_elements_of_many_fields, lists_of_nothing, messages_that_claim_64_megabytes,
-    columns_that_compute, a_column_called_rowid, definitions_that_compute, a_view_of_messages, aliases, merge_keys,
-    images_of_nothing, many_messages,
+    two_fields_a_type, a_definition_that_computes, empty_elements_of_many_fields, lists_of_nothing,
+    messages_that_claim_64_megabytes, columns_that_compute, a_view_of_messages, images_of_nothing, a_chunk_of_zeros,
+    pytest.param(merge_keys, marks=pytest.mark.long),
 )  # fmt: skip
-LONG = [
-    pytest.param(make, marks=(pytest.mark.slow, pytest.mark.long))
-    for make in (
-        a_definition_of_empty_lines,
-        a_definition_in_brackets,
-        many_names,
-        two_empty_fields_a_type,
-        a_thousand_of_a_thousand,
-        lists_in_every_message,
-    )
-]
 
 
 def _size(bag: Path) -> int:
     return sum(path.stat().st_size for path in (bag.iterdir() if bag.is_dir() else [bag]))
 
 
-@pytest.mark.parametrize("make", [*BAGS, *LONG])
+@pytest.mark.parametrize("make", BAGS)
 def test_a_small_bag_never_becomes_large(
     make: Callable[[Path], Path], commands: LimitedCommands, tmp_path: Path
 ) -> None:
@@ -256,29 +192,12 @@ def test_a_small_bag_never_becomes_large(
     mapping = bag_mappings.write_mapping(text, tmp_path / "mapping.toml")
     told = commands.run("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
     assert problem_of(told) == "", told
-    assert told.code == 1, told
+    assert told.code in (1, 2), told
     *progress, sentence = told.text.splitlines()
     assert sentence.startswith("demorec import: "), told.text
     assert all(line.startswith("importing: ") for line in progress), told.text  # of a busy machine
     assert len(sentence) < 1500
-    suggested = commands.run("import", "--suggest", bag)
-    assert problem_of(suggested) == "", suggested
-    assert "has too little memory" not in told.text + suggested.text
-
-
-def test_too_little_memory_is_no_fault_of_a_definition(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from demorec.sources import decoding
-
-    def lack(_: object) -> None:
-        raise MemoryError
-
-    bag = _joints(tmp_path)
-    monkeypatch.setattr(decoding, "_parsed", {})
-    monkeypatch.setattr(decoding._CountedMsgParser, "specification", lack)
-    assert exit_code("import", "--suggest", bag) == 1
-    assert "This machine has too little memory for this" in capsys.readouterr().err
+    assert not list(tmp_path.glob("run/episodes/*.mcap"))
 
 
 def _joints(folder: Path, moments: Sequence[int] | None = None, names: Sequence[str] = ("a", "b")) -> Path:
@@ -288,32 +207,14 @@ def _joints(folder: Path, moments: Sequence[int] | None = None, names: Sequence[
 
 _NO_CAMERA = MAPPING[: MAPPING.index("[cameras")]
 MAPPINGS: dict[str, tuple[str, str]] = {
-    "a key of 200,000 parts": ("[" + "a." * 200_000 + "a]\n", "a key has more than 16 parts"),
-    "a key of 200,000 quoted parts": ("[" + ".".join(['"#"'] * 200_000) + "]\n", "a key has more than 16 parts"),
-    "a key of 200,000 parts in a table": (
-        "x = {" + ".".join(["a"] * 200_000) + " = 1}\n", "a key has more than 16 parts"
-    ),
-    "a key of 500,000 characters": ("x" * 500_000 + " = 1\n", "a text has 500,000 characters"),
-    "50,000 values": ("".join(f"k{n} = 1\n" for n in range(50_000)), "values, at most 50,000"),
     "lists in lists": ("x = " + "[" * 100_000 + "]" * 100_000 + "\n", "nested too deeply"),
-    "12,000 features": (
-        _NO_CAMERA + "".join(f'[[features.f{k}]]\ntopic = "/joints"\n' for k in range(12_000)), "at most 1,000 are read"
-    ),
-    "60,000 episodes": (
-        _NO_CAMERA + f'[episodes]\ncut = "times"\ntimes_s = [{"[0, 1]," * 60_000}]\n', "at most 50,000 are read"
-    ),
-    "15,000 episodes": (
-        _NO_CAMERA + f'[episodes]\ncut = "times"\ntimes_s = [{"[0, 1]," * 15_000}]\n', "more rows and episodes"
-    ),
     "20,000 unknown keys": (_NO_CAMERA + "[cloak]\n" + "".join(f"keyy{k} = 1\n" for k in range(20_000)), "unknown key"),
     "a trim of 1e300 s": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_trim_s = 1e300"), "max_trim_s is 1e+300"),
-    "an age of 1e300 s": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_age_s = 1e300"), "max_age_s is 1e+300"),
     "a number of 5,000 digits": (_NO_CAMERA.replace("fps = 30", f"fps = {'9' * 5000}"), "no valid TOML"),
     "an infinity": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_trim_s = inf"), "is no finite number"),
     "NUL in urdf": (_NO_CAMERA.replace('name = "r"', 'name = "r"\nurdf = "a\\u0000b"'), "The URDF cannot be read"),
     "NUL in a topic": (_NO_CAMERA.replace('"/joints"', '"/jo\\u0000nts"'), r"there is no message of '/jo\x00nts'"),
     "a date": (_NO_CAMERA.replace("fps = 30", "fps = 2001-99-99"), "no valid TOML"),
-    "a long text": (_NO_CAMERA.replace("stack the cups", "x" * 20_000), "at most 10,000 are read"),
 }  # fmt: skip
 
 
@@ -327,28 +228,6 @@ def test_a_mapping_is_bounded(name: str, commands: LimitedCommands, tmp_path: Pa
     assert told in answer.text, answer.text
     assert answer.text.count("\n") == 1
     assert len(answer.text) < 2000
-
-
-def test_rows_follow_the_size_of_the_bag(commands: LimitedCommands, tmp_path: Path) -> None:
-    """Two messages 23 days apart: 2,000 million rows."""
-    bag = _joints(tmp_path, [bags.EPOCH_NS, bags.EPOCH_NS + 2_000_000 * bags.NS])
-    text = _NO_CAMERA.replace("fps = 30", "fps = 1000\nmax_age_s = 1e9\nmax_trim_s = 1e9")
-    mapping = bag_mappings.write_mapping(text, tmp_path / "mapping.toml")
-    told = commands.run("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
-    assert problem_of(told) == "", told
-    assert "lower clock.fps, import a part (episodes.times_s)" in told.text
-    assert told.text.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "line", ["version: " + "9" * 5000, "version: 2001-99-99", "version: !!int abc", "version: !!float x", "a: '\\0'"]
-)
-def test_odd_values_in_metadata_say_nothing_of_the_bag(line: str, tmp_path: Path, commands: LimitedCommands) -> None:
-    """What is not asked for is not read."""
-    bag = _folder(tmp_path, lambda text: text.replace("  version: 9", f"  {line}"))
-    told = commands.run("import", "--suggest", bag)
-    assert problem_of(told) == "", told
-    assert told.code == 0, told.text
 
 
 def test_a_link_out_of_the_bag_is_not_followed(tmp_path: Path, commands: LimitedCommands) -> None:

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from demorec.sources.bag_findings import all_findings, row_findings
-from demorec.sources.decoding import Budgets
 from demorec.sources.fields import reader_of
 from demorec.sources.image_messages import ImageHead, ImageHeads
 from demorec.sources.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
@@ -46,7 +45,7 @@ def _stream(part: Source | CameraSource, times: list[int]) -> Stream:
     heads = ImageHeads()
     for _ in times if isinstance(part, CameraSource) else ():
         heads.append(ImageHead("jpeg", "", 64, 48, True))
-    stream = Stream(label=part.topic[1:], part=part, budgets=Budgets())
+    stream = Stream(label=part.topic[1:], part=part)
     stream.logged, stream.stamped = array("q", [time + 1_000_000 for time in times]), array("q", times)
     stream.sums = array("I", range(len(times)))
     if isinstance(part, CameraSource):
@@ -67,7 +66,7 @@ def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, Episo
         features={"observation.state": (SOURCE,), "action": (SOURCE,)},
         cameras={name: CameraSource(topic=f"/{name}") for name in cameras},
     )  # fmt: skip
-    streams = BagStreams(mapping, num_bytes=1 << 30)
+    streams = BagStreams(mapping)
     streams.all = {(name, 0): _stream(SOURCE, joints) for name in mapping.features}
     streams.all |= {name: _stream(mapping.cameras[name], times) for name, times in cameras.items()}
     lines = Timelines(streams, mapping)

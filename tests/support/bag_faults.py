@@ -39,36 +39,6 @@ def _later(note: Note, seconds: float) -> Note:
     return replace(note, header_ns=note.header_ns + round(seconds * NS))
 
 
-def _position(note: Note, change: Callable[[NDArray[np.float64]], None]) -> Note:
-    position = note.body["position"].copy()
-    change(position)
-    return with_body(note, position=position)
-
-
-def _set(index: int, value: float) -> Callable[[NDArray[np.float64]], None]:
-    def change(position: NDArray[np.float64]) -> None:
-        position[index] = value
-
-    return change
-
-
-def _held(topic: str, first: int, last: int, columns: slice) -> Callable[[Notes], Notes]:
-    """An encoder that gives the same number again and again."""
-
-    def hurt(notes: Notes) -> Notes:
-        (kept,) = [note.body["position"] for k, note in enumerate(n for n in notes if n.topic == topic) if k == first]
-
-        def change(number: int, note: Note) -> Note:
-            def hold(position: NDArray[np.float64]) -> None:
-                position[columns] = kept[columns]
-
-            return _position(note, hold) if first <= number < last else note
-
-        return changed(notes, topic, change)
-
-    return hurt
-
-
 def _swapped_times(notes: Notes) -> Notes:
     """Ten pairs of neighbours in the wrong order."""
     mine = [k for k, note in enumerate(notes) if note.topic == STATE][10:30]
@@ -91,20 +61,10 @@ def _jittered(notes: Notes) -> Notes:
     return changed(notes, STATE, lambda k, note: _later(note, float(generator.uniform(-0.009, 0.009))))
 
 
-def _swapped_cameras(notes: Notes) -> Notes:
-    other = {FRONT: SIDE, SIDE: FRONT}
-    return [replace(note, topic=other.get(note.topic, note.topic)) for note in notes]
-
-
 def _halved(notes: Notes) -> Notes:
     for topic in (FRONT, SIDE):
         notes = changed(notes, topic, lambda k, note: note if k % 2 else None)
     return notes
-
-
-def _same_pictures(notes: Notes) -> Notes:
-    fronts = [note for note in notes if note.topic == FRONT]
-    return changed(notes, SIDE, lambda k, note: with_body(note, data=fronts[min(k, len(fronts) - 1)].body["data"]))
 
 
 def _frozen(notes: Notes) -> Notes:
@@ -148,9 +108,6 @@ FAULTS: dict[str, Fault] = {
     "images that are stamped after their recording": Fault(
         kind="clock_offset", hurt=_each(SIDE, lambda k, n: _later(n, 0.08))
     ),
-    "a leader that tells degrees": Fault(
-        kind="unit", hurt=_each(ACTION, lambda k, n: with_body(n, position=np.degrees(n.body["position"])))
-    ),
     "a clock that drifts": Fault(kind="clock_drift", hurt=_each(STATE, lambda k, n: _later(n, 0.0008 * k))),
     "headers without time": Fault(kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0))),
     "some headers without time": Fault(
@@ -165,37 +122,12 @@ FAULTS: dict[str, Fault] = {
     "a stream that ends early": Fault(kind="early_end", hurt=_each(ACTION, lambda k, n: n if k < 65 else None)),
     "duplicated messages": Fault(kind="duplicates", hurt=_repeated),
     "messages in the wrong order": Fault(kind="order", hurt=_swapped_times),
-    "a number that is none": Fault(
-        kind="nan",
-        hurt=_each(STATE, lambda k, n: _position(n, _set(2, np.nan)) if 30 <= k < 40 else n),
-        is_refused=True,
-    ),
-    "an infinite number": Fault(
-        kind="infinite",
-        hurt=_each(ACTION, lambda k, n: _position(n, _set(0, np.inf)) if 30 <= k < 40 else n),
-        is_refused=True,
-    ),
-    "an encoder that is stuck": Fault(kind="stuck", hurt=_held(STATE, 40, 90, slice(1, 2))),
-    "an arm that is stuck": Fault(kind="stuck", hurt=_held(STATE, 20, 60, slice(0, 6))),
-    "a joint that never moves though it shall": Fault(
-        kind="stuck", hurt=_each(STATE, lambda k, n: _position(n, _set(3, 0.25)))
-    ),
-    "only zeros": Fault(kind="zeros", hurt=_each(STATE, lambda k, n: with_body(n, position=np.zeros(6)))),
-    "a spike": Fault(kind="jump", hurt=_each(STATE, lambda k, n: _position(n, _set(4, 3.0)) if k == 50 else n)),
-    "degrees called rad": Fault(
-        kind="unit", hurt=_each(STATE, lambda k, n: with_body(n, position=np.degrees(n.body["position"])))
-    ),
     "messages that cannot be decoded": Fault(kind="malformed", hurt=_each(STATE, _garbage)),
     "a message that lacks a joint": Fault(kind="malformed", hurt=_each(STATE, _short)),
     "images cut off": Fault(kind="malformed", hurt=_each(FRONT, _cut_image)),
-    "swapped cameras": Fault(kind="swapped", hurt=_swapped_cameras),
-    "one camera twice": Fault(kind="same_pictures", hurt=_same_pictures),
     "a frozen camera": Fault(kind="frozen", hurt=_frozen),
     "a camera that changes its size": Fault(kind="size", hurt=_each(FRONT, _resized), is_refused=True),
     "cameras of half the rate": Fault(kind="slow", hurt=_halved),
-    "frames of another camera in between": Fault(
-        kind="frame_id", hurt=_each(FRONT, lambda k, n: replace(n, frame_id="cam_side") if k == 30 else n)
-    ),
     "another kind of image": Fault(
         kind="format",
         hurt=_each(FRONT, lambda k, n: with_body(n, format="png", data=_png()) if k == 30 else n),

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -24,8 +24,9 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from numpy.typing import NDArray
 from PIL import Image
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 
 NS = 1_000_000_000
 EPOCH_NS = 1_760_000_000 * NS
@@ -265,15 +266,6 @@ def _store(*, is_ros1: bool = False) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
-def register(definitions: Mapping[str, str]) -> None:
-    """Have the writers know types that are not ROS's own: name -> definition."""
-    types: dict[str, Any] = {}
-    for name, text in definitions.items():
-        types |= get_types_from_msg(text, name)
-    for store in (_store(), _store(is_ros1=False), _store(is_ros1=True)):
-        store.register({name: found for name, found in types.items() if name not in store.fielddefs})
-
-
 def ros_message(note: Note, *, is_ros1: bool = False) -> Any:
     """A message of `rosbags`."""
     store = _store(is_ros1=is_ros1)
@@ -331,6 +323,24 @@ def write_rosbag2(
             data = note.data
             if data is None:
                 data = store.serialize_cdr(ros_message(note), note.type)
+            writer.write(connections[note.topic], note.log_ns, data)
+    return path
+
+
+def write_ros1(notes: Notes, path: Path, *, compression: Ros1Writer.CompressionFormat | None = None) -> Path:
+    """A bag of ROS 1, by `rosbags`."""
+    store = _store(is_ros1=True)
+    writer = Ros1Writer(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        connections: dict[str, Any] = {}
+        for note in notes:
+            if note.topic not in connections:
+                connections[note.topic] = writer.add_connection(note.topic, note.type, typestore=store)
+            data = note.data
+            if data is None:
+                data = store.serialize_ros1(ros_message(note, is_ros1=True), note.type)
             writer.write(connections[note.topic], note.log_ns, data)
     return path
 

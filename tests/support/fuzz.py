@@ -1,7 +1,7 @@
-"""Commands within bounds: each in a child of its own, whose memory and CPU time are limited and measured.
+"""Commands in limited children, as the program runs them, with their memory and CPU time measured.
 
 Starting Python and its libraries takes longer than refusing a file. So one process loads them, and every command runs
-in a fork of it: a fuzz of thousands of cases starts Python once, and a case that hangs or dies ends alone.
+in a fork of it: a fuzz of thousands of cases starts Python once.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import json
 import os
 import random
 import resource
-import signal
 import subprocess
 import sys
 import tempfile
@@ -27,19 +26,18 @@ from typing import NamedTuple, Protocol, Self
 from demorec.cli import COMMANDS, main
 from demorec.cli.shared.flags import parse
 from demorec.core.errors import DemorecError
+from demorec.core.limited import continue_in_child
 from demorec.core.text import printable
 
-MOST_BYTES = 500_000_000
-MOST_SECONDS = 10.0
-"""Of CPU time, for an input of less than a megabyte."""
-_KILLED_SECONDS = 20
-"""After which a command is ended; more than allowed, so that what it took is told."""
-_MORE_ADDRESS_BYTES = 3 << 30
-"""Beyond what the loaded libraries take: a command that fills more gets a MemoryError before the machine suffers."""
+MAX_BYTES = 600_000_000
+"""Private memory for an input of less than a megabyte: 500 MB, 20 MB, and what is filled until the parent looks."""
+MAX_CPU_S = 10.0
+MAX_KILLED_CPU_S = 42.0
+"""CPU time of a command that was killed for it: 20 s, and 20 s for a megabyte."""
 
 
 class Told(NamedTuple):
-    """What a command answered: exit code (None if a signal or an exception ended it), outputs, memory, CPU seconds."""
+    """Result of a command: exit code (None after a signal or an exception), outputs, private memory, CPU seconds."""
 
     code: int | None
     text: str
@@ -60,11 +58,7 @@ class LimitedCommands:
     def __enter__(self) -> Self:
         # -P: the modules beside this file (mcap, docs ...) must not stand before the libraries of their names.
         command = [sys.executable, "-P", __file__, *self._modules]
-        # Each of Rerun's threads would reserve addresses of its own, which count as if they were filled.
-        environment = os.environ | {"MALLOC_ARENA_MAX": "2"}
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-        )
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         return self
 
     def __exit__(
@@ -103,9 +97,10 @@ def problem_of(told: Told) -> str:
             return f"says {words!r}"
     if told.code and not told.text.strip():
         return "fails without a word"
-    if told.peak_bytes > MOST_BYTES:
+    if told.peak_bytes > MAX_BYTES:
         return f"takes {told.peak_bytes / 1e6:.0f} MB"
-    return f"takes {told.seconds:.1f} s" if told.seconds > MOST_SECONDS else ""
+    most = MAX_KILLED_CPU_S if " s of CPU time" in told.text else MAX_CPU_S
+    return f"takes {told.seconds:.1f} s" if told.seconds > most else ""
 
 
 def changed_bytes(data: bytes, chance: random.Random) -> bytes:
@@ -182,6 +177,7 @@ def _serve(modules: Sequence[str]) -> None:
     for name in modules:
         importlib.import_module(name)
     answers = os.fdopen(os.dup(1), "w")
+    libraries = resource.getpagesize() * int(Path("/proc/self/statm").read_text().split()[2])
     for line in sys.stdin:
         with tempfile.TemporaryFile("w+") as said:
             child = os.fork()
@@ -193,7 +189,7 @@ def _serve(modules: Sequence[str]) -> None:
             answer = (
                 code if 0 <= code < 100 else None,
                 said.read(),
-                1024 * used.ru_maxrss,
+                1024 * used.ru_maxrss - libraries,
                 used.ru_utime + used.ru_stime,
             )
         answers.write(json.dumps(answer) + "\n")
@@ -208,10 +204,7 @@ def _run(arguments: list[str], output: int) -> None:
         os.dup2(output, 2)
         sys.stdin = io.StringIO()
         sys.stdout = sys.stderr = open(output, "w", closefd=False)  # noqa: SIM115
-        resource.setrlimit(resource.RLIMIT_CPU, (_KILLED_SECONDS, _KILLED_SECONDS + 2))
-        address = 4096 * int(Path("/proc/self/statm").read_text().split()[0]) + _MORE_ADDRESS_BYTES
-        resource.setrlimit(resource.RLIMIT_AS, (address, address))
-        signal.signal(signal.SIGXCPU, signal.SIG_DFL)
+        continue_in_child(arguments)
         main(arguments)
     except SystemExit as end:
         code = int(end.code or 0)

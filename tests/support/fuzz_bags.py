@@ -67,6 +67,7 @@ class FuzzedBags:
         self._plain = bags.write_mcap(notes, folder / "plain.mcap", compression="", use_chunking=False).read_bytes()
         self._chunked = bags.write_mcap(notes, folder / "chunked.mcap").read_bytes()
         self._trossen = bags.write_trossen(bags.in_order(bags.trossen(0.3)), folder / "trossen.mcap").read_bytes()
+        self._ros1 = bags.write_ros1(notes, folder / "plain.bag").read_bytes()
         rosbag2 = bags.write_rosbag2(notes, folder / "rosbag2", storage=StoragePlugin.SQLITE3)
         self._db3 = next(rosbag2.glob("*.db3")).read_bytes()
         self._metadata = (rosbag2 / "metadata.yaml").read_text()
@@ -93,8 +94,8 @@ class FuzzedBags:
         """What it is, and the arguments of `demorec`."""
         chance = random.Random(number)
         kinds: tuple[Callable[[random.Random, Path], tuple[Path, str]], ...] = (
-            self._bytes, self._database_bytes, self._database, self._yaml, self._toml, self._json, self._json,
-            self._definition, self._protobuf, self._image, self._image,
+            self._bytes, self._ros1_bytes, self._database_bytes, self._database, self._yaml, self._toml,
+            self._json, self._json, self._definition, self._protobuf, self._image, self._image,
         )  # fmt: skip
         make = kinds[number % len(kinds)]
         bag, mapping = make(chance, self.folder)
@@ -115,6 +116,11 @@ class FuzzedBags:
         path = folder / "bytes.mcap"
         path.write_bytes(changed_bytes(data, chance))
         return path, mapping
+
+    def _ros1_bytes(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
+        path = folder / "bytes.bag"
+        path.write_bytes(self._ros1[:13] + changed_bytes(self._ros1[13:], chance))
+        return path, bag_mappings.SO101
 
     def _database_bytes(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
         data = self._db3 if chance.random() < 0.7 else self._db3[: int(len(self._db3) * chance.random())]

@@ -1,13 +1,13 @@
 """Topics of other people's robots, a row each, with what a suggested mapping must make of them.
 
-Types, topics, names and rates are those of public drivers: ur_robot_driver, franka_ros2 and franka_ros, ROBOTIS's
-open_manipulator, spot_ros2, Isaac Sim's ROS 2 bridge, realsense2_camera, unitree_ros2, interbotix_xs_sdk,
-dynamixel_workbench, ros2_controllers, and messages as people define their own. All are written by `rosbags` or `mcap`.
+Types, topics, names and rates are those of public drivers: ur_robot_driver, ROBOTIS's open_manipulator, Isaac Sim's
+ROS 2 bridge, realsense2_camera, ros2_controllers, Foxglove's SDK. All are written by `rosbags`, `mcap` or `foxglove`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,40 +15,177 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 
 from support import bags
-from support.bags import NS, Notes, motion
-from support.layout_topics import (
-    POSE_NAMES,
-    TWIST_NAMES,
-    Body,
-    Layout,
-    Part,
-    Topic,
-    camera,
-    cmd_vel,
-    depth_camera,
-    field_of,
-    flat,
-    joint_part,
-    joints,
-    multi_array,
-    odometry,
-    pose_at,
-    pose_stamped,
-    raw_camera,
-    scalar,
-    state_at,
-    tf,
-    trajectory,
-    trajectory_part,
-)
+from support.bags import EPOCH_NS, NS, Note, Notes, motion
+
+SECONDS = 1.5
+Body = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topic:
+    """A topic at a steady rate; `body` makes the fields of a message from its time and number."""
+
+    name: str
+    type: str
+    body: Callable[[int, int], Body]
+    rate: int = 50
+    has_header: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """What a feature must have of a topic: the names, and the numbers of a message, None for one of others."""
+
+    topic: str
+    names: Sequence[str]
+    numbers: Callable[[Body], Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """A robot's topics, and what must come of them; an empty action is that of the next row.
+
+    Attributes:
+        clock_ns: Time of recording minus that of the headers.
+        write: Of the bag.
+    """
+
+    topics: Sequence[Topic]
+    state: Sequence[Part] = ()
+    action: Sequence[Part] = ()
+    cameras: int = 1
+    clock_ns: int = 0
+    write: Callable[[Notes, Path], Path] = field(default=lambda notes, path: bags.write_rosbag2(notes, path / "bag"))
+
+    def notes(self) -> Notes:
+        """Its messages, in the order of recording. Images begin last, so that a row can be at each of them."""
+        made = []
+        for topic in self.topics:
+            begin = EPOCH_NS + (NS // 20 if "image" in topic.type.lower() else 0)
+            for number in range(int(SECONDS * topic.rate)):
+                time = begin + number * NS // topic.rate
+                made.append(
+                    Note(topic=topic.name, type=topic.type, log_ns=time + self.clock_ns, frame_id=topic.name[1:],
+                         header_ns=time if topic.has_header else 0, body=topic.body(time, number))
+                )  # fmt: skip
+        return bags.in_order(made)
+
+
+def field_of(field_name: str = "position") -> Callable[[Body], Any]:
+    return lambda body: body[field_name]
+
+
+def joints(topic: str, names: Sequence[str], *, shift: float = 0.0, rate: int = 50) -> Topic:
+    return Topic(
+        name=topic, type="sensor_msgs/msg/JointState", rate=rate,
+        body=lambda time, number: {"name": list(names), "position": motion(time, len(names), shift=shift)},
+    )  # fmt: skip
+
+
+def joint_part(topic: str, names: Sequence[str]) -> Part:
+    """Of a topic of JointState, by name, whatever the order, of those messages that name them."""
+
+    def numbers(body: Body) -> Any:
+        have = dict(zip(body["name"], body["position"], strict=True))
+        return [have[name] for name in names] if names[0] in have else None
+
+    return Part(topic=topic, names=names, numbers=numbers)
+
+
+def camera(topic: str, shade: int = 0) -> Topic:
+    return Topic(
+        name=topic, type="sensor_msgs/msg/CompressedImage", rate=30,
+        body=lambda time, number: {
+            "format": "jpeg", "data": np.frombuffer(bags.jpeg(bags.image(time, shade)), np.uint8),
+        },
+    )  # fmt: skip
+
+
+def raw_camera(topic: str, shade: int = 0) -> Topic:
+    return Topic(
+        name=topic, type="sensor_msgs/msg/Image", rate=30,
+        body=lambda time, number: {
+            "encoding": "rgb8", "width": bags.WIDTH, "height": bags.HEIGHT, "step": 3 * bags.WIDTH,
+            "data": bags.image(time, shade),
+        },
+    )  # fmt: skip
+
+
+def depth_camera(topic: str) -> Topic:
+    def body(time: int, number: int) -> Body:
+        distances = np.full((bags.HEIGHT, bags.WIDTH), 500 + number, np.uint16)
+        return {"encoding": "16UC1", "width": bags.WIDTH, "height": bags.HEIGHT, "step": 2 * bags.WIDTH,
+                "data": np.frombuffer(distances.tobytes(), np.uint8)}  # fmt: skip
+
+    return Topic(name=topic, type="sensor_msgs/msg/Image", rate=30, body=body)
+
+
+def multi_array(topic: str, count: int, *, shift: float = 0.0) -> Topic:
+    return Topic(
+        name=topic, type="std_msgs/msg/Float64MultiArray", has_header=False,
+        body=lambda time, number: {"data": motion(time, count, shift=shift)},
+    )  # fmt: skip
+
+
+def scalar(topic: str, *, shift: float = 0.0, kind: str = "Float64") -> Topic:
+    return Topic(
+        name=topic, type=f"std_msgs/msg/{kind}", has_header=False,
+        body=lambda time, number: {"data": float(motion(time, 1, shift=shift)[0])},
+    )  # fmt: skip
+
+
+def pose_at(time: int) -> Body:
+    half = 0.2 * np.sin((time - EPOCH_NS) / NS)
+    orientation = {"x": 0.0, "y": 0.0, "z": float(np.sin(half)), "w": float(np.cos(half))}
+    return {"position": dict(zip("xyz", motion(time, 3).tolist(), strict=True)), "orientation": orientation}
+
+
+def pose_stamped(topic: str, *, ahead_ns: int = 0) -> Topic:
+    return Topic(
+        name=topic, type="geometry_msgs/msg/PoseStamped", body=lambda time, number: {"pose": pose_at(time + ahead_ns)}
+    )
+
+
+POSE_NAMES = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
+TWIST_NAMES = tuple(f"{part}.{axis}" for part in ("linear", "angular") for axis in "xyz")
+
+
+def flat(body: Body) -> list[float]:
+    return [number for part in body.values() for number in part.values()]
+
+
+def twist_at(time: int) -> Body:
+    return {part: dict(zip("xyz", motion(time, 3, shift=k).tolist(), strict=True))
+            for k, part in enumerate(("linear", "angular"))}  # fmt: skip
+
+
+def cmd_vel(topic: str) -> Topic:
+    return Topic(name=topic, type="geometry_msgs/msg/Twist", has_header=False, body=lambda time, number: twist_at(time))
+
+
+def odometry(topic: str) -> Topic:
+    return Topic(
+        name=topic, type="nav_msgs/msg/Odometry",
+        body=lambda time, number: {"pose": {"pose": pose_at(time)}, "twist": {"twist": twist_at(time)}},
+    )  # fmt: skip
+
+
+def trajectory(topic: str, names: Sequence[str]) -> Topic:
+    return Topic(
+        name=topic, type="trajectory_msgs/msg/JointTrajectory",
+        body=lambda time, number: {
+            "joint_names": list(names), "points": [{"positions": motion(time, len(names), shift=0.1)}],
+        },
+    )  # fmt: skip
+
+
+def trajectory_part(topic: str, names: Sequence[str]) -> Part:
+    return Part(topic=topic, names=names, numbers=lambda body: body["points"][0]["positions"])
+
 
 UR = tuple(f"{name}_joint" for name in ("shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "shoulder_pan"))
 FR3 = tuple(f"fr3_joint{k}" for k in range(1, 8))
-FINGERS = ("fr3_finger_joint1", "fr3_finger_joint2")
 OMX = ("joint1", "joint2", "joint3", "joint4", "joint5", "gripper_joint_1")
-LEGS = tuple(f"{leg}_{joint}" for leg in ("front_left", "front_right") for joint in ("hip_x", "hip_y", "knee"))
-VX300S = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper", "left_finger",
-          "right_finger")  # fmt: skip
 SIX = tuple(f"joint_{k}" for k in range(1, 7))
 
 
@@ -64,39 +201,12 @@ def _two_publishers() -> Sequence[Topic]:
     return Topic(name=arm.name, type=arm.type, rate=100, body=turned), gripper
 
 
-def _motors(time: int, shift: float = 0.0) -> list[Body]:
-    return [{"q": float(np.float32(number)), "dq": 1.0} for number in motion(time, 20, shift=shift)]
-
-
-def _dynamixels(time: int) -> Body:
-    ticks = np.round(motion(time, 5) * 651.9).astype(int)
-    return {"dynamixel_state": [
-        {"name": f"joint{k}", "id": k, "present_position": int(tick), "goal_position": int(tick) + 3}
-        for k, tick in enumerate(ticks)
-    ]}  # fmt: skip
-
-
-def _in_one_message(arm: str) -> Part:
-    sides = ("left", "right")
-    return Part(
-        topic="/teleoperation",
-        names=(
-            *(f"{side}_{arm}_positions_{k}" for side in sides for k in range(6)),
-            *(f"{side}_{arm}_gripper" for side in sides),
-        ),
-        numbers=lambda body: [
-            *(number for side in sides for number in body[side][f"{arm}_positions"]),
-            *(body[side][f"{arm}_gripper"] for side in sides),
-        ],
-    )
-
-
 def _mcap(notes: Notes, path: Path) -> Path:
     return bags.write_mcap(notes, path / "bag.mcap")
 
 
 def _ros1(notes: Notes, path: Path) -> Path:
-    return bags.write_mcap(notes, path / "bag.mcap", is_ros1=True)
+    return bags.write_ros1(notes, path / "bag.bag")
 
 
 def _foxglove(notes: Notes, path: Path) -> Path:
@@ -141,43 +251,11 @@ LAYOUTS: dict[str, Layout] = {
         action=(Part(topic="/forward_position_controller/commands", names=[f"data_{k}" for k in range(6)],
                      numbers=field_of("data")),),
     ),
-    "Franka": Layout(
-        topics=(
-            Topic(name="/franka_robot_state_broadcaster/robot_state", type="franka_msgs/msg/FrankaRobotState", rate=200,
-                  body=lambda time, number: {
-                      "measured_joint_state": state_at(FR3, time), "desired_joint_state": state_at(FR3, time, 0.1),
-                      "measured_joint_motor_state": state_at(FR3, time, 0.2), "o_t_ee": {"pose": pose_at(time)}}),
-            joints("/franka_gripper/joint_states", FINGERS, rate=40, shift=3.0),
-            raw_camera("/camera/camera/color/image_raw"),
-        ),
-        state=(
-            Part(topic="/franka_robot_state_broadcaster/robot_state", names=FR3,
-                 numbers=lambda body: body["measured_joint_state"]["position"]),
-            joint_part("/franka_gripper/joint_states", FINGERS),
-        ),
-    ),
-    "Franka, ROS 1": Layout(
-        topics=(
-            Topic(name="/franka_state_controller/franka_states", type="franka_msgs/msg/FrankaState", rate=200,
-                  body=lambda time, number: {"q": motion(time, 7), "q_d": motion(time, 7, shift=0.1)}),
-            joints("/franka_gripper/joint_states", FINGERS, rate=40), camera("/camera/color/image_raw/compressed"),
-        ),
-        state=(
-            Part(topic="/franka_state_controller/franka_states", names=[f"q_{k}" for k in range(7)],
-                 numbers=field_of("q")),
-            joint_part("/franka_gripper/joint_states", FINGERS),
-        ),
-        write=_ros1,
-    ),
     "ROBOTIS": Layout(
         topics=(joints("/joint_states", OMX, rate=100), trajectory("/leader/joint_trajectory", OMX),
                 camera("/camera/cam_top/image_raw/compressed")),
         state=(joint_part("/joint_states", OMX),),
         action=(trajectory_part("/leader/joint_trajectory", OMX),),
-    ),
-    "tf alone": Layout(
-        topics=(tf("/tf", ("link1", "link2", "tool0")), raw_camera("/camera/image_raw")),
-        unsure="transforms[child_frame_id=tool0].transform",
     ),
     "poses and a gripper": Layout(
         topics=(pose_stamped("/ee_pose"), scalar("/gripper/width"), pose_stamped("/target_pose", ahead_ns=NS // 10),
@@ -191,14 +269,6 @@ LAYOUTS: dict[str, Layout] = {
             Part(topic="/gripper/command", names=("gripper_command",), numbers=lambda body: [np.float32(body["data"])]),
         ),
         write=_mcap,
-    ),
-    "Spot": Layout(
-        topics=(joints("/spot/joint_states", LEGS), odometry("/spot/odometry"), cmd_vel("/spot/cmd_vel"),
-                tf("/tf", ("body", "odom")), camera("/spot/camera/frontleft/compressed"),
-                camera("/spot/camera/hand/compressed", 1)),
-        state=(joint_part("/spot/joint_states", LEGS),),
-        action=(Part(topic="/spot/cmd_vel", names=TWIST_NAMES, numbers=flat),),
-        cameras=2,
     ),
     "Isaac": Layout(
         topics=(joints("/joint_states", FR3, rate=60), joints("/joint_command", FR3, shift=0.1, rate=60),
@@ -241,71 +311,6 @@ LAYOUTS: dict[str, Layout] = {
         action=(joint_part("/teleop/joint_states", UR),),
         write=_foxglove,
     ),
-    "Unitree": Layout(
-        topics=(
-            Topic(name="/lowstate", type="unitree_go/msg/LowState", rate=200, has_header=False,
-                  body=lambda time, number: {"motor_state": _motors(time)}),
-            Topic(name="/lowcmd", type="unitree_go/msg/LowCmd", rate=200, has_header=False,
-                  body=lambda time, number: {"motor_cmd": _motors(time, 0.1)}),
-            Topic(name="/sportmodestate", type="unitree_go/msg/SportModeState", has_header=False,
-                  body=lambda time, number: {"position": motion(time, 3)}),
-            camera("/frontvideo/image/compressed"),
-        ),
-        state=(Part(topic="/lowstate", names=[f"q_{k}" for k in range(20)],
-                    numbers=lambda body: [motor["q"] for motor in body["motor_state"]]),),
-        action=(Part(topic="/lowcmd", names=[f"q_{k}" for k in range(20)],
-                     numbers=lambda body: [motor["q"] for motor in body["motor_cmd"]]),),
-    ),
-    "Interbotix": Layout(
-        topics=(
-            joints("/vx300s/joint_states", VX300S),
-            Topic(name="/vx300s/commands/joint_group", type="interbotix_xs_msgs/msg/JointGroupCommand",
-                  has_header=False,
-                  body=lambda time, number: {"name": "arm", "cmd": motion(time, 6, shift=0.1).astype(np.float32)}),
-            Topic(name="/vx300s/commands/joint_single", type="interbotix_xs_msgs/msg/JointSingleCommand",
-                  has_header=False, body=lambda time, number: {"name": "gripper", "cmd": 0.25 + number / 128}),
-            camera("/cam_high/image_raw/compressed"), camera("/cam_left_wrist/image_raw/compressed", 1),
-        ),
-        state=(joint_part("/vx300s/joint_states", VX300S),),
-        action=(
-            Part(topic="/vx300s/commands/joint_group", names=[f"cmd_{k}" for k in range(6)], numbers=field_of("cmd")),
-            Part(topic="/vx300s/commands/joint_single", names=("cmd",), numbers=lambda body: [body["cmd"]]),
-        ),
-        cameras=2,
-    ),
-    "Dynamixel": Layout(
-        topics=(
-            Topic(name="/dynamixel_workbench/dynamixel_state", has_header=False, rate=100,
-                  type="dynamixel_workbench_msgs/msg/DynamixelStateList", body=lambda time, number: _dynamixels(time)),
-            camera("/usb_cam/image_raw/compressed"),
-        ),
-        state=(Part(topic="/dynamixel_workbench/dynamixel_state", names=[f"joint{k}" for k in range(5)],
-                    numbers=lambda body: [item["present_position"] for item in body["dynamixel_state"]]),),
-    ),
-    "messages of one's own": Layout(
-        topics=(
-            Topic(name="/arm/telemetry", type="my_arm_msgs/msg/ArmState", rate=100,
-                  body=lambda time, number: {"q": motion(time, 6), "dq": np.ones(6), "tau": np.ones(6)}),
-            Topic(name="/arm/sent", type="my_arm_msgs/msg/ArmCommand",
-                  body=lambda time, number: {"position": motion(time, 6, shift=0.1), "stiffness": np.ones(6)}),
-            raw_camera("/overhead/image_raw"),
-        ),
-        state=(Part(topic="/arm/telemetry", names=[f"q_{k}" for k in range(6)], numbers=field_of("q")),),
-        action=(Part(topic="/arm/sent", names=[f"position_{k}" for k in range(6)],
-                     numbers=lambda body: np.float32(body["position"])),),
-        write=_mcap,
-    ),
-    "all in one message": Layout(
-        topics=(
-            Topic(name="/teleoperation", type="my_arm_msgs/msg/Teleoperation", rate=60, body=lambda time, number: {
-                side: {"leader_positions": motion(time, 6, shift=k + 0.1), "follower_positions": motion(time, 6),
-                       "leader_gripper": 0.5 + number / 256, "follower_gripper": 0.25 + number / 256}
-                for k, side in enumerate(("left", "right"))}),
-            camera("/head/image/compressed"),
-        ),
-        state=(_in_one_message("follower"),),
-        action=(_in_one_message("leader"),),
-    ),
     "two arms in namespaces": Layout(
         topics=(
             *(joints(f"/{side}/joint_states", SIX, shift=k) for k, side in enumerate(("left", "right"))),
@@ -327,38 +332,6 @@ LAYOUTS: dict[str, Layout] = {
         state=(Part(topic="/odom", names=(*POSE_NAMES, *TWIST_NAMES),
                     numbers=lambda body: [*flat(body["pose"]["pose"]), *flat(body["twist"]["twist"])]),),
         action=(Part(topic="/cmd_vel", names=TWIST_NAMES, numbers=flat),),
-    ),
-    "trajectories": Layout(
-        topics=(
-            joints("/joint_states", SIX, rate=100), trajectory("/joint_trajectory_controller/joint_trajectory", SIX),
-            Topic(name="/joint_trajectory_controller/controller_state",
-                  type="control_msgs/msg/JointTrajectoryControllerState",
-                  body=lambda time, number: {"joint_names": list(SIX), **{
-                      name: {"positions": motion(time, 6)} for name in ("desired", "actual", "error")}}),
-            camera("/camera/image_raw/compressed"),
-        ),
-        state=(joint_part("/joint_states", SIX),),
-        action=(trajectory_part("/joint_trajectory_controller/joint_trajectory", SIX),),
-    ),
-    "DROID": Layout(
-        topics=(
-            Topic(name="/droid/robot_state", type="droid_msgs/msg/RobotState", rate=60, body=lambda time, number: {
-                "cartesian_position": motion(time, 6, shift=4.0), "gripper_position": 0.5 + number / 256,
-                "joint_positions": motion(time, 7), "joint_velocities": np.ones(7)}),
-            Topic(name="/droid/action", type="droid_msgs/msg/Action", rate=60, body=lambda time, number: {
-                "cartesian_velocity": np.ones(6), "joint_position": motion(time, 7, shift=0.1),
-                "gripper_position": 0.75}),
-            camera("/droid/varied_camera_1/image/compressed"), camera("/droid/wrist_camera/image/compressed", 1),
-        ),
-        state=(
-            Part(topic="/droid/robot_state", names=(*(f"joint_positions_{k}" for k in range(7)), "gripper_position"),
-                 numbers=lambda body: [*body["joint_positions"], body["gripper_position"]]),
-        ),
-        action=(
-            Part(topic="/droid/action", names=(*(f"joint_position_{k}" for k in range(7)), "gripper_position"),
-                 numbers=lambda body: [*body["joint_position"], body["gripper_position"]]),
-        ),
-        cameras=2,
     ),
     "topics of numbers": Layout(
         topics=(

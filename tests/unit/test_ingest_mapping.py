@@ -129,23 +129,3 @@ def test_long_numbers_in_a_name_do_not_hold_it_up() -> None:
 def test_units(unit: str, to: str, given: list[float], expected: list[float]) -> None:
     source = Source(topic="/j", field="x", unit=unit, to=to, limits=((-1.0, 1.0), (-3.0, 3.0)))  # type: ignore[arg-type]
     assert np.allclose(converted(source, np.array([given])), expected)
-
-
-def test_digests_are_those_of_the_runs_that_may_be_continued(tmp_path: Path) -> None:
-    """As demorec gave them when bags and HDF5 files had a language each."""
-    bag = read_mapping(bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "bag.toml"))
-    assert bag.digest == "0f572a2612d74310"
-    text = """
-[robot]
-name = "arm"
-[task]
-text = "lift"
-[episodes]
-group = "data"
-[[features."observation.state"]]
-dataset = "obs/q"
-[[features.action]]
-dataset = "actions"
-"""
-    stored = read_mapping(bag_mappings.write_mapping(text, tmp_path / "hdf5.toml"), "hdf5")
-    assert stored.digest == "32cc4285c9e4acc2"

@@ -1,0 +1,219 @@
+"""Limits on memory and CPU time for commands that read files of unknown origin.
+
+Such a command runs in a child process, forked before any library is loaded. The parent waits for it, kills it above
+its limits, and turns its death into one sentence. Limits grow with the size of the files that the command line names.
+
+Memory is what the child has filled (resident and private), which the parent looks at fifty times a second. RLIMIT_DATA
+would count what allocators and threads merely reserve: 1 GB each for PyArrow and Rerun, more on machines of many cores.
+Linux alone reports all of this; elsewhere commands run without limits.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+VARIABLE = "DEMOREC_LIMITS"
+"""Environment variable; "off" removes the limits, for files that the user trusts."""
+READING_COMMANDS = frozenset({"info", "import", "view", "export", "dataset", "check", "report", "recover"})
+DRAWING_COMMANDS = frozenset({"replay", "render"})
+"""Commands that simulate or draw: their time and memory depend on frames and pixels, not on bytes."""
+DEEP_FLAG = "--deep"
+"""Makes a command of the former kind one of the latter."""
+READING_MEMORY_BYTES = 500_000_000
+DRAWING_MEMORY_BYTES = 4_000_000_000
+"""Rendering two cameras at 1920x1080 to AV1 with depth takes 0.8 GB."""
+MEMORY_RATIO = 20
+"""Bytes of memory for each byte of input."""
+READING_CPU_S = 20
+"""10 s to read, and 10 s to load libraries and to compile kernels on first use (LeRobot takes 5 s, kernels 4 s)."""
+CPU_S_PER_MB = 20
+"""`check` takes 2 s for each MB of a recording."""
+
+_TICK_S = 0.02
+_MAX_FILES = 20_000
+"""Files whose sizes are added up; the rest of a larger folder does not raise its limits."""
+_MAX_NAMES = 3
+"""Paths in a sentence."""
+_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL)
+_SET_PDEATHSIG = 1
+"""Option of prctl(2)."""
+
+
+class Limits(NamedTuple):
+    """Limits of one process.
+
+    Attributes:
+        paths: Existing files and folders that the command line names.
+        input_bytes: Their size.
+        memory_bytes: Private memory.
+        cpu_s: CPU time; None for no limit.
+    """
+
+    paths: tuple[str, ...]
+    input_bytes: int
+    memory_bytes: int
+    cpu_s: int | None
+
+    @classmethod
+    def of(cls, words: Sequence[str]) -> Limits | None:
+        """Limits of a command line without the program's name; None for a command that has none."""
+        command = words[0] if words else ""
+        is_drawing = command in DRAWING_COMMANDS or DEEP_FLAG in words
+        if not is_drawing and command not in READING_COMMANDS:
+            return None
+        paths = tuple(_paths_in(words[1:]))
+        size = sum(_sizes_below(paths))
+        floor = DRAWING_MEMORY_BYTES if is_drawing else READING_MEMORY_BYTES
+        cpu_s = None if is_drawing else READING_CPU_S + CPU_S_PER_MB * size // 1_000_000
+        return cls(paths, size, floor + MEMORY_RATIO * size, cpu_s)
+
+
+def continue_in_child(words: Sequence[str]) -> None:
+    """Go on in a limited child process; the parent exits as the child does.
+
+    Signals that reach the parent alone are passed on, and the child dies with it. Without limits nothing is forked.
+
+    Args:
+        words: The command line without the program's name.
+    """
+    if sys.platform != "linux" or os.environ.get(VARIABLE) == "off":
+        return
+    limits = Limits.of(words)
+    if limits is None:
+        return
+    heard, hears = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    usual = signal.pthread_sigmask(signal.SIG_BLOCK, (*_FORWARDED, signal.SIGCHLD))
+    parent = os.getpid()
+    child = os.fork()
+    if child == 0:
+        os.close(heard)
+        _limit_this_process(parent, limits.cpu_s)
+        signal.set_wakeup_fd(hears, warn_on_full_buffer=False)
+        signal.pthread_sigmask(signal.SIG_SETMASK, usual)
+        return
+    code, is_too_large = _watch(child, heard, limits.memory_bytes)
+    if code >= 0:
+        os._exit(code)
+    _tell_death(words[0], limits, signal.Signals(-code), is_too_large)
+
+
+def remove_cpu_limit() -> None:
+    """Lift the limit on CPU time, for a program that the user works with (a viewer)."""
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (hard, hard))
+
+
+def _limit_this_process(parent: int, cpu_s: int | None) -> None:
+    import ctypes
+
+    ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it was killed before
+        os._exit(1)
+    if cpu_s is not None:
+        soft, hard = resource.getrlimit(resource.RLIMIT_CPU)
+        lower = cpu_s if soft == resource.RLIM_INFINITY else min(soft, cpu_s)
+        resource.setrlimit(resource.RLIMIT_CPU, (lower, hard))
+
+
+def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
+    """Wait for the child; its exit code, -N after signal N, and whether it was killed for its memory."""
+    while True:
+        told = signal.sigtimedwait((*_FORWARDED, signal.SIGCHLD), _TICK_S)
+        if told is None:
+            family = [child, *_children(child)]
+            if any(_private_bytes(pid) > memory_bytes for pid in family):
+                for pid in family:
+                    os.kill(pid, signal.SIGKILL)
+                return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), True
+        elif told.si_signo == signal.SIGCHLD:
+            pid, status = os.waitpid(child, os.WNOHANG)
+            if pid == child:
+                return os.waitstatus_to_exitcode(status), False
+        elif told.si_code <= 0:  # sent by a process; the terminal signals the whole group
+            _pass_on(told.si_signo, child, heard)
+
+
+def _pass_on(number: int, child: int, heard: int) -> None:
+    """Send a signal to the child unless it was sent to the whole group: a second one would interrupt its clean-up."""
+    time.sleep(_TICK_S)
+    try:
+        numbers = os.read(heard, 4096)  # written by Python's own handler (signal.set_wakeup_fd)
+    except BlockingIOError:
+        numbers = b""
+    if number not in numbers:
+        os.kill(child, number)
+
+
+def _children(pid: int) -> list[int]:
+    """Processes that the main thread of a process has started, such as its workers."""
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def _private_bytes(pid: int) -> int:
+    try:
+        resident, shared = Path(f"/proc/{pid}/statm").read_text().split()[1:3]
+    except (OSError, ValueError):  # it has ended
+        return 0
+    return (int(resident) - int(shared)) * resource.getpagesize()
+
+
+def _tell_death(command: str, limits: Limits, number: signal.Signals, is_too_large: bool) -> NoReturn:
+    """Say in one sentence why the child died, or die of the same signal where a person or program has sent it."""
+    from demorec.core.text import printable
+
+    beyond = f"far more than its {limits.input_bytes / 1e6:,.1f} MB justify"
+    remedy = f"It is damaged or made to exhaust this machine; {VARIABLE}=off reads it nevertheless"
+    if is_too_large:
+        reason = f"Reading this takes more than {limits.memory_bytes / 1e6:,.0f} MB of memory, {beyond}. {remedy}"
+    elif number == signal.SIGXCPU:
+        reason = f"Reading this takes more than {limits.cpu_s} s of CPU time, {beyond}. {remedy}"
+    elif number in _CRASHES:
+        reason = f"A library crashed while reading this ({number.name}). The file is damaged, or made to do that"
+    elif number == signal.SIGKILL:
+        reason = "This command was killed, perhaps for lack of memory. Free some memory and try again"
+    else:
+        signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (number,))
+        os.kill(os.getpid(), number)
+        os._exit(128 + number)
+    names = ", ".join(limits.paths[:_MAX_NAMES]) + ", ..." * (len(limits.paths) > _MAX_NAMES)
+    begin = "\n" if os.isatty(2) else ""  # a progress bar may have left its line open
+    os.write(2, f"{begin}demorec {command}: {printable(f'{reason}: {names}')}\n".encode(errors="backslashreplace"))
+    os._exit(1)
+
+
+def _paths_in(words: Sequence[str]) -> Iterator[str]:
+    """Existing files and folders among the words of a command line, also as --flag=PATH, once each."""
+    for word in dict.fromkeys(words):
+        path = word.partition("=")[2] if word.startswith("-") else word
+        if path and "\0" not in path and os.path.lexists(Path(path).expanduser()):
+            yield path
+
+
+def _sizes_below(paths: Sequence[str]) -> Iterator[int]:
+    """Bytes of files, and of those in folders; links to folders are not followed."""
+    places = (Path(path).expanduser() for path in paths)
+    for file in islice((file for place in places for file in _files_below(place)), _MAX_FILES):
+        with suppress(OSError):  # reported where it is read
+            yield file.stat().st_size
+
+
+def _files_below(place: Path) -> Iterator[Path]:
+    if not place.is_dir():
+        yield place
+    for folder, _, names in os.walk(place):
+        for name in names:
+            yield Path(folder, name)

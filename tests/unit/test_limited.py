@@ -1,0 +1,185 @@
+"""The child process in which files are read: what kills it, and what it passes on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+import pytest
+
+from demorec.core import limited
+from demorec.core.limited import Limits
+
+START = """
+import os, signal, sys, time
+from demorec.core import limited
+limited.READING_CPU_S, limited.CPU_S_PER_MB = 1, 1
+limited.continue_in_child(sys.argv[1:])
+"""
+FILL = "content = bytearray(1 << 30)\nprint('filled')\n"
+FILL_SLOWLY = "content = []\nfor _ in range(300): content.append(bytes(range(250)) * 40_000); time.sleep(0.002)\n"
+SPIN = "while True: pass\n"
+WAIT = "print('ready', os.getpid(), flush=True)\ntime.sleep(60)\n"
+COUNT = """
+heard = []
+signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+print("ready", os.getpid(), flush=True)
+end = time.monotonic() + 1
+while time.monotonic() < end:
+    time.sleep(0.01)
+raise SystemExit(len(heard))
+"""
+WORKER = """
+import subprocess
+print(subprocess.run([sys.executable, "-c", "content = bytearray(1 << 30); input()"], stdin=0).returncode)
+"""
+
+
+class Ended(NamedTuple):
+    """How a program ended."""
+
+    code: int
+    output: str
+    errors: str
+    peak_bytes: int
+
+
+def run(work: str, *words: object, environment: Mapping[str, str] | None = None) -> Ended:
+    """Run some lines in a limited child."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", START + work, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | (environment or {}),
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    output, errors = process.stdout.read().decode(), process.stderr.read().decode()
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return Ended(process.returncode, output, errors, 1024 * used.ru_maxrss)
+
+
+def started(work: str, *words: object) -> tuple[subprocess.Popen[str], psutil.Process]:
+    """A program that has said that it is ready, and its child."""
+    command = [sys.executable, "-c", START + work, *map(str, words)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout is not None
+    ready, pid = process.stdout.readline().split()
+    assert ready == "ready"
+    return process, psutil.Process(int(pid))
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "given.mcap"
+    path.write_bytes(bytes(400_000))
+    return path
+
+
+@pytest.mark.parametrize("code", [0, 1, 2, 130])
+def test_the_exit_code_is_that_of_the_child(code: int, file: Path) -> None:
+    assert run(f"print(os.getppid()); raise SystemExit({code})", "info", file).code == code
+
+
+@pytest.mark.parametrize("work", [FILL, FILL_SLOWLY])
+def test_too_much_memory_is_one_sentence(work: str, file: Path) -> None:
+    ended = run(work, "info", file)
+    assert (ended.code, ended.output) == (1, "")
+    assert ended.errors == (
+        "demorec info: Reading this takes more than 508 MB of memory, far more than its 0.4 MB justify. It is damaged "
+        f"or made to exhaust this machine; DEMOREC_LIMITS=off reads it nevertheless: {file}\n"
+    )
+    assert 500_000_000 < ended.peak_bytes < 750_000_000
+
+
+def test_memory_of_a_worker_counts(file: Path) -> None:
+    ended = run(WORKER, "check", file)
+    assert (ended.code, ended.output) == (1, "")
+    assert "takes more than 508 MB of memory" in ended.errors
+
+
+@pytest.mark.parametrize("words", [["generate"], ["render"], ["check", "--deep"], []])
+def test_what_draws_may_take_more(words: list[str], file: Path) -> None:
+    assert run(FILL, *words, file).output == "filled\n"
+
+
+def test_the_limits_can_be_removed(file: Path) -> None:
+    assert run(FILL, "info", file, environment={"DEMOREC_LIMITS": "off"}).output == "filled\n"
+
+
+def test_too_much_cpu_time_is_one_sentence(file: Path) -> None:
+    ended = run(SPIN, "info", file)
+    assert ended.code == 1
+    assert ended.errors.startswith("demorec info: Reading this takes more than 1 s of CPU time")
+    assert ended.errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGABRT])
+def test_a_crash_is_one_sentence(number: signal.Signals, file: Path) -> None:
+    ended = run(f"os.kill(os.getpid(), {int(number)})", "info", file)
+    assert (ended.code, ended.errors.count("\n")) == (1, 1)
+    assert f"A library crashed while reading this ({number.name})" in ended.errors
+    assert str(file) in ended.errors
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_the_parent_is_passed_on(number: signal.Signals, file: Path) -> None:
+    process, child = started(WAIT, "info", file)
+    assert child.pid != process.pid
+    process.send_signal(number)
+    assert process.wait(20) == -number
+    assert not child.is_running()
+
+
+def test_a_signal_to_both_reaches_the_child_once(file: Path) -> None:
+    process, _ = started(COUNT, "info", file)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(20) == 1
+
+
+def test_the_child_dies_with_its_parent(file: Path) -> None:
+    process, child = started(WAIT, "info", file)
+    process.kill()
+    process.wait()
+    _, alive = psutil.wait_procs([child], timeout=20)
+    assert not alive
+
+
+def test_a_stopped_child_goes_on(file: Path) -> None:
+    process, child = started(COUNT, "info", file)
+    child.suspend()
+    time.sleep(0.2)
+    assert process.poll() is None
+    child.resume()
+    assert process.wait(20) == 0
+
+
+def test_limits_grow_with_what_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "run"
+    (folder / "episodes").mkdir(parents=True)
+    for number in range(3):
+        (folder / "episodes" / f"{number}.mcap").write_bytes(bytes(1_000_000))
+    (folder / "itself").symlink_to(folder)
+    (folder / "nowhere").symlink_to(tmp_path / "missing")
+    mapping = tmp_path / "mapping.toml"
+    mapping.write_bytes(bytes(1_000_000))
+    monkeypatch.chdir(tmp_path)
+    words = ["import", "run", "run", f"--mapping={mapping}", "--out", "new", "--fps", "30", "a\0b"]
+    limits = Limits.of(words)
+    assert limits is not None
+    assert limits.paths == ("run", str(mapping))
+    assert limits.input_bytes == 4_000_000
+    assert limits.memory_bytes == limited.READING_MEMORY_BYTES + 80_000_000
+    assert limits.cpu_s == limited.READING_CPU_S + 80
+    assert Limits.of(["generate", "--config", "mapping.toml"]) is None
+    drawing = Limits.of(["render", "run"])
+    assert drawing is not None
+    assert drawing.cpu_s is None
