@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.commands import exit_code
 from support.training import SMALL_ACT
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache", "hdf5_read_here")
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 
 WIDTH, HEIGHT, PIXELS_PER_METRE = 64, 48, 100
 REACH, CARRY = 8, 8
