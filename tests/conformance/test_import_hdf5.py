@@ -32,7 +32,6 @@ from demorec.sources.hdf5_import import episode_places, import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 from demorec.sources.mapping import Episodes
 
-pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 DEMOS = ("demo_0", "demo_1", "demo_10")
 
 
