@@ -230,4 +230,5 @@ def _row_bytes(metadata: pq.FileMetaData, columns: Sequence[str] | None) -> int:
         for part in (group.column(number) for number in range(group.num_columns)):
             if columns is None or f"{part.path_in_schema}.".startswith(beginnings):
                 num_bytes += part.total_uncompressed_size
-    return max(1, num_bytes // max(1, metadata.num_rows))
+    num_rows: int = metadata.num_rows
+    return max(1, num_bytes // max(1, num_rows))

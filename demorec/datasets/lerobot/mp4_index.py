@@ -23,10 +23,11 @@ _PARENTS = (b"trak", b"mdia", b"minf", b"stbl", b"edts")
 
 
 def check_video(path: Path) -> None:
-    """Raise ExportError unless a file is a regular one that begins as mp4 files do."""
+    """Raise ExportError unless a file is a regular one that consists of whole mp4 boxes."""
     try:
         with open_regular(path) as file:
-            next(_boxes(file, 0, os.fstat(file.fileno()).st_size), None)
+            for _ in _boxes(file, 0, os.fstat(file.fileno()).st_size):
+                pass
     except (OSError, ValueError, struct.error) as error:
         raise ExportError(f"The video cannot be opened ({describe_error(error)}): {path}") from error
 
