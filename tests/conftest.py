@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import av.logging
 import hypothesis
@@ -50,20 +49,6 @@ def pytest_runtest_call() -> Iterator[None]:
 def without_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exports are not verified and `dataset_opens` is left out: a process of LeRobot takes seconds to start."""
     without_verification(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def hdf5_read_here() -> Iterator[None]:
-    """HDF5 files are walked through in this process first; tests/crash/test_hdf5_damage.py has the one to be spared."""
-    from demorec.datasets.hdf5 import trial
-
-    def walked(path: Path) -> str:
-        trial.walk(path)
-        return ""
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trial, "why_not_read", walked)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ MEMORY_RATIO = 20
 """Bytes of memory for each byte of input."""
 READING_CPU_S = 20
 """10 s to read, and 10 s to load libraries and to compile kernels on first use (LeRobot takes 5 s, kernels 4 s)."""
-CPU_S_PER_MB = 20
+CPU_S_PER_MB = 10
 """`check` takes 2 s for each MB of a recording."""
 
 _TICK_S = 0.02

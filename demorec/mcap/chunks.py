@@ -17,12 +17,8 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from demorec.mcap.limits import Limits
-
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of what follows (MCAP specification, Records)."""
-MAX_RECORD_BYTES = 1 << 30
-"""No recording has larger records; a damaged length must not fill the memory."""
 
 _MESSAGE = 5
 _MESSAGE_HEAD = np.dtype(
@@ -56,12 +52,11 @@ def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, 
         yield opcode, start, position
 
 
-def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int | None = None) -> bytes:
+def chunk_content(record: bytes | memoryview, expected_size: int | None = None) -> bytes:
     """The records in a chunk, given the content of its record; a checksum of 0 stands for none.
 
     Raises:
-        ValueError, struct.error, zstandard.ZstdError: It is damaged, larger than the limits allow, or not of the
-            expected size.
+        ValueError, struct.error, zstandard.ZstdError: It is damaged, or not of the expected size.
     """
     _, _, size, stored_crc, name_bytes = _CHUNK_HEAD.unpack_from(record)
     position = _CHUNK_HEAD.size
@@ -72,7 +67,6 @@ def chunk_content(record: bytes | memoryview, limits: Limits, expected_size: int
         raise ValueError("a chunk differs from its index")
     if start + num_bytes > len(record):
         raise ValueError("a chunk that is cut off")
-    limits.check_chunk(size, num_bytes)
     stored = memoryview(record)[start : start + num_bytes]
     if compression == b"zstd":
         # Where the compressed data state their size, that much is reserved, whatever is said here to be the most.
@@ -152,17 +146,16 @@ class Block:
         return self.heads(length)
 
 
-def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int], limits: Limits) -> dict[str, Block]:
+def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int]) -> dict[str, Block]:
     """topic -> its messages in the contents of chunks, given topic -> channel.
 
     Raises:
-        ValueError, struct.error: The records do not fill their chunk, or are more than the limits allow.
+        ValueError, struct.error: The records do not fill their chunk.
     """
     found = array("q")
     joined = BytesIO()
     for chunk in contents:
         _find_records(chunk, joined.tell(), found.append)
-        limits.check_records(len(found))
         joined.write(chunk)
     content = joined.getvalue()
     values = np.frombuffer(content, dtype=np.uint8)

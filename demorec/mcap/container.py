@@ -1,5 +1,5 @@
 """Random access to an MCAP file that trusts nothing: every byte that is used was covered by a checksum, where its
-writer left one (0 stands for none), and nothing unpacks to more than `Limits` allows.
+writer left one (0 stands for none).
 
 The summary at the end states where each chunk is and which topics it holds, so one topic is read without touching the
 others, one chunk at a time. The mcap library parses the records; what this adds is the checking, and one error.
@@ -18,11 +18,8 @@ from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Foote
 
 from demorec.core.errors import RecordingError, ResourceError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular
-from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, Block, blocks_of, chunk_content, records_in
-from demorec.mcap.limits import LimitError, Limits
+from demorec.mcap.chunks import RECORD_HEAD, Block, blocks_of, chunk_content, records_in
 from demorec.mcap.scan import (
-    MAX_CHANNELS,
-    MAX_METADATA_BYTES,
     MESSAGE_HEAD,
     NO_SCHEMA,
     read_channel,
@@ -43,8 +40,6 @@ def damage_as_recording_error(path: Path) -> Iterator[None]:
         yield
     except (RecordingError, ResourceError):
         raise
-    except LimitError as error:
-        raise RecordingError(f"The recording is not read, {error}: {path}") from error
     except Exception as error:
         if not isinstance(error, _DAMAGE) and type(error).__module__.split(".")[0] not in _PARSERS:
             raise
@@ -84,8 +79,7 @@ class Container:
         self._file.close()
 
     def _read_summary(self) -> None:
-        size = self._file.seek(0, 2)
-        self._limits = Limits.of_file(size)
+        self._size = size = self._file.seek(0, 2)
         if size == 0:
             raise RecordingError(f"The file is empty, so no recording: {self.path}")
         if self._read_at(0, min(size, len(MCAP_MAGIC))) != MCAP_MAGIC:
@@ -121,9 +115,6 @@ class Container:
                 schema = read_schema(content)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHUNK_INDEX:
-                # Before it is parsed: of each channel, the number and where its messages begin, 10 bytes.
-                if int.from_bytes(content[32:36], "little") > 10 * MAX_CHANNELS:
-                    raise ValueError(f"a chunk of more than {MAX_CHANNELS:,} topics")
                 self._chunks.append(read_record(content, ChunkIndex))
             elif opcode == Opcode.METADATA_INDEX:
                 metadata = read_record(content, MetadataIndex)
@@ -134,8 +125,6 @@ class Container:
             elif opcode == Opcode.STATISTICS:
                 counts = dict(read_record(content, Statistics).channel_message_counts)
         self._chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
-        self._limits.check_total(sum(chunk.uncompressed_size for chunk in self._chunks))
-        self._limits.check_records(sum(counts.values()))
         for channel in channels.values():
             if channel.schema_id not in self.schemas:
                 raise ValueError(f"no schema {channel.schema_id} for the topic {channel.topic!r}")
@@ -143,7 +132,7 @@ class Container:
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in channels.values()}
 
     def _read_at(self, offset: int, length: int) -> bytes:
-        if not 0 <= length <= MAX_RECORD_BYTES:
+        if not 0 <= length <= self._size:
             raise RecordingError(f"The recording is damaged: a record of {length} bytes: {self.path}")
         if self._file.closed:
             raise RecordingError(f"The recording was closed before it was read: {self.path}")
@@ -172,10 +161,6 @@ class Container:
         index = self._metadata.get(name)
         if index is None:
             return None
-        if index.length > MAX_METADATA_BYTES:
-            raise RecordingError(
-                f"The metadata {name} have {index.length / 1e6:,.0f} MB, those of recordings a few kB: {self.path}"
-            )
         with damage_as_recording_error(self.path):
             record = read_record(self._content_at(index.offset, index.length, Opcode.METADATA), Metadata)
             return dict(record.metadata)
@@ -200,22 +185,19 @@ class Container:
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
         """(topic, time in ns, bytes) of the messages of some topics in the order of the file."""
         wanted = {channel: topic for topic, channel in self._ids(topics).items()}
-        count = 0
         with damage_as_recording_error(self.path):
             for content in self._unpacked(self._chunks_of(wanted)):
                 for opcode, start, end in records_in(content):
-                    count += 1
                     if opcode == Opcode.MESSAGE:
                         channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(content, start)
                         if channel in wanted:
                             yield wanted[channel], time_ns, content[start + MESSAGE_HEAD.size : end]
-                self._limits.check_records(count)
 
     def blocks(self, topics: Collection[str]) -> dict[str, Block]:
         """topic -> all its messages; the chunks that hold any of them are in memory together."""
         wanted = self._ids(topics)
         with damage_as_recording_error(self.path):
-            return blocks_of(self._unpacked(self._chunks_of(wanted.values())), wanted, self._limits)
+            return blocks_of(self._unpacked(self._chunks_of(wanted.values())), wanted)
 
     def blocks_by_chunk(self, topics: Collection[str], *, num_bytes: int = 0) -> Iterator[dict[str, Block]]:
         """As `blocks`, one chunk after the other, or a few of them: no more than have that many bytes unpacked.
@@ -228,11 +210,11 @@ class Container:
         with damage_as_recording_error(self.path):
             for chunk in self._chunks_of(wanted.values()):
                 if group and total + chunk.uncompressed_size > num_bytes:
-                    yield blocks_of(self._unpacked(group), wanted, self._limits)
+                    yield blocks_of(self._unpacked(group), wanted)
                     group, total = [], 0
                 group.append(chunk)
                 total += chunk.uncompressed_size
-            yield blocks_of(self._unpacked(group), wanted, self._limits)
+            yield blocks_of(self._unpacked(group), wanted)
 
     def _ids(self, topics: Collection[str]) -> dict[str, int]:
         """topic -> number of its channel, -1 where there is none."""
@@ -245,4 +227,4 @@ class Container:
     def _unpacked(self, chunks: Iterable[ChunkIndex]) -> Iterator[bytes]:
         for chunk in chunks:
             record = self._content_at(chunk.chunk_start_offset, chunk.chunk_length, Opcode.CHUNK)
-            yield chunk_content(record, self._limits, chunk.uncompressed_size)
+            yield chunk_content(record, chunk.uncompressed_size)

@@ -20,7 +20,6 @@ from demorec.episode.episode import frame_time_ns
 from demorec.episode.info import EpisodeInfo, Origin
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.metadata import CameraStreams
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
@@ -152,16 +151,13 @@ def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
                 yield "the file is empty" if size == 0 else "the file is no MCAP file"
                 return
             with damage_as_recording_error(source):
-                yield from scan(file, Unpacked(Limits.of_file(size)))
+                yield from scan(file)
     except OSError as error:
         unreadable = RecordingError(f"The file cannot be read ({error.strerror}): {source}")
         raise resource_error(error, source) or unreadable from error
     except RecordingError as error:
         cause = error.__cause__
-        if isinstance(cause, LimitError):
-            yield f"the rest is not read, {cause}"
-        else:
-            yield str(cause) if isinstance(cause, CutOffError) else "a record is damaged"
+        yield str(cause) if isinstance(cause, CutOffError) else "a record is damaged"
 
 
 def _survey(source: Path) -> _Survey:

@@ -1,4 +1,4 @@
-"""An MCAP file read from its front to its end, without its index: in bounded memory and time, whole or cut off.
+"""An MCAP file read from its front to its end, without its index, whole or cut off.
 
 So are bags read, which others wrote, and what a crash left of a recording.
 """
@@ -17,15 +17,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Metadata, Schema
 
-from demorec.mcap.chunks import MAX_RECORD_BYTES, RECORD_HEAD, chunk_content, records_in
-from demorec.mcap.limits import Unpacked
+from demorec.mcap.chunks import RECORD_HEAD, chunk_content, records_in
 
-MAX_METADATA_BYTES = 4 << 20
-"""Of a metadata record: ours have some 20 kB."""
-MAX_SCHEMA_BYTES = 1 << 20
-"""Of a message type's definition; the largest of ROS with all that it refers to have some 30 kB."""
-MAX_CHANNELS = 4096
-"""Of a file; large systems have some hundred topics."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence number, time of recording and of publishing (MCAP specification, Message)."""
 _IN_CHUNKS = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -85,21 +78,19 @@ def read_schema(content: bytes) -> Schema:
     return read_record(content, Schema)
 
 
-def scan(file: BinaryIO, unpacked: Unpacked) -> Iterator[ScannedMessage | Metadata | None]:
+def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
     """What a file holds: messages and metadata in its order, and None at the end of each chunk.
 
     Args:
         file: At its first record.
-        unpacked: What has been unpacked until now.
 
     Raises:
         CutOffError: It ends before its end.
-        LimitError: It would unpack to more than is allowed.
         Exception: A record is damaged; the parsers' own errors share no other base class.
     """
     schemas = {0: NO_SCHEMA}
     channels: dict[int, ScannedChannel] = {}
-    for opcode, data, start, end in _records(file, unpacked):
+    for opcode, data, start, end in _records(file):
         if opcode == Opcode.MESSAGE:
             channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data, start)
             yield ScannedMessage(channels[channel], log_ns, data[start + MESSAGE_HEAD.size : end])
@@ -109,13 +100,9 @@ def scan(file: BinaryIO, unpacked: Unpacked) -> Iterator[ScannedMessage | Metada
             yield read_record(data[start:end], Metadata)
         elif opcode == Opcode.SCHEMA:
             schema = read_schema(data[start:end])
-            if len(schema.data) > MAX_SCHEMA_BYTES:
-                raise ValueError(f"the definition of {schema.name[:80]!r} has {len(schema.data):,} bytes")
             schemas[schema.id] = schema
         else:
             found = read_channel(data[start:end])
-            if found.id not in channels and len(channels) >= MAX_CHANNELS:
-                raise ValueError("too many channels")
             schema = schemas[found.schema_id]
             channels[found.id] = ScannedChannel(
                 topic=found.topic,
@@ -127,7 +114,7 @@ def scan(file: BinaryIO, unpacked: Unpacked) -> Iterator[ScannedMessage | Metada
             )
 
 
-def _records(file: BinaryIO, unpacked: Unpacked) -> Iterator[tuple[int, bytes, int, int]]:
+def _records(file: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
     """(opcode, data, start, end) of the records that `scan` reads, in chunks too; an empty one ends a chunk's."""
     size = os.fstat(file.fileno()).st_size
     while True:
@@ -135,21 +122,17 @@ def _records(file: BinaryIO, unpacked: Unpacked) -> Iterator[tuple[int, bytes, i
         if len(head) < RECORD_HEAD.size:
             raise CutOffError("the end is missing")
         opcode, length = RECORD_HEAD.unpack(head)
-        if length > min(size - file.tell(), MAX_RECORD_BYTES):
+        if length > size - file.tell():
             raise CutOffError("a record is cut off")
         if opcode in (Opcode.DATA_END, Opcode.FOOTER):
             return
         if opcode == Opcode.CHUNK:
-            content = chunk_content(file.read(length), unpacked.limits)
-            unpacked.add(len(content))
-            count = 0
+            content = chunk_content(file.read(length))
             for inner, start, end in records_in(content):
-                count += 1
                 if inner in _IN_CHUNKS:
                     yield inner, content, start, end
-            unpacked.add(0, count)
             yield opcode, b"", 0, 0
-        elif opcode in _IN_CHUNKS or (opcode == Opcode.METADATA and length <= MAX_METADATA_BYTES):
+        elif opcode in _IN_CHUNKS or opcode == Opcode.METADATA:
             yield opcode, file.read(length), 0, length
         else:
             file.seek(length, os.SEEK_CUR)

@@ -9,7 +9,6 @@ from urllib.parse import quote
 
 from demorec.core.errors import DemorecError, describe_error
 from demorec.core.files import MCAP_MAGIC, open_regular
-from demorec.mcap.limits import LimitError, Limits, Unpacked
 from demorec.mcap.scan import CutOffError, ScannedChannel, ScannedMessage, scan
 
 MAX_TIME_NS = 1 << 62
@@ -32,14 +31,13 @@ def read_mcap(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMes
     with open_regular(path) as file:
         file.seek(len(MCAP_MAGIC))
         try:
-            for item in scan(file, Unpacked(Limits.of_file(path.stat().st_size))):
+            for item in scan(file):
                 if isinstance(item, ScannedMessage) and (topics is None or item.channel.topic in topics):
                     yield item
         except MemoryError:
             raise
         except Exception as error:  # the parsers' own errors share no other base class
-            is_own = isinstance(error, LimitError | CutOffError)
-            report(str(error) if is_own else f"a record is damaged: {describe_error(error)}")
+            report(str(error) if isinstance(error, CutOffError) else f"a record is damaged: {describe_error(error)}")
 
 
 def read_sqlite(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:

@@ -17,8 +17,6 @@ from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.runs.find import PathKind, expect, find
 
-pytestmark = pytest.mark.usefixtures("hdf5_read_here")
-
 
 def make_fifo(path: Path) -> None:
     os.mkfifo(path)

@@ -32,7 +32,6 @@ from demorec.sources.hdf5_import import episode_places, import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 from demorec.sources.mapping import Episodes
 
-pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 DEMOS = ("demo_0", "demo_1", "demo_10")
 
 
@@ -200,28 +199,6 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
     mapping.write_text(mapping.read_text().replace('"observations/qvel"', '"observations/images/cam_high"'))
     with pytest.raises(Hdf5Error, match="cam_high cannot be used, since it holds objects, no plain numbers"):
         import_hdf5([file], mapping, tmp_path / "other")
-
-
-def test_rows_that_share_their_bytes_are_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file, count = write_aloha(tmp_path / "episode_0.hdf5", count=200), 200
-    data = np.frombuffer(jpeg(np.random.default_rng(0).integers(0, 255, (96, 128, 3)).astype(np.uint8), 95), np.uint8)
-    with h5py.File(file, "r+") as opened:
-        for camera in ALOHA_CAMERAS:
-            del opened[f"observations/images/{camera}"]
-        kind = h5py.vlen_dtype(np.uint8)
-        stored = opened.create_dataset("observations/images/cam_high", (count,), kind, chunks=(count,))
-        stored[:] = [data] * count
-        opened.flush()
-        _, chunk = stored.id.read_direct_chunk((0,))
-        stored.id.write_direct_chunk((0,), chunk[:16] * count)
-    assert count * len(data) > 1 << 20
-    mapping = suggested(file)
-    monkeypatch.setenv("DEMOREC_UNPACKED_MB", "1")
-    monkeypatch.setattr("demorec.mcap.limits._RATIO", 0)
-    assert exit_code("import", "hdf5", file, "--mapping", mapping, "--out", tmp_path / "run") == 1
-    assert "would unpack to" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["uint8", "float32", "float64", "float16", "255"])

@@ -14,7 +14,7 @@ from support.commands import exit_code
 
 from lerobot_policy_act_keypoints.commands import act_keypoints_pretrain
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache", "hdf5_read_here")
+pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 
 WIDTH, HEIGHT, PIXELS_PER_METRE = 64, 48, 100
 REACH, CARRY = 8, 8

@@ -27,7 +27,6 @@ from support.foreign_dataset import write_foreign
 
 from demorec.sources import import_run
 
-pytestmark = pytest.mark.usefixtures("hdf5_read_here")
 COMMANDS = {name: ON_A_PATH[name] for name in ON_EVERYTHING} | {"export": "export hdf5 PATH --out NEW.hdf5"}
 ROWS = {
     "mcap": (1, 48),

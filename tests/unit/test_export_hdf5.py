@@ -14,8 +14,6 @@ from support.export import export, make_run
 from demorec.core.errors import ConfigError
 from demorec.mcap import Recording
 
-pytestmark = pytest.mark.usefixtures("hdf5_read_here")
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:

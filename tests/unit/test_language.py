@@ -6,18 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from support.recording import make_episode
 
 from demorec.annotate.referring import phrase_for, phrases_for, resolve
 from demorec.annotate.situation import situation
 from demorec.annotate.statements import episode_statements
-from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
-from demorec.datasets.lerobot import files
-from demorec.datasets.lerobot.language import EpisodeLanguage, language_arrays
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, RobotPlacement, Scene, Shape
 from demorec.mcap import EpisodeWriter, Recording
@@ -136,22 +131,3 @@ def test_phases_of_a_foreign_script_are_told_as_they_are(tmp_path: Path) -> None
     assert [(row, text) for row, kind, text in found if kind == "subtask"] == [
         (0, "wiggle about"), (2, "pick up the red cube and place it on the green target"), (4, "grasp the red cube"),
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize(("statements", "is_read"), [(200, True), (1000, False)])
-def test_words_that_stand_in_every_row_are_no_bomb(
-    statements: int, is_read: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Tables of words unpack to hundreds of times their size; above all bounds are only more than any episode has."""
-    monkeypatch.setattr(files, "_FLOOR_BYTES", 1 << 20)
-    said = {"role": "assistant", "content": "grasp the red cube", "style": "subtask", "timestamp": 0.0}
-    said |= {"camera": None, "tool_calls": None}
-    arrays = language_arrays(EpisodeLanguage(persistent=(said,) * statements), 600)
-    path = tmp_path / "words.parquet"
-    pq.write_table(pa.table({"index": np.arange(600), **arrays}), path)
-    assert 8 * 600 * statements * 6 > 16 * path.stat().st_size
-    if is_read:
-        assert files.open_table(path, ["index"]).metadata.num_rows == 600
-    else:
-        with pytest.raises(ExportError, match="values of language in so few rows"):
-            files.open_table(path)

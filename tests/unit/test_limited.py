@@ -178,7 +178,7 @@ def test_limits_grow_with_what_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     assert limits.paths == ("run", str(mapping))
     assert limits.input_bytes == 4_000_000
     assert limits.memory_bytes == limited.READING_MEMORY_BYTES + 80_000_000
-    assert limits.cpu_s == limited.READING_CPU_S + 80
+    assert limits.cpu_s == limited.READING_CPU_S + 40
     assert Limits.of(["generate", "--config", "mapping.toml"]) is None
     drawing = Limits.of(["render", "run"])
     assert drawing is not None

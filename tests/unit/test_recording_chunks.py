@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 from demorec.mcap.chunks import blocks_of
-from demorec.mcap.limits import Limits
 from demorec.mcap.messages import coded_images, compressed_image
-
-LIMITS = Limits.of_file(1000)
 
 
 def message(channel: int, time_ns: int, data: bytes) -> bytes:
@@ -33,14 +30,14 @@ def message(channel: int, time_ns: int, data: bytes) -> bytes:
 )
 def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> None:
     with pytest.raises((ValueError, struct.error)):
-        blocks_of([content], {"/one": 1}, LIMITS)
+        blocks_of([content], {"/one": 1})
 
 
 def test_images_of_several_formats_and_cut_off_ones() -> None:
     made = [compressed_image(0, "a", "h264", b"one")]
     made += [compressed_image(7, "a longer frame", "jpeg", b"three")]
     for messages in (made, made[:1] * 2):
-        block = blocks_of([b"".join(message(1, 0, data) for data in messages)], {"/x": 1}, LIMITS)["/x"]
+        block = blocks_of([b"".join(message(1, 0, data) for data in messages)], {"/x": 1})["/x"]
         assert list(coded_images(block, "h264").messages()) == (
             [b"one", b"three"] if messages is made else [b"one"] * 2
         )

@@ -15,7 +15,6 @@ import h5py
 from demorec.core.errors import describe_error
 from demorec.core.files import HDF5_MAGIC, open_regular
 from demorec.core.replacing import ReplaceableKind
-from demorec.datasets.hdf5 import trial
 from demorec.episode.sensed import SENSED
 
 ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "privileged"})
@@ -50,7 +49,7 @@ def _begins_as_hdf5(path: Path) -> bool:
 
 
 def _is_our_dataset(path: Path) -> bool:
-    if not _begins_as_hdf5(path) or trial.why_not_read(path):
+    if not _begins_as_hdf5(path):
         return False
     try:
         with h5py.File(path, "r", locking=False) as file:

@@ -1,14 +1,12 @@
-"""HDF5 files of unknown origin, read within bounds and in pieces.
+"""HDF5 files of unknown origin, read in pieces.
 
-Anyone writes HDF5 files, and people pass them on. A link in one can lead into any other file of the machine, a dataset
-can have its numbers elsewhere or claim rows that nobody wrote, and a few kB can unpack to terabytes: all of these are
-refused. No objects are made of what is in a file but numbers and short texts.
+A link can lead into any other file of the machine, and a dataset can have its numbers elsewhere or rows that nobody
+wrote: all of these are refused. Only numbers and texts are made of the content.
 """
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,17 +19,11 @@ from numpy.typing import NDArray
 from demorec.core.errors import DemorecError, resource_error
 from demorec.core.files import HDF5_MAGIC, Closing, open_regular
 from demorec.core.registry import nearest_match
-from demorec.datasets.hdf5 import trial
-from demorec.mcap.limits import LimitError, Limits
 
 Kind = Literal["group", "dataset", "other"]
 Scalar = str | bool | int | float
-_MAX_CHUNK_BYTES = 1 << 28
 _MAX_DEPTH = 6
-_MAX_DATASETS = 5_000
-"""Of an episode: robomimic's have some twenty."""
-_FLOOR_ROWS, _BYTES_PER_ROW = 500_000, 2
-"""The datasets that are used may have so many rows, or one for so many bytes of a file: a number alone has four."""
+"""Levels of groups that are searched for datasets."""
 _BLOCK_BYTES = 8 << 20
 """Of rows that are read at once; whole chunks of the file, unless these are larger than `_MAX_BLOCK_BYTES`."""
 _MAX_BLOCK_BYTES = 64 << 20
@@ -59,9 +51,8 @@ class StoredArray:
         is_ragged: Whether each row is as long as it likes: files in a dataset of variable length.
     """
 
-    def __init__(self, file: Path, place: str, dataset: h5py.Dataset, limits: Limits) -> None:
+    def __init__(self, file: Path, place: str, dataset: h5py.Dataset) -> None:
         self.place = place
-        self._limits, self._unpacked = limits, 0
         self.shape: tuple[int, ...] = dataset.shape
         self.is_ragged = dataset.dtype.kind == "O"
         self.dtype: np.dtype[np.generic] = np.dtype(np.uint8) if self.is_ragged else dataset.dtype
@@ -74,9 +65,6 @@ class StoredArray:
         """Rows from `begin` to before `end`; Hdf5Error when they cannot be read."""
         with _errors_reported(f"{self.place} cannot be read", self._file):
             rows: NDArray[np.generic] = self._dataset[begin:end]
-            if self.is_ragged:  # rows may share their bytes
-                self._unpacked += sum(map(len, rows))
-                self._limits.check_total(self._unpacked)
         return rows
 
     def rows(self) -> Iterator[NDArray[np.generic]]:
@@ -110,16 +98,10 @@ class ForeignFile(Closing):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._claimed: set[str] = set()
-        self._num_bytes = self._num_rows = 0
         with _errors_reported("The HDF5 file cannot be read", path):
             with open_regular(path) as file:
                 if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                     raise Hdf5Error(f"This is no HDF5 file: {path}")
-                self._size = os.fstat(file.fileno()).st_size
-                self._limits = Limits.of_file(self._size)
-            if reason := trial.why_not_read(path):
-                raise Hdf5Error(f"The HDF5 file cannot be read ({reason}): {path}")
             self._root = h5py.File(path, "r", locking=False)
 
     def close(self) -> None:
@@ -132,29 +114,15 @@ class ForeignFile(Closing):
         if not isinstance(group, h5py.Group):
             raise Hdf5Error(f"{_shown(place)} is no group: {self.path}")
         with _errors_reported(f"{_shown(place)} cannot be read", self.path):
-            if len(group) > trial.MAX_OBJECTS:
-                raise Hdf5Error(
-                    f"{_shown(place)} has {len(group):,} entries, at most {trial.MAX_OBJECTS:,} are read: {self.path}"
-                )
             return {str(name): self._kind(group, str(name)) for name in group}
 
     def datasets(self, place: str) -> Iterator[str]:
-        """The places of all datasets below a group, some levels deep; each group once, which may be in itself.
-
-        Raises:
-            Hdf5Error: They are more than `_MAX_DATASETS`.
-        """
-        waiting, found, seen = [(place, 0)], 0, {self.address(place)}
+        """The places of all datasets below a group, some levels deep; each group once, which may be in itself."""
+        waiting, seen = [(place, 0)], {self.address(place)}
         while waiting:
             group, depth = waiting.pop()
             below = [(f"{group}/{name}".lstrip("/"), kind) for name, kind in self.children(group).items()]
-            names = [name for name, kind in below if kind == "dataset"]
-            found += len(names)
-            if found > _MAX_DATASETS:
-                raise Hdf5Error(
-                    f"{_shown(place)} has more than {_MAX_DATASETS:,} datasets, which is no episode: {self.path}"
-                )
-            yield from names
+            yield from (name for name, kind in below if kind == "dataset")
             for name, kind in reversed(below):
                 if kind == "group" and depth < _MAX_DEPTH and (address := self.address(name)) not in seen:
                     seen.add(address)
@@ -183,40 +151,27 @@ class ForeignFile(Closing):
         """A dataset of rows, with `may_be_ragged` also one of bytes of variable length.
 
         Raises:
-            Hdf5Error: There is none, it holds no plain numbers, has no rows, was never written, leads out of the file,
-                or claims more than a file of this size may unpack to.
+            Hdf5Error: There is none, it holds no plain numbers, has no rows, was never written, or leads out of the
+                file.
         """
         found = self._find(place)
         with _errors_reported(f"{place} cannot be read", self.path):
             reason = _why_unusable(found, may_be_ragged)
-            if not reason:
-                self._claim(place, found)
         if reason:
             raise Hdf5Error(f"{place} cannot be used, since {reason}: {self.path}")
-        return StoredArray(self.path, place, found, self._limits)
-
-    def _claim(self, place: str, dataset: h5py.Dataset) -> None:
-        """LimitError where the datasets that are used have more bytes or rows than a file of this size may."""
-        if place in self._claimed:
-            return
-        self._claimed.add(place)
-        self._num_bytes += dataset.nbytes
-        self._num_rows += len(dataset)
-        self._limits.check_total(self._num_bytes)
-        if self._num_rows > (most := max(_FLOOR_ROWS, self._size // _BYTES_PER_ROW)):
-            raise LimitError(f"its datasets have more than {most:,} rows, too many for a file of its size")
+        return StoredArray(self.path, place, found)
 
     def names(self, place: str) -> list[str]:
         """A dataset of texts, as robomimic's masks are.
 
         Raises:
-            Hdf5Error: There is none, or it is no list of so many short texts.
+            Hdf5Error: There is none, or it is no list of texts.
         """
         found = self._find(place)
         with _errors_reported(f"{place} cannot be read", self.path):
             is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
             kind = h5py.check_string_dtype(found.dtype) if is_list else None
-            if kind is None or found.external or len(found) > trial.MAX_OBJECTS or (kind.length or 0) > trial.MAX_NAME:
+            if kind is None or found.external:
                 raise Hdf5Error(f"{place} is no list of texts: {self.path}")
             return [str(text) for text in found.asstr(errors="replace")[:]]
 
@@ -234,7 +189,7 @@ class ForeignFile(Closing):
             with _errors_reported(f"{walked}{part} cannot be read", self.path):
                 names = found if isinstance(found, h5py.Group) else ()
                 if part not in names:
-                    near = nearest_match(part, list(names)[: trial.MAX_OBJECTS]).rstrip("?")
+                    near = nearest_match(part, list(names)).rstrip("?")
                     raise Hdf5Error(f"There is no {walked}{part}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
                 if self._kind(found, part) == "other":
                     raise Hdf5Error(
@@ -263,8 +218,6 @@ def _why_unusable(found: h5py.Group | h5py.Dataset, may_be_ragged: bool) -> str:
         return "it has no rows"
     if found.is_virtual or found.external:
         return "its numbers are in other files"
-    if found.chunks and math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
-        return f"its chunks have more than {_MAX_CHUNK_BYTES >> 20} MB"
     return "" if found.size == 0 or _is_written(found) else "not all of its rows were written"
 
 
@@ -280,7 +233,8 @@ def _attribute(found: h5py.Group | h5py.Dataset, name: str, place: str, path: Pa
     with _errors_reported(f"The attribute {name} of {place} cannot be read", path):
         if name not in found.attrs:
             return None
-        if not trial.is_single(found.attrs.get_id(name)):
+        attribute = found.attrs.get_id(name)
+        if attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL or attribute.shape not in ((), (1,)):
             return None
         value = found.attrs[name]
         return _scalar(value.item() if isinstance(value, np.ndarray) else value)
@@ -303,8 +257,6 @@ def _errors_reported(what: str, path: Path) -> Iterator[None]:
     """Turn what the HDF5 library raises into an error that begins with what it was."""
     try:
         yield
-    except LimitError as error:
-        raise Hdf5Error(f"The HDF5 file is not read, since {error}: {path}") from error
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         reason = error.strerror if isinstance(error, OSError) else ""
         reason = reason or next((words for said, words in _REASONS if said in str(error)), "it is damaged")

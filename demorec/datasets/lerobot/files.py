@@ -1,12 +1,7 @@
-"""The files of a dataset of unknown origin, opened within bounds: JSON and Parquet tables.
-
-Anyone writes LeRobot datasets, and people pass them on. A table of a few kB can claim a thousand million rows,
-and under its name may lie something that is no file at all.
-"""
+"""JSON files and Parquet tables of a dataset that anyone may have written."""
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,23 +17,12 @@ from numpy.typing import NDArray
 from demorec.core.errors import ExportError, describe_error, resource_error
 from demorec.core.files import open_regular, read_text_limited
 from demorec.core.plain import parse_json
-from demorec.datasets.lerobot.pages import longest_row, pages_of
 
 MAX_JSON_BYTES = 32 << 20
 """Of info.json, stats.json and the like; ours have some ten kB."""
-_FLOOR_BYTES = 64 << 20
-_RATIO = 16
-"""A table may unpack to so much, or so many times its size; rows of a robot that moves hardly compress, and the
-sidecar's JSON, of which each row has much in common with the others, to a third."""
 _BATCH_BYTES = 32 << 20
-"""Of rows that are read at once, as far as that can be known before."""
+"""Size of rows that are read at once, by the table's footer."""
 _ROWS_AT_ONCE = 64
-_REPEATED = "language_"
-_MOST_SAID = 4096
-"""Values of the language columns in a row; what holds for an episode stands in each of its rows and compresses well."""
-_MOST_SAID_AT_ALL, _SAID_RATIO = 16 << 20, 32
-"""Values of them in any table, and per byte of a larger one; ours have 2 values a byte."""
-_BYTES_PER_VALUE = 8
 
 
 def leave_pandas_out() -> None:
@@ -84,23 +68,15 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
     """A Parquet file that has these columns, for what its footer says; its rows are read by `TableRows` alone.
 
     Raises:
-        ExportError: It is missing, no regular file, no Parquet, lacks a column, or claims too many values.
+        ExportError: It is missing, no regular file, no Parquet, or lacks a column.
     """
     with _table_errors(path):
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
+        open_regular(path).close()
         table = pq.ParquetFile(path, pre_buffer=False)  # which would hold the whole file in memory
-        parts = [part for _, part in _parts(table.metadata)]
-        said = sum(part.num_values for part in parts if part.path_in_schema.startswith(_REPEATED))
-        values = sum(part.num_values for part in parts) - said
         num_rows = table.metadata.num_rows
         groups = [table.metadata.row_group(number).num_rows for number in range(table.metadata.num_row_groups)]
         if min(groups, default=0) < 0 or sum(groups) != num_rows:
             raise ValueError(f"its parts have {sum(groups):,} rows, it says {num_rows:,}")
-    if _BYTES_PER_VALUE * max(values, num_rows) > _most_bytes(size):
-        raise ExportError(f"The table claims {values:,} values in {size / 1000:,.0f} kB, so it is not read: {path}")
-    if said > _MOST_SAID * num_rows or said > max(_MOST_SAID_AT_ALL, _SAID_RATIO * size):
-        raise ExportError(f"The table claims {said:,} values of language in so few rows, so it is not read: {path}")
     missing = set(columns or ()) - set(table.schema_arrow.names)
     if missing:
         raise ExportError(f"The table has no column {', '.join(sorted(missing))}: {path}")
@@ -138,15 +114,13 @@ class TableRows:
         rows: How many at once, at most; fewer where they may be large.
 
     Raises:
-        ExportError: As `open_table`, or the values unpack to too much.
+        ExportError: As `open_table`.
     """
 
     def __init__(self, path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE) -> None:
         self._path, self._names = path, None if columns is None else list(columns)
         self._table = open_table(path, columns)
-        with _table_errors(path):
-            row_bytes = _check_pages(path, self._table.metadata, columns)
-        self._at_once = max(1, min(rows, _BATCH_BYTES // row_bytes))
+        self._at_once = max(1, min(rows, _BATCH_BYTES // _row_bytes(self._table.metadata, columns)))
         self.rest()
 
     def rest(self) -> None:
@@ -191,19 +165,13 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.S
         schema: Of which types the columns must be.
 
     Raises:
-        ExportError: As `open_table`, a column has another type, or the values unpack to too much.
+        ExportError: As `open_table`, or a column has another type.
     """
     found = open_table(path, columns).schema_arrow
     for name in columns or ():
         if schema is not None and found.field(name).type != schema.field(name).type:
             raise ExportError(f"The column {name} is {found.field(name).type}, not {schema.field(name).type}: {path}")
-    allowed = _most_bytes(path.stat().st_size)
-    batches, num_bytes = [], 0
-    for batch in table_batches(path, columns):
-        batches.append(batch)
-        num_bytes += batch.nbytes
-        if num_bytes > allowed:
-            raise _too_large(path, allowed)
+    batches = list(table_batches(path, columns))
     with _table_errors(path):
         return pa.Table.from_batches(batches, schema=batches[0].schema if batches else found)
 
@@ -254,52 +222,13 @@ def _table_errors(path: Path) -> Iterator[None]:
         raise resource_error(error, path) or damaged from error
 
 
-def _parts(metadata: pq.FileMetaData) -> Iterator[tuple[int, pq.ColumnChunkMetaData]]:
-    """Every column of every row group, with its number."""
-    for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
-        for number in range(group.num_columns):
-            yield number, group.column(number)
-
-
-def _check_pages(path: Path, metadata: pq.FileMetaData, columns: Sequence[str] | None) -> int:
-    """About how many bytes a row may take: its numbers, and texts as large as their dictionaries allow.
-
-    Raises:
-        ExportError: The pages of these columns unpack to more than a file of this size may.
-        ValueError: They are none.
-    """
-    num_bytes = num_packed = num_values = 0
-    texts: dict[int, int] = {}
+def _row_bytes(metadata: pq.FileMetaData, columns: Sequence[str] | None) -> int:
+    """Mean size of a row of some columns, bytes, at least 1."""
     beginnings = tuple(f"{name}." for name in columns or ())
-    with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        allowed = _most_bytes(size)
-        for number, part in _parts(metadata):
-            if columns is not None and not f"{part.path_in_schema}.".startswith(beginnings):
-                continue
-            num_values += part.num_values
-            num_packed += part.total_compressed_size
-            if num_packed > size:
-                raise ValueError("its columns claim more bytes than it has")
-            dictionary, is_text = 0, part.physical_type.endswith("BYTE_ARRAY")
-            for page in pages_of(file, part):
-                num_bytes += page.num_bytes
-                dictionary = max(dictionary, page.num_bytes if page.is_dictionary and is_text else 0)
-                if num_bytes > allowed:
-                    raise _too_large(path, allowed)
-            depth = metadata.schema.column(number).max_repetition_level
-            if depth and dictionary * part.num_values > _BATCH_BYTES:
-                dictionary = longest_row(file, part, depth)
-            texts[number] = max(texts.get(number, 0), dictionary)
-    if sum(texts.values()) > allowed:
-        raise _too_large(path, allowed)
+    num_bytes = 0
+    for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
+        for part in (group.column(number) for number in range(group.num_columns)):
+            if columns is None or f"{part.path_in_schema}.".startswith(beginnings):
+                num_bytes += part.total_uncompressed_size
     num_rows: int = metadata.num_rows
-    return 1 + sum(texts.values()) + _BYTES_PER_VALUE * num_values // max(1, num_rows)
-
-
-def _too_large(path: Path, allowed: int) -> ExportError:
-    return ExportError(f"The table would unpack to more than {allowed / 1e6:,.0f} MB: {path}")
-
-
-def _most_bytes(size: int) -> int:
-    return max(_FLOOR_BYTES, _RATIO * size)
+    return max(1, num_bytes // max(1, num_rows))

@@ -39,13 +39,11 @@ PACKET_CODECS: dict[str, PacketCodec] = {"h264": "h264", "hevc": "h265", "av1": 
 _TO_START_CODES = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
 _TEMPORAL_DELIMITER = b"\x12\x00"
 """In front of every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
-_BLOCK = 128
-"""Encoded images are whole blocks of at most so many pixels."""
 
 
 @contextmanager
 def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.video.stream.VideoStream]]:
-    """A video within bounds; ExportError when it cannot be read, in the block too."""
+    """Open a video; ExportError when it cannot be read, in the block too."""
     check_video(path)
     try:
         with av.open(str(path), format="mp4") as container:
@@ -54,8 +52,6 @@ def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.v
             width, height = stream.codec_context.width, stream.codec_context.height
             if width * height > MAX_PIXELS:
                 raise ValueError(f"it has {width}x{height} pixels, allowed are {MAX_PIXELS:,} in all")
-            # A few bytes can announce images of gigabytes, whatever the file's own head says.
-            stream.codec_context.options = {"max_pixels": str((height + _BLOCK) * (width + _BLOCK))}
             yield container, stream
     except (OSError, EOFError, ValueError, IndexError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
@@ -292,21 +288,12 @@ def why_transcoded(videos: Sequence[EpisodeVideo]) -> tuple[PacketCodec, tuple[i
     return codec, size, reason
 
 
-_LARGE_BYTES, _IMAGE_RATIO = 24 << 20, 200
-"""An image of more pixels than that, in RGB (8 million), takes at least so small a part of them as a file."""
-_PIXEL_BYTES, _FILE_RATIO = 512 << 20, 1000
-"""All images of a dataset may have so many bytes of pixels, or so many times its files: deflate reaches 1,032, and rows
-that share one image share its bytes."""
-
-
 class StoredImages:
     """The images of a camera feature that are in the rows of the data files, PNG or JPEG."""
 
     def __init__(self, info: DatasetInfo, key: str) -> None:
         self._key = key
         self._stream = RowStream(info, [key])
-        self._allowed = _PIXEL_BYTES
-        self._counted: set[Path] = set()
 
     def read(self, place: EpisodePlace, frames: Collection[int] | None = None) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of some frames of an episode, of all by default; ExportError when they cannot be read."""
@@ -316,9 +303,6 @@ class StoredImages:
     def decode(self, place: EpisodePlace, columns: Iterable[pa.Array]) -> Iterator[Rgb]:
         """(H, W, 3) uint8 RGB of some rows of an episode, whose column was read already; ExportError as `read`."""
         path = place.data
-        if path not in self._counted and path.is_file():
-            self._counted.add(path)
-            self._allowed += _FILE_RATIO * path.stat().st_size
         shape: tuple[int, ...] | None = None
         for column in columns:
             for item in column:
@@ -339,15 +323,8 @@ class StoredImages:
         if not data:
             raise ValueError("it is not in the table")
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
-            size = f"{image.width}x{image.height} pixels"
-            num_bytes = 3 * image.width * image.height
-            self._allowed -= num_bytes
             if image.width * image.height > MAX_PIXELS:
-                raise ValueError(f"{size}, at most {MAX_PIXELS:,} are read")
-            if num_bytes > max(_LARGE_BYTES, _IMAGE_RATIO * len(data)):
-                raise ValueError(f"{size} in {len(data):,} bytes are no image of a camera")
-            if self._allowed < 0:
-                raise ValueError(f"{size} in so many rows are too many for files of this size")
+                raise ValueError(f"{image.width}x{image.height} pixels, at most {MAX_PIXELS:,} are read")
             if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
                 raise ValueError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
             return np.asarray(image.convert("RGB"))
