@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -30,12 +30,9 @@ class Report:
       demorec report recordings/cubes --out cubes.html
       demorec report datasets/cubes --out cubes.html --camera wrist
       demorec report recordings/cubes --out cubes.html --images --workers 4
-      demorec report datasets/cubes --against datasets/sorted --out sorted.html
     """
 
     path: Annotated[Positional[Path], arg(help=f"One of: {WHAT_IS_READ}, evaluations.")]
-    against: Path | None = None
-    """A LeRobot dataset that the dataset is compared with, as by demorec dataset diff."""
     mapping: MappingFile = None
     out: Path
     """The page (.html)."""
@@ -59,19 +56,12 @@ class Report:
         check_option("workers", self.workers, 1, 1024)
         if self.images and not self.checks:
             raise ConfigError("--images chooses checks, and --no-checks runs none: leave one of them out.")
-        read = [self.path]
-        if self.against is None:
-            expect(self.path, "recording", "dataset", *IMPORTED, *EPISODE_FOLDERS)
-        else:
-            read.append(self.against)
-            for path in read:
-                expect(path, "dataset")
+        expect(self.path, "recording", "dataset", *IMPORTED, *EPISODE_FOLDERS)
         if not self.out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
-        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read(read))
+        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
         refuse_inside([self.out])
         from demorec.check.report import CheckOptions
-        from demorec.report.differences import differences
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
@@ -81,9 +71,6 @@ class Report:
             ProgressBar("reading", unit="item") as bar,
         ):
             report = gather(path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
-        if self.against is not None:
-            with ProgressBar("comparing") as bar:
-                report = replace(report, differences=differences(self.path, self.against, bar.set))
         size = write_page(report, self.out)
         say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")
         return 0

@@ -14,7 +14,6 @@ from demorec.check.base import Level, Result
 from demorec.episode.episode import Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.learn.evaluate.statistics import Rate
-from demorec.report.differences import Differences
 from demorec.report.filmstrip import Filmstrip
 from demorec.report.histogram import Histogram
 
@@ -138,7 +137,6 @@ class Report:
         checks: None when no checks were run.
         missing: Sentences about what the source does not contain.
         configs: Resolved configurations.
-        differences: From another dataset; None when it was compared with none.
     """
 
     title: str
@@ -150,7 +148,6 @@ class Report:
     checks: CheckSummaries | None
     missing: tuple[str, ...]
     configs: tuple[Mapping[str, Any], ...]
-    differences: Differences | None = None
 
 
 def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:

@@ -17,7 +17,7 @@ _TOTAL_BYTES = 13_500_000
 _MAX_BYTES = 16_000
 """Of one filmstrip."""
 _MOMENTS = 8
-_HEIGHTS = (240, 208, 176, 144, 120, 104, 88, 72, 56, 40, 28)
+_HEIGHTS = (120, 104, 88, 72, 56, 40, 28)
 """Pixels; the first at which the strip is within its budget is taken."""
 _MAX_ASPECT = 3.0
 """Ratio of width to height up to which images keep their shape; wider ones are squeezed."""
@@ -53,7 +53,6 @@ def filmstrip(
     images_at: Callable[[Sequence[int]], Iterable[NDArray[np.uint8]]],
     *,
     max_bytes: int,
-    height: int = 120,
 ) -> Filmstrip | None:
     """A strip of at most `max_bytes`; None if even the smallest is larger, or there is no frame.
 
@@ -62,14 +61,13 @@ def filmstrip(
         num_frames: Of the episode.
         images_at: Rising frame numbers -> their images, (H, W, 3) uint8.
         max_bytes: Of the JPEG file.
-        height: The largest, pixels.
     """
     if num_frames == 0:
         return None
     frames = np.unique(np.linspace(0, num_frames - 1, _MOMENTS).round().astype(int)).tolist()
     images = [Image.fromarray(image) for image in images_at(frames)]
     aspect = min(images[0].width / images[0].height, _MAX_ASPECT)
-    for height in (smaller for smaller in _HEIGHTS if smaller <= height):
+    for height in _HEIGHTS:
         width = max(1, round(height * aspect))
         strip = Image.new("RGB", (width * len(images), height))
         for number, image in enumerate(images):

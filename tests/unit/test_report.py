@@ -16,10 +16,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 from support.commands import exit_code
-from support.export import export, make_run, recode
+from support.export import export, make_run
 from support.foreign_dataset import DATA, write_foreign
 from support.mcap import rewritten
 from support.recording import frame_number, write_episode
@@ -255,63 +254,6 @@ def test_a_large_run_stays_small(run: Path, count: int) -> None:
     assert f"{3 * count // 4} of {count} attempts succeeded" in text
 
 
-def test_a_changed_row_and_image_are_the_differences(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Episodes of 24, 30 and 24 frames: a number of frame 5 of the second, an image of frame 7 of the third."""
-    other = Path(shutil.copytree(dataset, tmp_path / "<b>other"))
-    table = other / "data" / "chunk-000" / "file-000.parquet"
-    rows = pq.read_table(table)
-    place, values = rows.column_names.index("action"), rows.column("action").to_pylist()
-    values[24 + 5][0] = 50.0
-    kind = rows.schema.field("action")
-    pq.write_table(rows.set_column(place, kind, pa.array(values, kind.type)), table)
-    before = np.zeros((48, 64, 3), np.uint8)
-
-    def painted(images: list[NDArray[np.uint8]]) -> None:
-        before[:] = images[24 + 30 + 7]
-        images[24 + 30 + 7] = np.broadcast_to(PAINTED, before.shape).copy()
-
-    recode(other / "videos" / "observation.images.front" / "chunk-000" / "file-000.mp4", painted)
-
-    out = tmp_path / "page.html"
-    assert exit_code("report", dataset, "--against", other, "--no-checks", "--out", out) == 0
-    text = out.read_text()
-    found = parsed(text)
-    section = text[text.index('<section id="differences">') : text.index('<section id="outcomes">')]
-    words = " ".join(parsed(section).words.split())
-    assert f"B is {other}. 1 of 3 and 3 episodes are the same." in words
-    levels = dict(re.findall(r"(\w+): (\d+) episodedifference", words))
-    assert levels == {"rows": "1", "images": "1"}
-    row, image = (words.split("episodedifference")[n] for n in (1, 2))
-    assert "episode 1action differs in 1 of 30 frames, first in frame 5, most in frame 5" in row
-    assert row.split(" images: ")[0].endswith(" and 50.0")
-    psnr = 10 * np.log10(255**2 / np.square(before.astype(float) - PAINTED).mean())
-    assert "episode 2observation.images.front differs in 1 of 24 images, first in frame 7" in image
-    assert f"frame 7 ({psnr:.1f} dB)" in image
-
-    (shown,) = parsed(section).all("img")
-    strip = Image.open(io.BytesIO(base64.b64decode((shown["src"] or "").partition(",")[2])))
-    parts = [strip.crop((n * strip.width // 3, 0, (n + 1) * strip.width // 3, strip.height)) for n in range(3)]
-    assert frame_number(np.asarray(parts[0].resize((64, 48)))) == 7
-    inner = (slice(16, -16), slice(16, -16))  # JPEG shares colours across the edges between images
-    assert np.abs(np.asarray(parts[1], float) - PAINTED)[inner].max() < 8
-    apart = np.abs(before.astype(float) - PAINTED).max(axis=2)
-    seen = np.asarray(parts[2].convert("L").resize((64, 48)), float)
-    assert np.abs(seen - apart * 255 / apart.max())[4:-4, 4:-4].mean() < 8
-    assert "<b>" not in text
-    assert "://" not in text
-    assert any(link["href"] == "#differences" for link in found.all("a"))
-
-    capsys.readouterr()
-    assert exit_code("report", dataset, "--against", dataset, "--no-checks", "--out", tmp_path / "same.html") == 0
-    assert "3 of 3 and 3 episodes are the same. No difference." in (tmp_path / "same.html").read_text()
-
-
-PAINTED = np.array([200, 40, 90], np.uint8)
-"""Colour of an image that a test puts in."""
-
-
 def test_what_cannot_be_read_is_told(run: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(run, tmp_path / "run")
     file = folder / "episodes" / "episode_000002.mcap"
@@ -332,8 +274,6 @@ def test_refusals(run: Path, dataset: Path, tmp_path: Path, capsys: pytest.Captu
         ((run, "--out", tmp_path / "no" / "x.html"), "there is no folder"),
         ((run, "--out", tmp_path / "x.html", "--workers", "0"), "--workers is 0"),
         ((run, "--out", tmp_path / "x.html", "--no-checks", "--images"), "leave one of them out"),
-        ((run, "--against", dataset, "--out", tmp_path / "x.html"), "Expected a LeRobot dataset, found"),
-        ((dataset, "--against", run, "--out", tmp_path / "x.html"), "Expected a LeRobot dataset, found"),
     ):
         assert exit_code("report", *arguments) == 2
         assert words in capsys.readouterr().err
