@@ -60,8 +60,7 @@ _CLOSING = 1e-3
 """Metres that the opening shrinks by from frame to frame when the fingers begin to close."""
 _MIN_DRAWN = 3
 _NEEDED = (
-    "episode_index", "success", "num_retries", "content_digest", "frame_stride", "phases", "objects", "goals",
-    "deliberate_miss_frames", "episode_info",
+    "episode_index", "success", "num_retries", "content_digest", "phases", "objects", "episode_info",
 )  # fmt: skip
 """Columns of the sidecar that all versions have."""
 

@@ -10,7 +10,6 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -224,7 +223,7 @@ def dataset_language_truth(dataset: Dataset) -> Found:
 
 
 def _wrong_phases(episode: EpisodeLanguage, row: Row, fps: int) -> Iterator[str]:
-    """Subtasks begin where phases do, and those that speak of a deliberate miss are those of one."""
+    """Check that subtasks begin where phases do."""
     subtasks = [entry for entry in episode.persistent if entry.get("style") == "subtask"]
     if not subtasks:
         return
@@ -233,11 +232,6 @@ def _wrong_phases(episode: EpisodeLanguage, row: Row, fps: int) -> Iterator[str]
     if starts != phases:
         wrong = sorted(set(starts) ^ set(phases))
         yield f"subtasks and phases change at other frames ({wrong[:3]})"
-    missed = set(row["deliberate_miss_frames"])
-    for entry, (first, end) in zip(subtasks, pairwise([*starts, episode.num_rows]), strict=True):
-        is_miss = bool(missed & set(range(first, end)))
-        if is_miss != ("on purpose" in entry["content"] and "after missing" not in entry["content"]):
-            yield f"frame {first}: {entry['content'][:60]!r} {'hides' if is_miss else 'invents'} a deliberate miss"
 
 
 def _wrong_words(episode: EpisodeLanguage, row: Row, info: EpisodeInfo, start: Surroundings) -> Iterator[str]:

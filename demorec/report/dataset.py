@@ -36,7 +36,7 @@ _EPISODE_COLUMNS = (
     "episode_index", "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
     "failure_reason", "num_retries", "checks", "phases", "episode_info",
 )  # fmt: skip
-_ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", "failure_reason", "in_dataset")
+_ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", "failure_reason", "episode_index")
 _Row = Mapping[str, Any]
 
 
@@ -139,7 +139,7 @@ def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row], _Row]:
     except (OSError, ValueError) as error:
         raise ExportError(f"The sidecar's configs.json cannot be read ({describe_error(error)}): {root}") from error
     rows = {row["episode_index"]: row for row in episodes}
-    return rows, [row for row in attempts if not row["in_dataset"]], configs if isinstance(configs, dict) else {}
+    return rows, [row for row in attempts if row["episode_index"] is None], configs if isinstance(configs, dict) else {}
 
 
 def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:

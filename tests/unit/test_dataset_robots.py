@@ -194,19 +194,6 @@ def rename(root: Path, record_file: Path, urdf_file: Path, record: RobotRecord) 
     pq.write_table(table.set_column(column, table.schema.field(column), [[name] * table.num_rows]), path)
 
 
-def test_a_dataset_of_before_is_as_good_as_it_was(dataset: Path) -> None:
-    (path,) = (dataset / "demorec" / "episodes").rglob("*.parquet")
-    pq.write_table(pq.read_table(path).drop_columns(["robot_digest"]), path)
-    shutil.rmtree(dataset / "demorec" / "robots")
-    assert level_of(dataset, "dataset_robots", "dataset") == "skip"
-    assert level_of(dataset, "forward_kinematics", "dataset") == "pass"
-    with open_dataset_episode(dataset, 0) as episode:
-        assert episode.info.simulation is not None
-        assert episode.robot_description is None
-    export(SAMPLE, dataset, append=True, allow_duplicates=True)
-    assert level_of(dataset, "dataset_robots", "dataset") == "pass"
-
-
 def test_an_arm_whose_model_is_not_installed_is_drawn_from_the_dataset(
     exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

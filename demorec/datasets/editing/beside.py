@@ -6,7 +6,7 @@ before anything is written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from demorec.datasets.lerobot.sidecar import (
     SidecarWriter,
 )
 
-_OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "goals", "episode_info")
+_OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
@@ -158,13 +158,13 @@ class Beside(Closing):
         row.setdefault("source", source.root.name)
         if not self._plan.keeps_scene(cut):
             row |= dict.fromkeys(_OF_SCENE)
-            row |= _cut_frames(row, cut)
+            row["phases"] = _cut_phases(row, cut)
         elif cut.task and row.get("episode_info") is not None:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
         attempts = source.attempts
         for attempt in attempts.failed(index):
-            self._sidecar.add_attempt(attempt, in_dataset=False)
-        attempt = attempts.of(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names if name != "in_dataset"}
+            self._sidecar.add_attempt(attempt)
+        attempt = attempts.of(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names}
         record = EpisodeRecord(
             row=row,
             moving_cameras=self._camera_poses(cut, index) if self._poses else {},
@@ -189,7 +189,7 @@ class Beside(Closing):
         if self._sidecar is not None:
             for number, source in enumerate(self._plan.sources):
                 for attempt in source.attempts.homeless() if self._plan.takes_all_of(number) else ():
-                    self._sidecar.add_attempt(attempt, in_dataset=False)
+                    self._sidecar.add_attempt(attempt)
             found = next((s.root for s in self._plan.sources if (s.root / EXPORT_PATH).exists()), None)
             self._sidecar.finish(read_json(found / EXPORT_PATH) if found else {})
         if _progress_is_kept(self._plan):
@@ -206,16 +206,14 @@ def _reworded(info: str, task: str, root: Path) -> str:
     return to_json(described)
 
 
-def _cut_frames(row: dict[str, Any], cut: Cut) -> dict[str, Any]:
-    """Phases and misses within a cut, frames counted from its first one."""
+def _cut_phases(row: Mapping[str, Any], cut: Cut) -> list[dict[str, Any]]:
+    """Phases within a cut, frames counted from its first one."""
     length = cut.last - cut.first
-    phases = [
+    return [
         {"name": phase["name"], "from": max(phase["from"] - cut.first, 0), "to": min(phase["to"] - cut.first, length)}
         for phase in row.get("phases") or ()
         if phase["from"] < cut.last and phase["to"] > cut.first
     ]
-    misses = [frame - cut.first for frame in row.get("deliberate_miss_frames") or () if cut.first <= frame < cut.last]
-    return {"phases": phases, "deliberate_miss_frames": misses}
 
 
 def left_out(plan: Plan) -> tuple[str, ...]:
@@ -233,7 +231,6 @@ def left_out(plan: Plan) -> tuple[str, ...]:
 
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
     cameras = {take.feature for take in plan.takes[number].values()}
-    proportions = [PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")]
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()
@@ -253,7 +250,7 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
             yield name, "its camera is left out"
         elif name == PROGRESS_PATH and not keeps_progress:
             yield name, "not all datasets have progress with the same columns"
-        elif name in proportions and not (keeps_progress and _has_stages(plan)):
+        elif name == PROPORTIONS_PATH and not (keeps_progress and _has_stages(plan)):
             yield name, "they are those of the source's episodes together"
 
 

@@ -19,6 +19,7 @@ from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
 from demorec.datasets.editing.packets import OpenVideo, video_files
 from demorec.datasets.editing.plan import Cut, Plan, Source, Take
+from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
@@ -223,8 +224,7 @@ class _Reader:
         if "duration_s" in facts:
             facts["duration_s"] = (cut.last - cut.first) / self._fps
         if (cut.first, cut.last) != (0, place.length):
-            for head in ("sparse", "dense"):
-                facts |= _clipped_stages(facts, head, cut)
+            facts |= _clipped_stages(facts, cut)
         return facts
 
 
@@ -235,19 +235,18 @@ def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
     return pa.concat_arrays([kept[:-1], column[-1:]])
 
 
-def _clipped_stages(facts: Mapping[str, Any], head: str, cut: Cut) -> dict[str, Any]:
+def _clipped_stages(facts: Mapping[str, Any], cut: Cut) -> dict[str, Any]:
     """The stages of an episode within a cut, frames counted from its first one."""
-    names, starts, ends = (facts.get(f"{head}_subtask_{part}") for part in ("names", "start_frames", "end_frames"))
+    names, starts, ends = facts.get(STAGE_NAMES), facts.get(STAGE_STARTS), facts.get(STAGE_ENDS)
     if not names or not starts or not ends:
         return {}
-    kept = [
-        (name, max(start, cut.first) - cut.first, min(end, cut.last - 1) - cut.first)
-        for name, start, end in zip(names, starts, ends, strict=True)
-        if start < cut.last and end >= cut.first
-    ]
-    parts = zip(*kept, strict=True)
-    return dict(zip((f"{head}_subtask_{part}" for part in ("names", "start_frames", "end_frames")), map(list, parts),
-                    strict=True))  # fmt: skip
+    found: dict[str, list[Any]] = {STAGE_NAMES: [], STAGE_STARTS: [], STAGE_ENDS: []}
+    for name, start, end in zip(names, starts, ends, strict=True):
+        if start < cut.last and end >= cut.first:
+            found[STAGE_NAMES].append(name)
+            found[STAGE_STARTS].append(max(start, cut.first) - cut.first)
+            found[STAGE_ENDS].append(min(end, cut.last - 1) - cut.first)
+    return found
 
 
 def _kept_statistics(source: Source) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:

@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, facts_of
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, fact_columns
 from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -41,7 +41,7 @@ class Existing:
         tasks: In the order of their indices.
         statistics: Of the camera features.
         configs: Of the sidecar: config digest -> configuration.
-        facts: Columns of facts that its table of episodes has -> type.
+        facts: Columns of its table of episodes beyond LeRobot's own -> type.
     """
 
     root: Path
@@ -70,7 +70,7 @@ def open_existing(root: Path) -> Existing:
         rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
         tasks = tuple(read_tasks(root)) if info.total_tasks else ()
         found = read_json(root / STATS_PATH) if (root / STATS_PATH).exists() else {}
-        facts = facts_of(root)
+        facts = fact_columns(root)
         configs = read_json(root / CONFIGS_PATH) if (root / CONFIGS_PATH).exists() else {}
         statistics = {key: part for key in info.video_keys if (part := _statistics(found, key, info)) is not None}
         if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
@@ -131,8 +131,7 @@ def link_files(source: Path, target: Path) -> None:
 
     Only files that are never changed in place are linked; what the writer will write anew is left out.
     """
-    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH}
-    renewed |= {PROPORTIONS_PATH.format(head=head) for head in ("sparse", "dense")}
+    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH, PROPORTIONS_PATH}
     for folder, _, names in os.walk(source):
         for name in names:
             path = Path(folder) / name

@@ -186,7 +186,7 @@ class _Export:
 
     def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, reading: Reading) -> None:
         if reading.data is None or reading.record is None:
-            sidecar.add_attempt(reading.attempt, in_dataset=False)
+            sidecar.add_attempt(reading.attempt)
             return
         digest = writer.add(reading.data)
         sidecar.add(writer.num_episodes - 1, digest, reading.record, reading.attempt)

@@ -128,7 +128,7 @@ def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
     if options.progress:
         runs = dense_runs(story_of(episode.recording, episode.columns), episode.rows)
         num_goals = len(episode.info.scene.goals)
-        facts |= EpisodeProgress(num_goals=num_goals, dense=tuple(runs)).row()
+        facts |= EpisodeProgress(num_goals=num_goals, runs=tuple(runs)).row()
     return facts
 
 
