@@ -119,7 +119,7 @@ class View:
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""
-        from demorec.cli.dataset import scored
+        from demorec.cli.dataset.score import scored
         from demorec.runs.find import find
 
         if others := [path for path in self.paths if find(path).kind != "dataset"]:

@@ -18,7 +18,7 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing, sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
-from demorec.datasets.editing.plan import Cut, Plan, Source
+from demorec.datasets.editing.plan import EpisodeSlice, Plan, Source
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
@@ -99,7 +99,7 @@ def _write_kept_progress(plan: Plan, folder: Path) -> None:
     sync_path(path)
 
 
-def _counted(rows: pa.Table, cut: Cut, episode: int, index: int) -> pa.Table:
+def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.Table:
     """Rows of a cut with their numbers in the new dataset, in which `index` is that of its first frame."""
     frames = rows.column("frame_index").to_numpy() - cut.first
     counted = {"index": frames + index, "episode_index": np.full(len(frames), episode), "frame_index": frames}
@@ -128,10 +128,10 @@ class Beside(Closing):
         self._stored_boxes = [
             {
                 name: StoredBoxes(path, [place.from_index for place in source.places])
-                for name, take in takes.items()
-                if (path := source.root / BOXES_DIR / f"{take.feature}.json").is_file()
+                for name, mapping in mappings.items()
+                if (path := source.root / BOXES_DIR / f"{mapping.feature}.json").is_file()
             }
-            for source, takes in zip(plan.sources, plan.takes, strict=True)
+            for source, mappings in zip(plan.sources, plan.mappings, strict=True)
         ]
 
     def close(self) -> None:
@@ -140,7 +140,7 @@ class Beside(Closing):
         if self._sidecar is not None:
             self._sidecar.close()
 
-    def add(self, cut: Cut, episode_index: int, digest: str) -> None:
+    def add(self, cut: EpisodeSlice, episode_index: int, digest: str) -> None:
         """What belongs to an episode that was written, and has this digest."""
         boxes = {
             name: file.read(cut.episode, cut.first, cut.last) for name, file in self._stored_boxes[cut.source].items()
@@ -172,7 +172,7 @@ class Beside(Closing):
         )
         self._sidecar.add(episode_index, digest, record, attempt)
 
-    def _camera_poses(self, cut: Cut, episode_index: int) -> dict[str, Array]:
+    def _camera_poses(self, cut: EpisodeSlice, episode_index: int) -> dict[str, Array]:
         """Camera -> (T, 7) world_from_camera; none for an episode without; ExportError where frames lack."""
         rows = self._poses[cut.source].frames(episode_index, cut.first, cut.last)
         if rows is None or not rows.num_rows:
@@ -206,7 +206,7 @@ def _reworded(info: str, task: str, root: Path) -> str:
     return to_json(described)
 
 
-def _cut_phases(row: Mapping[str, Any], cut: Cut) -> list[dict[str, Any]]:
+def _cut_phases(row: Mapping[str, Any], cut: EpisodeSlice) -> list[dict[str, Any]]:
     """Phases within a cut, frames counted from its first one."""
     length = cut.last - cut.first
     return [
@@ -230,7 +230,7 @@ def left_out(plan: Plan) -> tuple[str, ...]:
 
 
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
-    cameras = {take.feature for take in plan.takes[number].values()}
+    cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()

@@ -12,7 +12,7 @@ import numpy as np
 
 from demorec.core.errors import ConfigError
 from demorec.core.registry import check_choice, nearest_match
-from demorec.datasets.editing.plan import Plan, Source, Take
+from demorec.datasets.editing.plan import FeatureMapping, Plan, Source
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.datasets.lerobot.reader import RowStream
@@ -191,7 +191,9 @@ def rename(source: Source, names: Mapping[str, str]) -> Plan:
     if twice := [name for name in kept if kept.count(name) > 1]:
         raise ConfigError(f"Two features would be called {twice[0]!r}.")
     features = {names.get(name, name): feature for name, feature in plan.info.features.items()}
-    return plan.with_features(features, [{names.get(name, name): take for name, take in plan.takes[0].items()}])
+    return plan.with_features(
+        features, [{names.get(name, name): mapping for name, mapping in plan.mappings[0].items()}]
+    )
 
 
 def drop_features(source: Source, names: Sequence[str]) -> Plan:
@@ -203,7 +205,9 @@ def drop_features(source: Source, names: Sequence[str]) -> Plan:
     features = {name: feature for name, feature in plan.info.features.items() if name not in names}
     if set(features) <= set(AUTOMATIC_FEATURES):
         raise ConfigError("No feature would be left.")
-    return plan.with_features(features, [{name: take for name, take in plan.takes[0].items() if name in features}])
+    return plan.with_features(
+        features, [{name: mapping for name, mapping in plan.mappings[0].items() if name in features}]
+    )
 
 
 def _check_features(source: Source, names: Mapping[str, str] | Sequence[str]) -> None:
@@ -220,13 +224,13 @@ def joined(plans: Sequence[Plan]) -> Plan:
     """Plans of one source each, with the same features, one after the other."""
     sources = tuple(source for plan in plans for source in plan.sources)
     cuts = [replace(cut, source=number) for number, plan in enumerate(plans) for cut in plan.cuts]
-    takes: tuple[Mapping[str, Take], ...] = tuple(take for plan in plans for take in plan.takes)
+    mappings: tuple[Mapping[str, FeatureMapping], ...] = tuple(mapping for plan in plans for mapping in plan.mappings)
     other = {
         name: value
         for name, value in plans[0].info.other.items()
         if all(plan.info.other.get(name) == value for plan in plans)
     }
-    return Plan(sources=sources, cuts=tuple(cuts), info=replace(plans[0].info, other=other), takes=takes)
+    return Plan(sources=sources, cuts=tuple(cuts), info=replace(plans[0].info, other=other), mappings=mappings)
 
 
 class Condition:

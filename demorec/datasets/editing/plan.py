@@ -180,46 +180,35 @@ class Attempts:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Take:
+class FeatureMapping:
     """How a feature of the new dataset comes from one of a source.
 
     Attributes:
-        feature: Its name there; "" for one that is filled with `fill`.
-        elements: For each element the number of the one that it comes from, -1 for `fill`; None for all as they are.
-        scale, offset: (D,) what numbers are multiplied by, and what is added then; None for neither.
-        fill: (D,) what elements have that come from nowhere.
+        feature: Its name in the source.
+        elements: For each element the number of the source's element; None: all in their order.
+        scale, offset: (D,) factor and summand of numbers; None: unchanged.
     """
 
     feature: str
     elements: tuple[int, ...] | None = None
     scale: NDArray[np.float64] | None = None
     offset: NDArray[np.float64] | None = None
-    fill: NDArray[np.float64] | None = None
 
     @property
     def is_copy(self) -> bool:
         """Whether every bit stays."""
-        return bool(self.feature) and self.elements is None and self.scale is None
+        return self.elements is None and self.scale is None
 
     def apply(self, values: NDArray[Any], dtype: str) -> NDArray[Any]:
         """(T, D) of the new feature from (T, E) of the source's."""
-        if self.elements is None:
-            found = values.astype(np.float64)
-        else:
-            filled = np.zeros(len(self.elements)) if self.fill is None else self.fill
-            found = np.tile(filled, (len(values), 1))
-            chosen = np.array(self.elements)
-            found[:, chosen >= 0] = values[:, chosen[chosen >= 0]]
-        if self.scale is not None:
-            offset = 0.0 if self.offset is None else self.offset
-            converted = found * self.scale + offset
-            keeps = np.zeros(found.shape[1], np.bool_) if self.elements is None else np.array(self.elements) < 0
-            found = np.where(keeps, found, converted)
+        found = values if self.elements is None else values[:, list(self.elements)]
+        if self.scale is not None and self.offset is not None:
+            found = found.astype(np.float64) * self.scale + self.offset
         return found.astype(dtype)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cut:
+class EpisodeSlice:
     """The frames from `first` to before `last` of an episode.
 
     Attributes:
@@ -243,13 +232,13 @@ class Plan:
         sources: What it is made from.
         cuts: Its episodes in order.
         info: Of the new dataset: features, rate, robot, sizes of files.
-        takes: For each source: feature of the new dataset -> where it comes from, less the automatic ones.
+        mappings: For each source: feature of the new dataset -> where it comes from, less the automatic ones.
     """
 
     sources: tuple[Source, ...]
-    cuts: tuple[Cut, ...]
+    cuts: tuple[EpisodeSlice, ...]
     info: DatasetInfo
-    takes: tuple[Mapping[str, Take], ...]
+    mappings: tuple[Mapping[str, FeatureMapping], ...]
 
     @classmethod
     def whole(cls, source: Source) -> Plan:
@@ -263,15 +252,19 @@ class Plan:
             other={} if source.info.is_old else source.info.other,
         )  # fmt: skip
         cuts = tuple(
-            Cut(source=0, episode=number, first=0, last=place.length) for number, place in enumerate(source.places)
+            EpisodeSlice(source=0, episode=number, first=0, last=place.length)
+            for number, place in enumerate(source.places)
         )
-        return cls(sources=(source,), cuts=cuts, info=info, takes=({name: Take(feature=name) for name in own},))
+        return cls(
+            sources=(source,), cuts=cuts, info=info, mappings=({name: FeatureMapping(feature=name) for name in own},)
+        )
 
-    def keeps_scene(self, cut: Cut) -> bool:
+    def keeps_scene(self, cut: EpisodeSlice) -> bool:
         """Whether an episode is still what its scene describes: all its frames, with its own states and actions."""
-        source, takes = self.sources[cut.source], self.takes[cut.source]
+        source, mappings = self.sources[cut.source], self.mappings[cut.source]
         return (cut.first, cut.last) == (0, source.places[cut.episode].length) and all(
-            name not in source.info.features or (name in takes and takes[name].is_copy and takes[name].feature == name)
+            name not in source.info.features
+            or (name in mappings and mappings[name].is_copy and mappings[name].feature == name)
             for name in (STATE, ACTION)
         )
 
@@ -281,12 +274,14 @@ class Plan:
             range(len(self.sources[number].places))
         )
 
-    def with_cuts(self, cuts: Sequence[Cut]) -> Plan:
+    def with_cuts(self, cuts: Sequence[EpisodeSlice]) -> Plan:
         """Other episodes; ConfigError when none is left."""
         if not cuts:
             raise ConfigError("No episode would be left: choose others.")
         return replace(self, cuts=tuple(cuts))
 
-    def with_features(self, features: Mapping[str, DatasetFeature], takes: Sequence[Mapping[str, Take]]) -> Plan:
+    def with_features(
+        self, features: Mapping[str, DatasetFeature], mappings: Sequence[Mapping[str, FeatureMapping]]
+    ) -> Plan:
         """Other features."""
-        return replace(self, info=replace(self.info, features=dict(features)), takes=tuple(takes))
+        return replace(self, info=replace(self.info, features=dict(features)), mappings=tuple(mappings))
