@@ -110,7 +110,7 @@ def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None, path: Path
         except (ValueError, TypeError, KeyError) as error:
             raise ConfigError(f"The mapping of {name} cannot be used ({describe_error(error)}): {path}") from error
     fixed = {name: features.pop(name) for name in AUTOMATIC_FEATURES}
-    mapped = plan.with_features({**features, **fixed}, [mappings])
+    mapped = plan.with_features({**features, **fixed}, mappings)
     return replace(mapped, info=replace(mapped.info, robot_type=entry.get("robot_type", mapped.info.robot_type)))
 
 

@@ -255,18 +255,20 @@ class Plan:
             EpisodeSlice(source=0, episode=number, first=0, last=place.length)
             for number, place in enumerate(source.places)
         )
-        return cls(
-            sources=(source,), cuts=cuts, info=info, mappings=({name: FeatureMapping(feature=name) for name in own},)
-        )
+        mappings = {name: FeatureMapping(feature=name) for name in own}
+        return cls(sources=(source,), cuts=cuts, info=info, mappings=(mappings,))
 
     def keeps_scene(self, cut: EpisodeSlice) -> bool:
         """Whether an episode is still what its scene describes: all its frames, with its own states and actions."""
-        source, mappings = self.sources[cut.source], self.mappings[cut.source]
-        return (cut.first, cut.last) == (0, source.places[cut.episode].length) and all(
-            name not in source.info.features
-            or (name in mappings and mappings[name].is_copy and mappings[name].feature == name)
-            for name in (STATE, ACTION)
-        )
+        source = self.sources[cut.source]
+        if (cut.first, cut.last) != (0, source.places[cut.episode].length):
+            return False
+        for name in (STATE, ACTION):
+            mapping = self.mappings[cut.source].get(name)
+            is_kept = mapping is not None and mapping.is_copy and mapping.feature == name
+            if name in source.info.features and not is_kept:
+                return False
+        return True
 
     def takes_all_of(self, number: int) -> bool:
         """Whether all episodes of a source go along."""
@@ -280,8 +282,6 @@ class Plan:
             raise ConfigError("No episode would be left: choose others.")
         return replace(self, cuts=tuple(cuts))
 
-    def with_features(
-        self, features: Mapping[str, DatasetFeature], mappings: Sequence[Mapping[str, FeatureMapping]]
-    ) -> Plan:
-        """Other features."""
-        return replace(self, info=replace(self.info, features=dict(features)), mappings=tuple(mappings))
+    def with_features(self, features: Mapping[str, DatasetFeature], mappings: Mapping[str, FeatureMapping]) -> Plan:
+        """Other features of a plan of one source."""
+        return replace(self, info=replace(self.info, features=dict(features)), mappings=(mappings,))

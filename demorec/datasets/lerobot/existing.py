@@ -61,8 +61,8 @@ def open_existing(root: Path) -> Existing:
     info = DatasetInfo.load(root)
     if info.is_old:
         raise ExportError(
-            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to; "
-            f"{_how_to_convert(root)}"
+            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to. This writes it as "
+            f"{CODEBASE_VERSION}: demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
         )
     try:
         lengths = [row["length"] for row in rows_in(root, "meta/episodes", ["length"])]
@@ -148,16 +148,3 @@ def link_files(source: Path, target: Path) -> None:
                 except OSError:
                     pass  # another file system, or one without links
             shutil.copy2(path, copy)
-
-
-def _how_to_convert(root: Path) -> str:
-    """The command of LeRobot 0.6.1 that converts a dataset of v2.1, for a sentence."""
-    root = root.resolve()
-    arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
-    # The converter deletes what has these names, or puts it in the dataset's place.
-    taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
-    first = f"move {' and '.join(taken)} away first, then " if taken else ""
-    return (
-        f"{first}LeRobot converts it in its place and leaves the old one beside it, as {root.name}_old: python -m "
-        f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
-    )
