@@ -83,20 +83,18 @@ def _write_kept_progress(plan: Plan, folder: Path) -> None:
     if _has_stages(plan):
         write_progress(folder)
         return
-    path, total = folder / PROGRESS_PATH, 0
     sources = [EpisodeRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]
     schema = open_table(plan.sources[0].root / PROGRESS_PATH).schema_arrow
-    waiting: list[pa.Table] = []
-    with pq.ParquetWriter(path, schema) as writer:
-        for episode, cut in enumerate(plan.cuts):
-            index = plan.sources[cut.source].places[cut.episode].episode_index
-            if (rows := sources[cut.source].frames(index, cut.first, cut.last)) is not None:
-                waiting.append(_counted(rows, cut, episode, total))
-            total += cut.last - cut.first
-            if sum(rows.num_rows for rows in waiting) >= _ROWS_AT_ONCE or cut is plan.cuts[-1]:
-                writer.write_table(pa.concat_tables([schema.empty_table(), *waiting]))
-                waiting.clear()
-    sync_path(path)
+    tables = [schema.empty_table()]
+    total = 0
+    for episode, cut in enumerate(plan.cuts):
+        index = plan.sources[cut.source].places[cut.episode].episode_index
+        rows = sources[cut.source].frames(index, cut.first, cut.last)
+        if rows is not None:
+            tables.append(_counted(rows, cut, episode, total))
+        total += cut.last - cut.first
+    pq.write_table(pa.concat_tables(tables), folder / PROGRESS_PATH)
+    sync_path(folder / PROGRESS_PATH)
 
 
 def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.Table:

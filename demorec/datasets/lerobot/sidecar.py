@@ -110,14 +110,13 @@ class EpisodeRecord:
     Attributes:
         row: Of the episodes' table, less the index.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
-        config_digest, config: Of its run.
+        config: Configuration of its run.
         robot: What draws and moves its arm; None where that is not known.
     """
 
     row: Mapping[str, Any]
     moving_cameras: Mapping[str, Array]
     robot: DatasetRobot | None
-    config_digest: str = ""
     config: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -137,7 +136,6 @@ class EpisodeRecord:
         return cls(
             row=row,
             moving_cameras=moving,
-            config_digest="" if simulation is None else simulation.config_digest,
             config={} if simulation is None else simulation.config,
             robot=robot_of(episode),
         )
@@ -217,8 +215,8 @@ class SidecarWriter(Closing):
         self._episodes.add_row({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
         if robot is not None:
             write_robot(self._root, robot)
-        if record.config_digest or record.config:
-            self._configs.setdefault(record.config_digest, record.config)
+        if record.config:
+            self._configs.setdefault(record.row["config_digest"], record.config)
         self.add_attempt(attempt, episode_index)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)
