@@ -26,7 +26,7 @@ class Diff:
     """
 
     a: Annotated[Positional[Path], arg(metavar="A", help="A dataset, or a run that has one.")]
-    b: Annotated[Positional[Path], arg(metavar="B", help="Another one.")]
+    b: Annotated[Positional[Path], arg(metavar="B", help="Another dataset, or a run that has one.")]
     json: bool = False
     """Print all differences as JSON."""
 

@@ -88,7 +88,6 @@ def _write(
         num_episodes=intake.num_taken,
         num_frames=num_frames,
         new_episodes=intake.num_taken,
-        new_frames=num_frames,
         skipped_failures=intake.skipped_failures,
         skipped_unknown=intake.skipped_unknown,
         skipped_unwanted=intake.skipped_unwanted,

@@ -138,7 +138,6 @@ class _Export:
             num_episodes=finished.total_episodes,
             num_frames=finished.total_frames,
             new_episodes=finished.total_episodes - info.total_episodes,
-            new_frames=finished.total_frames - info.total_frames,
             skipped_failures=self._intake.skipped_failures,
             skipped_unknown=self._intake.skipped_unknown,
             skipped_unwanted=self._intake.skipped_unwanted,
