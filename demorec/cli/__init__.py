@@ -23,7 +23,7 @@ from demorec.core.registry import Registry, nearest_match
 
 
 class Command(Protocol):
-    """A dataclass whose fields are the flags and whose docstring is the help.
+    """A dataclass whose fields are the flags and whose docstring is the help; or a group (`subcommands_of`).
 
     A classmethod `defaults(args)`, where there is one, returns the instance whose values are the flags' defaults.
     """
@@ -60,31 +60,49 @@ _LONGEST = 4000
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `demorec`."""
     args = list(sys.argv[1:] if argv is None else argv)
-    name = args[0] if args else ""
-    if name and not name.startswith("-"):
-        if name not in COMMANDS.rows:
-            _fail(f"Unknown command {name!r}.{nearest_match(name, COMMANDS.rows)} See demorec --help.", 2)
-        sys.exit(_run(name, args[1:], prog=f"demorec {name}"))
-    try:
-        say(*([f"demorec {version('demorec')}"] if name == "--version" else _overview()))
-    except DemorecError as error:
-        _fail(str(error), error.exit_code)
-    sys.exit(0 if name in ("-h", "--help", "--version") else 2)
+    if args[:1] == ["--version"]:
+        say(f"demorec {version('demorec')}")
+        sys.exit(0)
+    sys.exit(_run_named(COMMANDS, args, prog="demorec", about="robot demonstrations you can trust"))
 
 
 def generate_dataset_main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `generate-dataset`: the same as `demorec generate`."""
     args = list(sys.argv[1:] if argv is None else argv)
-    sys.exit(_run("generate", args, prog="generate-dataset"))
+    sys.exit(_run(COMMANDS, "generate", args, prog="generate-dataset"))
 
 
-def _run(name: str, args: Sequence[str], *, prog: str) -> int:
+def _run_named(commands: Registry[type[Command]], args: Sequence[str], *, prog: str, about: str) -> int:
+    """Run the command that the first word names; without one, say what the program is about and list all of them."""
+    name = args[0] if args else ""
+    if not name or name.startswith("-"):
+        try:
+            say(*_overview(commands, prog, about))
+        except DemorecError as error:
+            tell(f"{prog}: {error}")
+            return error.exit_code
+        return 0 if name in ("-h", "--help") else 2
+    if name not in commands.rows:
+        tell(f"{prog}: Unknown command {name!r}.{nearest_match(name, commands.rows)} See {prog} --help.")
+        return 2
+    return _run(commands, name, args[1:], prog=f"{prog} {name}")
+
+
+def _run(commands: Registry[type[Command]], name: str, args: Sequence[str], *, prog: str) -> int:
     try:
-        command = COMMANDS.load(name)  # which may take a while
+        command = commands.load(name)  # which may take a while
     except KeyboardInterrupt:
         tell(f"{prog}: interrupted.")
         return 130
+    if (subcommands := subcommands_of(command)) is not None:
+        return _run_named(subcommands, args, prog=prog, about=command.__doc__ or "")
     return run_command(command, args, prog=prog)
+
+
+def subcommands_of(command: type[Command]) -> Registry[type[Command]] | None:
+    """The commands of a group such as `demorec dataset`, which are the attribute `commands` of its class."""
+    found: Registry[type[Command]] | None = getattr(command, "commands", None)
+    return found
 
 
 def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> int:
@@ -130,27 +148,19 @@ def _keep_traceback() -> str:
         return text.splitlines()[-1]
 
 
-def _overview() -> list[str]:
-    lines = [
-        "demorec: robot demonstrations you can trust",
-        "",
-        "usage: demorec COMMAND ... (COMMAND --help for more)",
-        "",
-    ]
-    for name in COMMANDS.names():
-        summary = (COMMANDS.load(name).__doc__ or "").strip().splitlines()[0]
-        indent = " " * 13
+def _overview(commands: Registry[type[Command]], prog: str, about: str) -> list[str]:
+    lines = textwrap.wrap(f"{prog}: {' '.join(about.split())}", terminal_width(), break_on_hyphens=False)
+    lines += ["", f"usage: {prog} COMMAND ... (COMMAND --help for more)", ""]
+    width = max(10, *map(len, commands.names()))
+    for name in commands.names():
+        summary = (commands.load(name).__doc__ or "").strip().splitlines()[0]
         lines += textwrap.wrap(
-            f"{name:<10} {summary}",
+            f"{name:<{width}} {summary}",
             terminal_width(),
             initial_indent="  ",
-            subsequent_indent=indent,
+            subsequent_indent=" " * (width + 3),
             break_on_hyphens=False,
         )
-    lines += ["", "generate-dataset ... is the same as demorec generate ..."]
+    if commands is COMMANDS:
+        lines += ["", "generate-dataset ... is the same as demorec generate ..."]
     return lines
-
-
-def _fail(message: str, code: int) -> None:
-    tell(f"demorec: {message}")
-    sys.exit(code)

@@ -149,26 +149,6 @@ class ExportEpisode:
         joints = (*arm, *("" for _ in names[len(arm) :]))
         return (Feature(name=STATE, names=names, joints=joints, units=(*("rad" for _ in arm), "m", *pose)),)
 
-    def described_cameras(self) -> list[dict[str, Any]]:
-        """What is known of each camera of the recording: name, width, height, intrinsics (K, row by row), mount,
-        mount_from_camera and world_from_camera_start (position, quaternion xyzw); None for what is not."""
-        info = self.info
-        found = []
-        for camera in info.cameras:
-            intrinsics, placed = camera.intrinsics, camera.mount_from_camera
-            row = {
-                "name": camera.name,
-                "width": camera.width,
-                "height": camera.height,
-                "intrinsics": None if intrinsics is None else list(intrinsics),
-                "mount": camera.mount or None,
-                "mount_from_camera": None if placed is None else placed.vector().tolist(),
-            }
-            if info.simulation is not None:
-                row["world_from_camera_start"] = self.columns.world_from_camera[camera.name][0].tolist()
-            found.append(row)
-        return found
-
     def traits(self) -> Iterator[tuple[str, str]]:
         """What all recordings of a dataset must have in common, as (what, value) in words."""
         info = self.info

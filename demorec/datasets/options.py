@@ -64,7 +64,7 @@ class ExportReport:
     Attributes:
         path: Of the dataset.
         num_episodes, num_frames: In the dataset now.
-        new_episodes, new_frames: Added by this export.
+        new_episodes: Added by this export.
         skipped_failures: Failed episodes that were left out.
         skipped_unknown: Episodes that were left out since their recordings end before the outcome.
         skipped_unwanted: Recordings that `episodes` and `corrected_only` left out.
@@ -82,7 +82,6 @@ class ExportReport:
     num_episodes: int
     num_frames: int
     new_episodes: int
-    new_frames: int
     skipped_failures: int = 0
     skipped_unknown: int = 0
     skipped_unwanted: int = 0

@@ -34,7 +34,7 @@ _EPISODE_COLUMNS = (
     "episode_index", "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
     "failure_reason", "num_retries", "checks", "phases", "episode_info",
 )  # fmt: skip
-_ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", "failure_reason", "in_dataset")
+_ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", "failure_reason", "episode_index")
 _Row = Mapping[str, Any]
 
 
@@ -132,7 +132,7 @@ def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row]]:
         )
     )
     rows = {row["episode_index"]: row for row in episodes}
-    return rows, [row for row in attempts if not row["in_dataset"]]
+    return rows, [row for row in attempts if row["episode_index"] is None]
 
 
 def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:

@@ -7,14 +7,19 @@ import unicodedata
 import pytest
 
 from demorec.cli import COMMANDS, generate_dataset_main, main
+from demorec.cli.dataset import Dataset
 from demorec.core.tables import EXPORTERS
 
 PROGRAMS = (
     "demorec",
     "generate-dataset",
-    *(f"demorec {name}" for name in COMMANDS.names() if name != "generate"),
+    *(f"demorec {name}" for name in COMMANDS.names() if name not in ("generate", "dataset")),
     *(f"demorec export {name}" for name in EXPORTERS.names()),
+    *(f"demorec dataset {name}" for name in Dataset.commands.names()),
 )
+
+GROUPS = ("demorec", "demorec dataset")
+"""Programs whose help lists commands."""
 
 
 def help_of(program: str, width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -27,13 +32,13 @@ def help_of(program: str, width: int, capsys: pytest.CaptureFixture[str], monkey
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
-@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("program", [*PROGRAMS, *GROUPS[1:]])
 def test_lines_fit_the_terminal(
     program: str, width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lines = help_of(program, width, capsys, monkeypatch)
     assert len(lines) > 8
-    examples = [line for line in lines if line.startswith("  ") and program != "demorec"]
+    examples = [line for line in lines if line.startswith("  ") and program not in GROUPS]
     assert max((len(line) for line in examples), default=0) <= 80
     assert max(len(line) for line in lines if line not in examples) <= width
     assert not any(unicodedata.category(char).startswith("C") for line in lines for char in line)
@@ -49,3 +54,14 @@ def test_every_flag_is_described(
     for number in flags:
         below = next(iter(rows[number + 1 :]), "-")
         assert "  " in rows[number] or not below.startswith("-"), rows[number]
+
+
+@pytest.mark.parametrize("name", Dataset.commands.names())
+def test_a_command_of_dataset_has_its_own_flags_and_an_example(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "\n".join(help_of(f"demorec dataset {name}", 80, capsys, monkeypatch))
+    assert f"\n  demorec dataset {name} " in text
+    assert ("--idle-threshold" in text) == (name == "trim")
+    assert ("--where" in text) == (name in ("select", "drop", "set-task"))
+    assert ("--out" in text) == (name != "diff")

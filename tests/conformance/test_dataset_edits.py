@@ -119,13 +119,13 @@ def test_all_differences_are_named_and_a_mapping_solves_them(
     mapping = tmp_path / "m.toml"
     mapping.write_text(
         f'[[dataset]]\npath = "{tmp_path / "b"}"\n[dataset.feature.action]\nfrom = "act"\n'
-        '[dataset.feature."observation.state"]\nelements = ["z", "", "x"]\nfill = 7.0\nunit = "degree"\n'
+        '[dataset.feature."observation.state"]\nelements = ["z", "y", "x"]\nunit = "degree"\n'
     )
     assert edit("merge", small, tmp_path / "b", "--mapping", mapping, "--out", tmp_path / "m") == 0
     found, before = items(tmp_path / "m"), items(small)
     assert all(same(a, b) for a, b in zip(found, before, strict=False))
     state, was = found[7][6]["observation.state"], before[2][6]["observation.state"]
-    assert state == pytest.approx([np.deg2rad(was[2]), 7, np.deg2rad(was[0])])
+    assert state == pytest.approx(np.deg2rad(was[::-1]))
     assert np.array_equal(found[7][6]["action"], before[2][6]["action"])
 
 

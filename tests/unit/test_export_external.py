@@ -81,7 +81,7 @@ def test_a_missing_image_is_an_error_unless_the_last_may_be_held(tmp_path: Path)
     with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
         shown = [float(frame.to_ndarray(format="rgb24")[30, 30, 1]) for frame in file.decode(video=0)]
     assert np.abs(np.array(shown) - [5 * (6 if index in (7, 8) else index) for index in range(30)]).max() < 12
-    assert json.loads((tmp_path / "d" / "demorec" / "export.json").read_text())["hold_pictures"] > 0
+    assert json.loads((tmp_path / "d" / "demorec" / "export.json").read_text())["hold_images"] > 0
     first = replace(episode, frames=[replace(episode.frames[0], images={}), *episode.frames[1:]])
     with pytest.raises(ExportError, match="none came before it: leave the camera"):
         export(run_of(tmp_path / "first", first), tmp_path / "e", hold_images=9)

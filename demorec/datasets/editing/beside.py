@@ -6,7 +6,7 @@ before anything is written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing, sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
-from demorec.datasets.editing.plan import Cut, Plan, Source
+from demorec.datasets.editing.plan import EpisodeSlice, Plan, Source
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
@@ -34,7 +34,7 @@ from demorec.datasets.lerobot.sidecar import (
     SidecarWriter,
 )
 
-_OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "goals", "episode_info")
+_OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
@@ -83,23 +83,21 @@ def _write_kept_progress(plan: Plan, folder: Path) -> None:
     if _has_stages(plan):
         write_progress(folder)
         return
-    path, total = folder / PROGRESS_PATH, 0
     sources = [EpisodeRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]
     schema = open_table(plan.sources[0].root / PROGRESS_PATH).schema_arrow
-    waiting: list[pa.Table] = []
-    with pq.ParquetWriter(path, schema) as writer:
-        for episode, cut in enumerate(plan.cuts):
-            index = plan.sources[cut.source].places[cut.episode].episode_index
-            if (rows := sources[cut.source].frames(index, cut.first, cut.last)) is not None:
-                waiting.append(_counted(rows, cut, episode, total))
-            total += cut.last - cut.first
-            if sum(rows.num_rows for rows in waiting) >= _ROWS_AT_ONCE or cut is plan.cuts[-1]:
-                writer.write_table(pa.concat_tables([schema.empty_table(), *waiting]))
-                waiting.clear()
-    sync_path(path)
+    tables = [schema.empty_table()]
+    total = 0
+    for episode, cut in enumerate(plan.cuts):
+        index = plan.sources[cut.source].places[cut.episode].episode_index
+        rows = sources[cut.source].frames(index, cut.first, cut.last)
+        if rows is not None:
+            tables.append(_counted(rows, cut, episode, total))
+        total += cut.last - cut.first
+    pq.write_table(pa.concat_tables(tables), folder / PROGRESS_PATH)
+    sync_path(folder / PROGRESS_PATH)
 
 
-def _counted(rows: pa.Table, cut: Cut, episode: int, index: int) -> pa.Table:
+def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.Table:
     """Rows of a cut with their numbers in the new dataset, in which `index` is that of its first frame."""
     frames = rows.column("frame_index").to_numpy() - cut.first
     counted = {"index": frames + index, "episode_index": np.full(len(frames), episode), "frame_index": frames}
@@ -128,10 +126,10 @@ class Beside(Closing):
         self._stored_boxes = [
             {
                 name: StoredBoxes(path, [place.from_index for place in source.places])
-                for name, take in takes.items()
-                if (path := source.root / BOXES_DIR / f"{take.feature}.json").is_file()
+                for name, mapping in mappings.items()
+                if (path := source.root / BOXES_DIR / f"{mapping.feature}.json").is_file()
             }
-            for source, takes in zip(plan.sources, plan.takes, strict=True)
+            for source, mappings in zip(plan.sources, plan.mappings, strict=True)
         ]
 
     def close(self) -> None:
@@ -140,7 +138,7 @@ class Beside(Closing):
         if self._sidecar is not None:
             self._sidecar.close()
 
-    def add(self, cut: Cut, episode_index: int, digest: str) -> None:
+    def add(self, cut: EpisodeSlice, episode_index: int, digest: str) -> None:
         """What belongs to an episode that was written, and has this digest."""
         boxes = {
             name: file.read(cut.episode, cut.first, cut.last) for name, file in self._stored_boxes[cut.source].items()
@@ -158,13 +156,13 @@ class Beside(Closing):
         row.setdefault("source", source.root.name)
         if not self._plan.keeps_scene(cut):
             row |= dict.fromkeys(_OF_SCENE)
-            row |= _cut_frames(row, cut)
+            row["phases"] = _cut_phases(row, cut)
         elif cut.task and row.get("episode_info") is not None:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
         attempts = source.attempts
         for attempt in attempts.failed(index):
-            self._sidecar.add_attempt(attempt, in_dataset=False)
-        attempt = attempts.of(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names if name != "in_dataset"}
+            self._sidecar.add_attempt(attempt)
+        attempt = attempts.of(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names}
         record = EpisodeRecord(
             row=row,
             moving_cameras=self._camera_poses(cut, index) if self._poses else {},
@@ -172,7 +170,7 @@ class Beside(Closing):
         )
         self._sidecar.add(episode_index, digest, record, attempt)
 
-    def _camera_poses(self, cut: Cut, episode_index: int) -> dict[str, Array]:
+    def _camera_poses(self, cut: EpisodeSlice, episode_index: int) -> dict[str, Array]:
         """Camera -> (T, 7) world_from_camera; none for an episode without; ExportError where frames lack."""
         rows = self._poses[cut.source].frames(episode_index, cut.first, cut.last)
         if rows is None or not rows.num_rows:
@@ -189,7 +187,7 @@ class Beside(Closing):
         if self._sidecar is not None:
             for number, source in enumerate(self._plan.sources):
                 for attempt in source.attempts.homeless() if self._plan.takes_all_of(number) else ():
-                    self._sidecar.add_attempt(attempt, in_dataset=False)
+                    self._sidecar.add_attempt(attempt)
             found = next((s.root for s in self._plan.sources if (s.root / EXPORT_PATH).exists()), None)
             self._sidecar.finish(read_json(found / EXPORT_PATH) if found else {})
         if _progress_is_kept(self._plan):
@@ -206,16 +204,14 @@ def _reworded(info: str, task: str, root: Path) -> str:
     return to_json(described)
 
 
-def _cut_frames(row: dict[str, Any], cut: Cut) -> dict[str, Any]:
-    """Phases and misses within a cut, frames counted from its first one."""
+def _cut_phases(row: Mapping[str, Any], cut: EpisodeSlice) -> list[dict[str, Any]]:
+    """Phases within a cut, frames counted from its first one."""
     length = cut.last - cut.first
-    phases = [
+    return [
         {"name": phase["name"], "from": max(phase["from"] - cut.first, 0), "to": min(phase["to"] - cut.first, length)}
         for phase in row.get("phases") or ()
         if phase["from"] < cut.last and phase["to"] > cut.first
     ]
-    misses = [frame - cut.first for frame in row.get("deliberate_miss_frames") or () if cut.first <= frame < cut.last]
-    return {"phases": phases, "deliberate_miss_frames": misses}
 
 
 def left_out(plan: Plan) -> tuple[str, ...]:
@@ -232,7 +228,7 @@ def left_out(plan: Plan) -> tuple[str, ...]:
 
 
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
-    cameras = {take.feature for take in plan.takes[number].values()}
+    cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()

@@ -145,7 +145,6 @@ class EpisodeComparer:
             details={
                 "num_frames": len(found),
                 "first_frame": first,
-                "first_frame_b": first - starts[0] + starts[1],
                 "worst": [{"frame": frame, "psnr_db": round(psnr, 2)} for psnr, frame in worst],
             },
         )

@@ -1,4 +1,4 @@
-"""Several datasets into one: features matched by name, all differences named at once, a mapping (TOML) to solve them.
+"""Merge datasets into one: features matched by name, all differences reported at once, a mapping (TOML) to solve them.
 
 [[dataset]]
 path = "b"                                  # as on the command line
@@ -6,9 +6,8 @@ robot_type = "so100"                        # what its arm is called in the merg
 drop = ["observation.images.side"]
 
 [dataset.feature."observation.state"]       # a feature of the merged dataset
-from = "state"                              # its name in this one; "" for one that is filled
-elements = ["shoulder", "gripper"]          # names here, in the order of the first dataset; "" is filled
-fill = 0.0
+from = "state"                              # its name in this one
+elements = ["shoulder", "gripper"]          # names in this one, in the order of the first dataset
 unit = "degree"                             # here: rad (as it is), degree, or normalised, with low and high in rad
 """
 
@@ -28,13 +27,13 @@ from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.registry import check_choice, nearest_match
 from demorec.datasets.editing.operations import joined
-from demorec.datasets.editing.plan import Plan, Source, Take
+from demorec.datasets.editing.plan import FeatureMapping, Plan, Source
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 
 _UNITS = ("rad", "degree", "normalised")
 _MAX_BYTES = 1 << 20
 _KEYS = ("path", "robot_type", "drop", "feature")
-_FEATURE_KEYS = ("from", "elements", "fill", "unit", "low", "high")
+_FEATURE_KEYS = ("from", "elements", "unit", "low", "high")
 
 
 class DatasetsDifferError(ConfigError):
@@ -70,8 +69,8 @@ def merge(sources: Sequence[Source], mapping: Path | None = None) -> Plan:
     wrong = [text for plan in plans[1:] for text in _differences(plans[0], plan)]
     if wrong:
         raise DatasetsDifferError(f"These datasets differ: {'; '.join(wrong)}.", list(_suggested(plans)))
-    takes = [{name: plan.takes[0][name] for name in plans[0].takes[0]} for plan in plans]
-    return joined([replace(plan, takes=(take,)) for plan, take in zip(plans, takes, strict=True)])
+    mappings = [{name: plan.mappings[0][name] for name in plans[0].mappings[0]} for plan in plans]
+    return joined([replace(plan, mappings=(mapping,)) for plan, mapping in zip(plans, mappings, strict=True)])
 
 
 def _read(path: Path, roots: Sequence[Path]) -> dict[Path, dict[str, Any]]:
@@ -92,66 +91,68 @@ def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None, path: Path
     """A dataset as its entry in the mapping wants it."""
     for key in entry:
         check_choice("key of a mapping", key, _KEYS)
-    features, takes = dict(plan.info.features), dict(plan.takes[0])
+    features, mappings = dict(plan.info.features), dict(plan.mappings[0])
     for name in entry.get("drop", ()):
-        if name not in takes:
-            raise ConfigError(f"The mapping drops {name!r}, which is not there.{nearest_match(name, takes)}: {path}")
-        del features[name], takes[name]
+        if name not in mappings:
+            raise ConfigError(f"The mapping drops {name!r}, which is not there.{nearest_match(name, mappings)}: {path}")
+        del features[name], mappings[name]
     wanted = entry.get("feature", {})
     used = {item.get("from", name) for name, item in wanted.items()}
     for name in used - set(wanted):  # renamed
         features.pop(name, None)
-        takes.pop(name, None)
+        mappings.pop(name, None)
     for name, item in wanted.items():
         for key in item:
             check_choice("key of a feature in a mapping", key, _FEATURE_KEYS)
         model = first.info.features.get(name) if first is not None else None
         try:
-            features[name], takes[name] = _converted(plan.info.features, name, item, model)
+            features[name], mappings[name] = _converted(plan.info.features, name, item, model)
         except (ValueError, TypeError, KeyError) as error:
             raise ConfigError(f"The mapping of {name} cannot be used ({describe_error(error)}): {path}") from error
     fixed = {name: features.pop(name) for name in AUTOMATIC_FEATURES}
-    mapped = plan.with_features({**features, **fixed}, [takes])
+    mapped = plan.with_features({**features, **fixed}, mappings)
     return replace(mapped, info=replace(mapped.info, robot_type=entry.get("robot_type", mapped.info.robot_type)))
 
 
 def _converted(
     there: Mapping[str, DatasetFeature], name: str, item: Mapping[str, Any], model: DatasetFeature | None
-) -> tuple[DatasetFeature, Take]:
+) -> tuple[DatasetFeature, FeatureMapping]:
+    """A feature of the merged dataset and its mapping, by an entry and the first dataset's feature of that name."""
     origin = item.get("from", name)
-    plain = set(item) <= {"from"}
-    if origin and origin not in there:
+    if origin not in there:
         raise ValueError(f"there is no feature {origin!r}")
-    if plain and origin:
-        return there[origin], Take(feature=origin)
-    target = model if model is not None else there[origin]
-    width = target.shape[0]
-    if not _is_vector(target, *([there[origin]] if origin else ())):
+    own = there[origin]
+    if set(item) <= {"from"}:
+        return own, FeatureMapping(feature=origin)
+    if not _is_vector(own) or (model is not None and not _is_vector(model)):
         raise ValueError("only vectors of numbers are converted")
-    elements: tuple[int, ...] | None = None if origin else (-1,) * width
+    target = model or own
+    elements = None
     if "elements" in item:
-        names = list(there[origin].names or map(str, range(there[origin].shape[0])))
-        elements = tuple(names.index(text) if text else -1 for text in item["elements"])
+        elements = tuple(_element_names(own).index(text) for text in item["elements"])
         if model is None:
-            target = replace(target, shape=(len(elements),), names=tuple(item["elements"]))
-            width = len(elements)
-    if (len(elements) if elements is not None else there[origin].shape[0]) != width:
-        raise ValueError(f"it gives another number of elements than {width}")
-    if elements is not None and -1 in elements and "fill" not in item:
-        raise ValueError("fill is missing, which says what elements have that come from nowhere")
+            target = replace(own, shape=(len(elements),), names=tuple(item["elements"]))
+    width = own.shape[0] if elements is None else len(elements)
+    if width != target.shape[0]:
+        raise ValueError(f"it gives another number of elements than {target.shape[0]}")
     scale, offset = _unit(item, width)
-    fill = np.broadcast_to(np.asarray(item.get("fill", 0.0), dtype=np.float64), (width,))
-    return target, Take(feature=origin, elements=elements, scale=scale, offset=offset, fill=fill)
+    return target, FeatureMapping(feature=origin, elements=elements, scale=scale, offset=offset)
+
+
+def _element_names(feature: DatasetFeature) -> tuple[str, ...]:
+    """Names of a vector's elements, their numbers where they have none."""
+    return feature.names or tuple(map(str, range(feature.shape[0])))
 
 
 def _unit(item: Mapping[str, Any], width: int) -> tuple[Any, Any]:
-    """(D,) factor and summand that make rad of numbers in a unit."""
+    """(D,) factor and summand that convert an entry's unit to rad; None for rad."""
     unit = check_choice("unit", str(item.get("unit", "rad")), _UNITS)
     if unit == "rad":
         return None, None
     if unit == "degree":
-        return np.full(width, math.pi / 180), None
-    low, high = (np.broadcast_to(np.asarray(item[key], dtype=np.float64), (width,)) for key in ("low", "high"))
+        return np.full(width, math.pi / 180), np.zeros(width)
+    low = np.broadcast_to(np.asarray(item["low"], dtype=np.float64), (width,))
+    high = np.broadcast_to(np.asarray(item["high"], dtype=np.float64), (width,))
     return (high - low) / 200, (high + low) / 2  # LeRobot's range of a joint is -100 to 100
 
 
@@ -174,37 +175,33 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
 
 
 def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
+    """Lines of a mapping: features that not all datasets can give are dropped, elements put into one order."""
     plans = [plan for plan in plans if plan.info.fps == plans[0].info.fps]
     if len(plans) < 2:
         return
     robots = [plan.info.robot_type for plan in plans if plan.info.robot_type]
-    numeric = [{n: f for n, f in plan.info.features.items() if _is_vector(f)} for plan in plans]
-    common = {
-        name
-        for name, feature in plans[0].info.features.items()
-        if all(
-            name in plan.info.features
-            and (_is_vector(feature, plan.info.features[name]) or _fits(feature, plan.info.features[name]))
-            and (feature.dtype == plan.info.features[name].dtype)
-            for plan in plans
-        )
-    }
-    for number, plan in enumerate(plans):
+    first = plans[0].info.features
+    common = [name for name in first if all(_can_give(plan.info.features.get(name), first[name]) for plan in plans)]
+    for plan in plans:
+        features = plan.info.features
         yield from ("[[dataset]]", f"path = {_quoted(str(plan.sources[0].root))}")
         if robots and plan.info.robot_type != robots[0]:
             yield f"robot_type = {_quoted(robots[0])}"
-        if dropped := [name for name in plan.info.features if name not in common]:
+        if dropped := [name for name in features if name not in common]:
             yield f"drop = {_quoted(dropped)}"
         yield from _other_names(plans[0], plan)
-        for name in [name for name in numeric[number] if name in common] if number else ():
-            mine, first = plan.info.features[name], plans[0].info.features[name]
-            if (mine.shape, mine.names) != (first.shape, first.names):
-                own = mine.names or tuple(map(str, range(mine.shape[0])))
-                wanted = first.names or tuple(map(str, range(first.shape[0])))
-                elements = [text if text in own else "" for text in wanted]
-                yield from (f"[dataset.feature.{_quoted(name)}]", f"elements = {_quoted(elements)}")
-                yield from ["fill = 0.0"] if "" in elements else []
+        for name in common:
+            if not _fits(features[name], first[name]):
+                yield f"[dataset.feature.{_quoted(name)}]"
+                yield f"elements = {_quoted(_element_names(first[name]))}"
         yield ""
+
+
+def _can_give(own: DatasetFeature | None, first: DatasetFeature) -> bool:
+    """Whether a feature equals that of the first dataset, or has all of its elements."""
+    if own is None or own.dtype != first.dtype:
+        return False
+    return _fits(own, first) or (_is_vector(own, first) and set(_element_names(first)) <= set(_element_names(own)))
 
 
 def _other_names(first: Plan, plan: Plan) -> Iterator[str]:

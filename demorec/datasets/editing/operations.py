@@ -12,7 +12,7 @@ import numpy as np
 
 from demorec.core.errors import ConfigError
 from demorec.core.registry import check_choice, nearest_match
-from demorec.datasets.editing.plan import Plan, Source, Take
+from demorec.datasets.editing.plan import FeatureMapping, Plan, Source
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.datasets.lerobot.reader import RowStream
@@ -32,6 +32,8 @@ _COMPARED: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
     ast.NotIn: lambda a, b: a not in b,
 }
 _EQUALITIES = (ast.Eq, ast.NotEq)
+_Value = Callable[[Mapping[str, Any]], Any]
+"""Value of a part of a condition, by an episode's columns."""
 
 
 def chosen(source: Source, where: str = "", episodes: Sequence[int] | None = None) -> list[int]:
@@ -191,7 +193,8 @@ def rename(source: Source, names: Mapping[str, str]) -> Plan:
     if twice := [name for name in kept if kept.count(name) > 1]:
         raise ConfigError(f"Two features would be called {twice[0]!r}.")
     features = {names.get(name, name): feature for name, feature in plan.info.features.items()}
-    return plan.with_features(features, [{names.get(name, name): take for name, take in plan.takes[0].items()}])
+    mappings = {names.get(name, name): mapping for name, mapping in plan.mappings[0].items()}
+    return plan.with_features(features, mappings)
 
 
 def drop_features(source: Source, names: Sequence[str]) -> Plan:
@@ -203,7 +206,8 @@ def drop_features(source: Source, names: Sequence[str]) -> Plan:
     features = {name: feature for name, feature in plan.info.features.items() if name not in names}
     if set(features) <= set(AUTOMATIC_FEATURES):
         raise ConfigError("No feature would be left.")
-    return plan.with_features(features, [{name: take for name, take in plan.takes[0].items() if name in features}])
+    mappings = {name: mapping for name, mapping in plan.mappings[0].items() if name in features}
+    return plan.with_features(features, mappings)
 
 
 def _check_features(source: Source, names: Mapping[str, str] | Sequence[str]) -> None:
@@ -220,24 +224,26 @@ def joined(plans: Sequence[Plan]) -> Plan:
     """Plans of one source each, with the same features, one after the other."""
     sources = tuple(source for plan in plans for source in plan.sources)
     cuts = [replace(cut, source=number) for number, plan in enumerate(plans) for cut in plan.cuts]
-    takes: tuple[Mapping[str, Take], ...] = tuple(take for plan in plans for take in plan.takes)
+    mappings: tuple[Mapping[str, FeatureMapping], ...] = tuple(mapping for plan in plans for mapping in plan.mappings)
     other = {
         name: value
         for name, value in plans[0].info.other.items()
         if all(plan.info.other.get(name) == value for plan in plans)
     }
-    return Plan(sources=sources, cuts=tuple(cuts), info=replace(plans[0].info, other=other), takes=takes)
+    return Plan(sources=sources, cuts=tuple(cuts), info=replace(plans[0].info, other=other), mappings=mappings)
 
 
 class Condition:
-    """A parsed condition of `--where`; `holds` says whether it is true of an episode. ConfigError for what is none.
-
-    Comparisons of columns with values, joined by and, or, not. Nothing is evaluated as Python: what it parses is looked
-    through, and anything else than this grammar is refused.
+    """A parsed condition of `--where`: comparisons of columns with values, joined by and, or, not.
 
         success and num_frames < 300
         "cube" in task and drawn/speed >= 0.9
         episode_index in (3, 7)
+
+    Nothing is evaluated as Python: the parsed text is translated, and anything beyond this grammar is refused.
+
+    Raises:
+        ConfigError: Not a condition, or an unknown column.
     """
 
     def __init__(self, text: str, columns: Sequence[str]) -> None:
@@ -245,49 +251,54 @@ class Condition:
         try:
             if len(text) > _MAX:
                 raise SyntaxError
-            self._tree = ast.parse(text.strip(), mode="eval").body
+            tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise ConfigError(
                 "This is no condition: compare by == != < <= > >= in, join by and, or, not, and put text in quotes, "
                 f'such as num_frames < 300 and "cube" in task: {text}'
             ) from error
-        self._truth(self._tree, dict.fromkeys(columns), checks=True)
+        self._holds = self._truth(tree)
 
     def holds(self, row: Mapping[str, Any]) -> bool:
-        """Whether it is true of these values; a comparison with a value that is not known is false."""
-        return bool(self._value(self._tree, row, checks=False))
+        """Whether it is true of an episode; a comparison with an unknown value is false."""
+        return bool(self._holds(row))
 
-    def _value(self, node: ast.expr, row: Mapping[str, Any], *, checks: bool) -> Any:
+    def _value(self, node: ast.expr) -> _Value:
         match node:
             case ast.Constant(value=bool() | int() | float() | str() | None as value):
-                return value
+                return lambda row: value
             case ast.Tuple(elts=parts) | ast.List(elts=parts):
-                return [self._value(part, row, checks=checks) for part in parts]
+                values = [self._value(part) for part in parts]
+                return lambda row: [value(row) for value in values]
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
-                return -value
+                return lambda row: -value
             case ast.UnaryOp(op=ast.Not(), operand=part):
-                return not self._truth(part, row, checks=checks)
+                truth = self._truth(part)
+                return lambda row: not truth(row)
             case ast.BoolOp(op=joined, values=parts):
-                values = [self._truth(part, row, checks=checks) for part in parts]
-                return all(values) if isinstance(joined, ast.And) else any(values)
+                truths = [self._truth(part) for part in parts]
+                combine = all if isinstance(joined, ast.And) else any
+                return lambda row: combine(truth(row) for truth in truths)
             case ast.Compare(left=left, ops=kinds, comparators=rights):
-                values = [self._value(part, row, checks=checks) for part in (left, *rights)]
-                pairs = zip(kinds, values, values[1:], strict=False)
-                return True if checks and self._known(kinds) else all(self._compare(*pair) for pair in pairs)
+                return self._comparison(kinds, [self._value(part) for part in (left, *rights)])
             case _:
-                return self._column(node, row)
+                return self._column(node)
 
-    def _truth(self, node: ast.expr, row: Mapping[str, Any], *, checks: bool) -> bool:
-        """Of what and, or, not join: not of a value alone, as "b" in `task == "a" or "b"`, which would always hold."""
-        value = self._value(node, row, checks=checks)
-        if isinstance(node, ast.Constant | ast.Tuple | ast.List) and not isinstance(value, bool):
+    def _truth(self, node: ast.expr) -> _Value:
+        """Value of an operand of and, or, not; a value alone, as "b" in `task == "a" or "b"`, would always hold."""
+        if isinstance(node, ast.Tuple | ast.List) or (
+            isinstance(node, ast.Constant) and not isinstance(node.value, bool)
+        ):
             raise ConfigError(f"A condition joins comparisons, and {ast.unparse(node)} alone is none: {self._text}")
-        return bool(value)
+        return self._value(node)
 
-    def _known(self, kinds: Sequence[ast.cmpop]) -> bool:
+    def _comparison(self, kinds: Sequence[ast.cmpop], values: Sequence[_Value]) -> _Value:
         if not all(type(kind) in _COMPARED for kind in kinds):
             raise ConfigError(f"Values are compared by ==, !=, <, <=, >, >=, in and not in: {self._text}")
-        return True
+        return lambda row: all(
+            self._compare(kind, left(row), right(row))
+            for kind, left, right in zip(kinds, values, values[1:], strict=False)
+        )
 
     def _compare(self, kind: ast.cmpop, left: Any, right: Any) -> bool:
         if (left is None or right is None) and not isinstance(kind, _EQUALITIES):
@@ -297,19 +308,17 @@ class Condition:
         except TypeError as error:
             raise ConfigError(f"{left!r} and {right!r} cannot be compared so: {self._text}") from error
 
-    def _column(self, node: ast.expr, row: Mapping[str, Any]) -> Any:
+    def _column(self, node: ast.expr) -> _Value:
         name = _name(node)
         if name is None:
             raise ConfigError(
                 "A condition has columns, values, comparisons, and, or, not and parentheses, and nothing else: "
                 f"{self._text}"
             )
-        if name in row:
-            return row[name]
-        if name in _CONSTANTS:
-            return _CONSTANTS[name]
         if name in self._columns:
-            return None
+            return lambda row: row.get(name)
+        if name in _CONSTANTS:
+            return lambda row: _CONSTANTS[name]
         raise _no_column(name, self._columns)
 
 

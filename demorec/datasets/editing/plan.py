@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,6 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.facts import fact_columns
 from demorec.datasets.lerobot.files import open_table, read_json_lines, read_table, table_batches, tables_in
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -33,8 +33,6 @@ from demorec.datasets.lerobot.stats import NAMES
 from demorec.episode.features import ACTION, STATE
 
 _OLD_STATS = "meta/episodes_stats.jsonl"
-_PLACED = ("stats/", "videos/", "data/", "meta/")
-_FIXED = frozenset(("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"))
 _BESIDE = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
 _SCENE = "root_seed"
 """Stands in the sidecar for each episode whose scene does."""
@@ -56,12 +54,8 @@ class Source(OpenDataset):
 
     @cached_property
     def fact_types(self) -> Mapping[str, Any]:
-        """Columns of the table of episodes that state facts -> Arrow type; empty before v3.0."""
-        tables = self.episode_tables
-        schema = open_table(tables[0]).schema_arrow if tables else ()
-        return {
-            item.name: item.type for item in schema if item.name not in _FIXED and not item.name.startswith(_PLACED)
-        }
+        """Columns of the table of episodes beyond LeRobot's own -> Arrow type; empty before v3.0."""
+        return fact_columns(self.root)
 
     def facts(self) -> list[dict[str, Any]]:
         """The values of these columns, by episode in order."""
@@ -105,8 +99,8 @@ class Source(OpenDataset):
 
     @cached_property
     def attempts(self) -> Attempts:
-        """Those that stand beside the episodes."""
-        return Attempts(self.root, sorted(self.beside))
+        """The attempts of the sidecar."""
+        return Attempts(self.root)
 
     def columns(self) -> list[dict[str, Any]]:
         """What episodes are chosen and ordered by: name -> value, by episode in order."""
@@ -147,98 +141,74 @@ def _columns(tables: Sequence[Path], names: Sequence[str]) -> list[dict[str, Any
 
 
 class Attempts:
-    """The attempts that stand beside a dataset, by the episode to which each belongs.
+    """The attempts of a sidecar, by the episode to which each belongs; ExportError when they cannot be read."""
 
-    Args:
-        root: Its folder.
-        episodes: `episode_index` of those of which demorec keeps something, in order.
-    """
-
-    def __init__(self, root: Path, episodes: Sequence[int]) -> None:
+    def __init__(self, root: Path) -> None:
         paths = tables_in(root, f"{SIDECAR_DIR}/attempts")
         tables = [read_table(path, ATTEMPT_SCHEMA.names, schema=ATTEMPT_SCHEMA) for path in paths]
         self._table = pa.concat_tables(tables or [ATTEMPT_SCHEMA.empty_table()]).combine_chunks()
-        is_inside = self._table.column("in_dataset").to_pylist()
-        inside = [number for number, value in enumerate(is_inside) if value]
-        # One row was written for every episode, in order.
-        owners = dict(zip(inside, episodes, strict=True)) if len(inside) == len(episodes) else {}
-        self._own = {episode: number for number, episode in owners.items()}
+        self._own: dict[int, int] = {}
         self._failed: dict[int, list[int]] = {}
         self._homeless: list[int] = []
-        indices = self._table.column("run_episode_index").to_pylist()
-        same: dict[int | None, list[int]] = {}
-        for number in owners:
-            same.setdefault(indices[number], []).append(number)
-        for number, value in enumerate(is_inside):
-            if value:
+        run_indices = self._table.column("run_episode_index").to_pylist()
+        waiting: list[int] = []
+        for number, episode in enumerate(self._table.column("episode_index").to_pylist()):
+            if episode is None:
+                waiting.append(number)
                 continue
-            # Several runs may have an episode of that number: the rows of one run stand together.
-            if others := same.get(indices[number]):
-                place = bisect_left(others, number)
-                nearest = min(others[max(place - 1, 0) : place + 1], key=lambda n: abs(n - number))
-                self._failed.setdefault(owners[nearest], []).append(number)
-            else:
-                self._homeless.append(number)
+            self._own[episode] = number
+            self._failed[episode] = [n for n in waiting if run_indices[n] == run_indices[number]]
+            self._homeless += [n for n in waiting if run_indices[n] != run_indices[number]]
+            waiting = []
+        self._homeless += waiting
 
     def _rows(self, numbers: Sequence[int]) -> list[dict[str, Any]]:
-        found = [row for number in numbers for row in self._table.slice(number, 1).to_pylist()]
-        return [{name: value for name, value in row.items() if name != "in_dataset"} for row in found]
+        return [row for number in numbers for row in self._table.slice(number, 1).to_pylist()]
 
     def of(self, episode_index: int) -> dict[str, Any] | None:
-        """The one that became an episode of the dataset."""
+        """The attempt that became an episode of the dataset."""
         number = self._own.get(episode_index)
         return None if number is None else self._rows([number])[0]
 
     def failed(self, episode_index: int) -> list[dict[str, Any]]:
-        """Those before it that failed."""
+        """Failed attempts before an episode."""
         return self._rows(self._failed.get(episode_index, []))
 
     def homeless(self) -> list[dict[str, Any]]:
-        """Failed ones at episodes that the dataset has not."""
+        """Failed attempts at episodes that the dataset does not have."""
         return self._rows(self._homeless)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Take:
+class FeatureMapping:
     """How a feature of the new dataset comes from one of a source.
 
     Attributes:
-        feature: Its name there; "" for one that is filled with `fill`.
-        elements: For each element the number of the one that it comes from, -1 for `fill`; None for all as they are.
-        scale, offset: (D,) what numbers are multiplied by, and what is added then; None for neither.
-        fill: (D,) what elements have that come from nowhere.
+        feature: Its name in the source.
+        elements: For each element the number of the source's element; None: all in their order.
+        scale, offset: (D,) factor and summand of numbers; None: unchanged.
     """
 
     feature: str
     elements: tuple[int, ...] | None = None
     scale: NDArray[np.float64] | None = None
     offset: NDArray[np.float64] | None = None
-    fill: NDArray[np.float64] | None = None
 
     @property
     def is_copy(self) -> bool:
         """Whether every bit stays."""
-        return bool(self.feature) and self.elements is None and self.scale is None
+        return self.elements is None and self.scale is None
 
     def apply(self, values: NDArray[Any], dtype: str) -> NDArray[Any]:
         """(T, D) of the new feature from (T, E) of the source's."""
-        if self.elements is None:
-            found = values.astype(np.float64)
-        else:
-            filled = np.zeros(len(self.elements)) if self.fill is None else self.fill
-            found = np.tile(filled, (len(values), 1))
-            chosen = np.array(self.elements)
-            found[:, chosen >= 0] = values[:, chosen[chosen >= 0]]
-        if self.scale is not None:
-            offset = 0.0 if self.offset is None else self.offset
-            converted = found * self.scale + offset
-            keeps = np.zeros(found.shape[1], np.bool_) if self.elements is None else np.array(self.elements) < 0
-            found = np.where(keeps, found, converted)
+        found = values if self.elements is None else values[:, list(self.elements)]
+        if self.scale is not None and self.offset is not None:
+            found = found.astype(np.float64) * self.scale + self.offset
         return found.astype(dtype)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cut:
+class EpisodeSlice:
     """The frames from `first` to before `last` of an episode.
 
     Attributes:
@@ -262,13 +232,13 @@ class Plan:
         sources: What it is made from.
         cuts: Its episodes in order.
         info: Of the new dataset: features, rate, robot, sizes of files.
-        takes: For each source: feature of the new dataset -> where it comes from, less the automatic ones.
+        mappings: For each source: feature of the new dataset -> where it comes from, less the automatic ones.
     """
 
     sources: tuple[Source, ...]
-    cuts: tuple[Cut, ...]
+    cuts: tuple[EpisodeSlice, ...]
     info: DatasetInfo
-    takes: tuple[Mapping[str, Take], ...]
+    mappings: tuple[Mapping[str, FeatureMapping], ...]
 
     @classmethod
     def whole(cls, source: Source) -> Plan:
@@ -282,17 +252,23 @@ class Plan:
             other={} if source.info.is_old else source.info.other,
         )  # fmt: skip
         cuts = tuple(
-            Cut(source=0, episode=number, first=0, last=place.length) for number, place in enumerate(source.places)
+            EpisodeSlice(source=0, episode=number, first=0, last=place.length)
+            for number, place in enumerate(source.places)
         )
-        return cls(sources=(source,), cuts=cuts, info=info, takes=({name: Take(feature=name) for name in own},))
+        mappings = {name: FeatureMapping(feature=name) for name in own}
+        return cls(sources=(source,), cuts=cuts, info=info, mappings=(mappings,))
 
-    def keeps_scene(self, cut: Cut) -> bool:
+    def keeps_scene(self, cut: EpisodeSlice) -> bool:
         """Whether an episode is still what its scene describes: all its frames, with its own states and actions."""
-        source, takes = self.sources[cut.source], self.takes[cut.source]
-        return (cut.first, cut.last) == (0, source.places[cut.episode].length) and all(
-            name not in source.info.features or (name in takes and takes[name].is_copy and takes[name].feature == name)
-            for name in (STATE, ACTION)
-        )
+        source = self.sources[cut.source]
+        if (cut.first, cut.last) != (0, source.places[cut.episode].length):
+            return False
+        for name in (STATE, ACTION):
+            mapping = self.mappings[cut.source].get(name)
+            is_kept = mapping is not None and mapping.is_copy and mapping.feature == name
+            if name in source.info.features and not is_kept:
+                return False
+        return True
 
     def takes_all_of(self, number: int) -> bool:
         """Whether all episodes of a source go along."""
@@ -300,12 +276,12 @@ class Plan:
             range(len(self.sources[number].places))
         )
 
-    def with_cuts(self, cuts: Sequence[Cut]) -> Plan:
+    def with_cuts(self, cuts: Sequence[EpisodeSlice]) -> Plan:
         """Other episodes; ConfigError when none is left."""
         if not cuts:
             raise ConfigError("No episode would be left: choose others.")
         return replace(self, cuts=tuple(cuts))
 
-    def with_features(self, features: Mapping[str, DatasetFeature], takes: Sequence[Mapping[str, Take]]) -> Plan:
-        """Other features."""
-        return replace(self, info=replace(self.info, features=dict(features)), takes=tuple(takes))
+    def with_features(self, features: Mapping[str, DatasetFeature], mappings: Mapping[str, FeatureMapping]) -> Plan:
+        """Other features of a plan of one source."""
+        return replace(self, info=replace(self.info, features=dict(features)), mappings=(mappings,))

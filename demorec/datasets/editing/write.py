@@ -18,8 +18,8 @@ from demorec.core.errors import ExportError
 from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
 from demorec.datasets.editing.packets import OpenVideo, video_files
-from demorec.datasets.editing.plan import Cut, Plan, Source, Take
-from demorec.datasets.lerobot.facts import STAGE_COLUMNS
+from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan, Source
+from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
@@ -105,9 +105,9 @@ class _Reader:
         self.source: Source = plan.sources[number]
         self.num_decoded = 0
         self._features, self._fps = plan.info.features, plan.info.fps
-        self._takes: Mapping[str, Take] = plan.takes[number]
+        self._mappings: Mapping[str, FeatureMapping] = plan.mappings[number]
         info = self.source.info
-        names = {take.feature for take in self._takes.values() if take.feature}
+        names = {mapping.feature for mapping in self._mappings.values()}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
         self._rows = RowStream(info, [*self._names, "task_index"])
         self._open_video = open_video
@@ -119,7 +119,7 @@ class _Reader:
         self._known = {} if decode else _kept_statistics(self.source)
         self._has_digests = any(source.sidecar_tables for source in plan.sources)
 
-    def episode(self, cut: Cut) -> EpisodeData:
+    def episode(self, cut: EpisodeSlice) -> EpisodeData:
         """Read an episode."""
         place = self.source.places[cut.episode]
         all_rows = self._rows.read(place)
@@ -131,23 +131,23 @@ class _Reader:
         pixels: dict[str, PixelHistogram | Statistics] = {}
         language = EpisodeLanguage()
         num_decoded = 0
-        for name, take in self._takes.items():
+        for name, mapping in self._mappings.items():
             feature = self._features[name]
             if feature.dtype == "language":
                 language = self._language(rows, cut)
                 continue
             if feature.is_video:
-                file = self._open_video(place.videos[take.feature][0], self.source.info.fps)
-                video = file.cut(place, take.feature, cut.first, cut.last)
+                file = self._open_video(place.videos[mapping.feature][0], self.source.info.fps)
+                video = file.cut(place, mapping.feature, cut.first, cut.last)
                 videos[name] = video.with_digest() if self._has_digests else video
                 video_info[name] = feature.info or file.stream_info()
             else:
-                columns[name] = self._column(rows, take, feature)
-                if take.feature in _OF_THE_END and cut.last != place.length:
-                    columns[name] = _with_end(columns[name], self._column(all_rows, take, feature))
+                columns[name] = self._column(rows, mapping, feature)
+                if mapping.feature in _OF_THE_END and cut.last != place.length:
+                    columns[name] = _with_end(columns[name], self._column(all_rows, mapping, feature))
             if feature.is_camera:
-                known = self._kept(place, take.feature) if whole else None
-                pixels[name] = known or self._counted(take.feature, cut, rows)
+                known = self._kept(place, mapping.feature) if whole else None
+                pixels[name] = known or self._counted(mapping.feature, cut, rows)
                 num_decoded += known is None
         self.num_decoded += num_decoded > 0
         tasks = [cut.task] if cut.task else self._tasks(rows)
@@ -169,7 +169,7 @@ class _Reader:
         values = dict(zip(_NUMBERS, found[1], strict=True))
         return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
 
-    def _counted(self, key: str, cut: Cut, rows: pa.Table) -> PixelHistogram:
+    def _counted(self, key: str, cut: EpisodeSlice, rows: pa.Table) -> PixelHistogram:
         """Every pixel of a camera in a cut, whose rows have been read."""
         place, feature = self.source.places[cut.episode], self.source.info.features[key]
         if feature.is_video:
@@ -177,13 +177,11 @@ class _Reader:
             return _video_histogram(video, feature, cut.first, cut.last)
         return _histogram(self._stored[key].decode(place, rows.column(key).chunks))
 
-    def _column(self, rows: pa.Table, take: Take, feature: DatasetFeature) -> Any:
-        if not take.feature:
-            return take.apply(np.zeros((rows.num_rows, 0)), feature.dtype)
-        array = rows.column(take.feature).combine_chunks()
+    def _column(self, rows: pa.Table, mapping: FeatureMapping, feature: DatasetFeature) -> Any:
+        array = rows.column(mapping.feature).combine_chunks()
         array = array if isinstance(array, pa.Array) else pa.concat_arrays(array.chunks)
-        if not take.is_copy:
-            return take.apply(column_numbers(array), feature.dtype)
+        if not mapping.is_copy:
+            return mapping.apply(column_numbers(array), feature.dtype)
         if feature.dtype == "image":
             array = pa.StructArray.from_arrays(
                 [array.field("bytes"), array.field("path").cast(pa.string())], names=["bytes", "path"]
@@ -197,7 +195,7 @@ class _Reader:
         first = tasks[found[0]]
         return [first] if (found == found[0]).all() else [tasks[index] for index in found.tolist()]
 
-    def _language(self, rows: pa.Table, cut: Cut) -> EpisodeLanguage:
+    def _language(self, rows: pa.Table, cut: EpisodeSlice) -> EpisodeLanguage:
         """What is said in these rows, times counted from the first of them."""
         spoken = spoken_of(rows.select(COLUMNS).to_batches(), self.source.root)
         latest: dict[str, dict[str, Any]] = {}
@@ -218,7 +216,7 @@ class _Reader:
             kept = [row for row in kept if row.get("timestamp") is None or row["timestamp"] < end]
         return EpisodeLanguage(persistent=[*latest.values(), *kept], events=spoken.events)
 
-    def _facts(self, cut: Cut, place: EpisodePlace) -> dict[str, Any]:
+    def _facts(self, cut: EpisodeSlice, place: EpisodePlace) -> dict[str, Any]:
         table = self._facts_beside.read(place.episode_index)
         facts: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
         if "duration_s" in facts:
@@ -235,17 +233,18 @@ def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
     return pa.concat_arrays([kept[:-1], column[-1:]])
 
 
-def _clipped_stages(facts: Mapping[str, Any], cut: Cut) -> dict[str, Any]:
+def _clipped_stages(facts: Mapping[str, Any], cut: EpisodeSlice) -> dict[str, Any]:
     """The stages of an episode within a cut, frames counted from its first one."""
-    names, starts, ends = (facts.get(name) for name in STAGE_COLUMNS)
+    names, starts, ends = facts.get(STAGE_NAMES), facts.get(STAGE_STARTS), facts.get(STAGE_ENDS)
     if not names or not starts or not ends:
         return {}
-    kept = [
-        (name, max(start, cut.first) - cut.first, min(end, cut.last - 1) - cut.first)
-        for name, start, end in zip(names, starts, ends, strict=True)
-        if start < cut.last and end >= cut.first
-    ]
-    return dict(zip(STAGE_COLUMNS, map(list, zip(*kept, strict=True)), strict=True))
+    found: dict[str, list[Any]] = {STAGE_NAMES: [], STAGE_STARTS: [], STAGE_ENDS: []}
+    for name, start, end in zip(names, starts, ends, strict=True):
+        if start < cut.last and end >= cut.first:
+            found[STAGE_NAMES].append(name)
+            found[STAGE_STARTS].append(max(start, cut.first) - cut.first)
+            found[STAGE_ENDS].append(min(end, cut.last - 1) - cut.first)
+    return found
 
 
 def _kept_statistics(source: Source) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:

@@ -15,15 +15,7 @@ from demorec.core.errors import ConfigError, ExportError, write_error
 from demorec.core.replacing import check_replaceable, written_whole
 from demorec.core.tables import environment_name
 from demorec.datasets.episode import DONE, ExportEpisode
-from demorec.datasets.hdf5.file import (
-    DATASET,
-    ENV_ARGUMENTS,
-    EXTERNAL_ARGUMENTS,
-    EXTERNAL_ENVIRONMENT,
-    IMAGE_ARGUMENTS,
-    UNFINISHED,
-    NewFile,
-)
+from demorec.datasets.hdf5.file import DATASET, ENVIRONMENT_PREFIX, UNFINISHED, NewFile
 from demorec.datasets.hdf5.options import Hdf5Options
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
@@ -96,7 +88,6 @@ def _write(
         num_episodes=intake.num_taken,
         num_frames=num_frames,
         new_episodes=intake.num_taken,
-        new_frames=num_frames,
         skipped_failures=intake.skipped_failures,
         skipped_unknown=intake.skipped_unknown,
         skipped_unwanted=intake.skipped_unwanted,
@@ -104,6 +95,8 @@ def _write(
     )
 
 
+_EXTERNAL = f"{ENVIRONMENT_PREFIX}collected"
+"""Stands for an environment in files of external episodes, which have none."""
 _GYM = 2
 """`EnvType.GYM_TYPE` of robomimic."""
 _ROBOSUITE = {
@@ -136,9 +129,6 @@ def _fill(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
     info, count = episode.recording.info, len(episode.rows)
     demo.attrs["num_samples"] = count
     demo.attrs["instruction"] = info.instruction
-    demo.attrs["episode_index"], demo.attrs["attempt"] = info.episode_index, info.attempt
-    if episode.origin:
-        demo.attrs["origin"] = episode.origin
     if urdf := episode.urdf:
         demo.attrs["model_file"] = urdf
     dones = episode.scalar_columns[DONE].astype(np.int64)
@@ -201,9 +191,9 @@ def _image_names(episode: ExportEpisode) -> list[str]:
 
 
 def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
-    """The attributes of `data`: what robomimic makes an environment from, and what else holds for all episodes.
+    """Attributes of `data`: what robomimic makes an environment from, rate and names of observations.
 
-    Of an external episode there is no environment but its name.
+    An external episode has no environment, only the name of one.
     """
     info, options = episode.info, episode.options
     arguments: dict[str, object] = {
@@ -211,11 +201,9 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
         "fps": episode.fps,
         "cameras": [camera.name for camera in episode.cameras if not camera.is_depth],
     }
-    if info.simulation is None:
-        arguments["observations"] = [*_observation_names(episode), *_image_names(episode)]
-        assert arguments.keys() == EXTERNAL_ARGUMENTS
-        name, task = EXTERNAL_ENVIRONMENT, {}
-    else:
+    name = _EXTERNAL
+    if info.simulation is not None:
+        name = environment_name(info.task)
         cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
         arguments |= {
             "physics_hz": info.physics_hz,
@@ -223,10 +211,11 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
             "action": options.action,
             "privileged": options.privileged,
         }
-        assert arguments.keys() - IMAGE_ARGUMENTS == ENV_ARGUMENTS
-        name, task = environment_name(info.task), {"task": info.task}
-    described = {"env_name": name, "type": _GYM, "env_kwargs": arguments}
-    return {"env_args": json.dumps(described), **task, "fps": episode.fps}
+    return {
+        "env_args": json.dumps({"env_name": name, "type": _GYM, "env_kwargs": arguments}),
+        "fps": episode.fps,
+        "observations": json.dumps([*_observation_names(episode), *_image_names(episode)]),
+    }
 
 
 def _states(columns: Columns, rows: NDArray[np.intp], info: EpisodeInfo) -> tuple[NDArray[np.float64], tuple[str, ...]]:

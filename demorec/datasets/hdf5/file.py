@@ -15,32 +15,24 @@ import h5py
 from demorec.core.errors import describe_error
 from demorec.core.files import HDF5_MAGIC, open_regular
 from demorec.core.replacing import ReplaceableKind
-from demorec.episode.sensed import SENSED
 
-ENV_ARGUMENTS = frozenset({"robot", "fps", "physics_hz", "cameras", "action", "privileged"})
-"""What `env_args` says of every environment of ours, by which our files are known."""
-IMAGE_ARGUMENTS = frozenset({"width", "height"})
-"""What it says of environments with cameras beside."""
-EXTERNAL_ENVIRONMENT = "demorec/collected"
-"""What stands for an environment in files of external episodes, which have none."""
-EXTERNAL_ARGUMENTS = frozenset({"robot", "fps", "cameras", "observations"})
-"""What `env_args` says beside it."""
-_OBSERVATIONS = "|".join(
-    (
-        r"robot0_(joint_pos|joint_vel|gripper_qpos|gripper_qvel|eef_pos|eef_quat)|object|command|[^/]+_(image|depth)",
-        *(re.escape(name.removeprefix("observation.")) for name in SENSED),
-    )
-)
-_PARTS = r"data|mask|mask/(train|valid)|data/demo_\d+(/(actions|states|rewards|dones|obs))?|data/demo_\d+/obs/({names})"
-_ATTRIBUTES = (
-    ("data", frozenset({"env_args", "total", "task", "fps"})),
-    (
-        r"data/demo_\d+",
-        frozenset({"num_samples", "instruction", "episode_index", "attempt", "success", "model_file", "origin"}),
-    ),
-    (r"data/demo_\d+/(actions|states|obs/({names}))", frozenset({"names"})),
-)
-"""All that an export writes: names of groups and datasets, and of the attributes that they have."""
+ENVIRONMENT_PREFIX = "demorec/"
+"""Beginning of `env_name` in `env_args`, which marks a file as an export."""
+_PARTS: dict[str, tuple[str, ...]] = {
+    "mask": (),
+    "mask/train": (),
+    "mask/valid": (),
+    "data": ("env_args", "total", "fps", "observations"),
+    "data/demo_N": ("num_samples", "instruction", "success", "model_file"),
+    "data/demo_N/actions": ("names",),
+    "data/demo_N/states": ("names",),
+    "data/demo_N/rewards": (),
+    "data/demo_N/dones": (),
+    "data/demo_N/obs": (),
+    "data/demo_N/obs/NAME": ("names",),
+}
+"""Groups and datasets that an export writes -> their attributes. `observations` lists the NAMEs (JSON)."""
+_DEMO = re.compile(r"data/demo_\d+(?=/|$)")
 
 
 def _begins_as_hdf5(path: Path) -> bool:
@@ -56,11 +48,7 @@ def _is_our_dataset(path: Path) -> bool:
             data = file.get("data")
             if not isinstance(data, h5py.Group) or not {"total", "env_args"} <= set(data.attrs):
                 return False
-            described = json.loads(data.attrs["env_args"])
-            given = set(described["env_kwargs"])
-            if described["env_name"] == EXTERNAL_ENVIRONMENT:
-                return given == EXTERNAL_ARGUMENTS
-            return str(described["env_name"]).startswith("demorec/") and given - IMAGE_ARGUMENTS == ENV_ARGUMENTS
+            return str(json.loads(data.attrs["env_args"])["env_name"]).startswith(ENVIRONMENT_PREFIX)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, RecursionError):
         return False
 
@@ -70,30 +58,23 @@ def _strangers(path: Path) -> list[str]:
     found: list[str] = []
 
     def look(name: str, link: object) -> None:
-        if not isinstance(link, h5py.HardLink) or not parts.fullmatch(name):
+        place = _DEMO.sub("data/demo_N", name)
+        if place in observations:
+            place = "data/demo_N/obs/NAME"
+        if not isinstance(link, h5py.HardLink) or place not in _PARTS:
             found.append(name)
             return
-        allowed = next((names for place, names in attributes if place.fullmatch(name)), frozenset[str]())
-        found.extend(f"attribute {key} of {name}" for key in file[name].attrs if key not in allowed)
+        found.extend(f"attribute {key} of {name}" for key in file[name].attrs if key not in _PARTS[place])
 
     try:
         with h5py.File(path, "r", locking=False) as file:
-            names = _observation_pattern(file)
-            parts = re.compile(_PARTS.replace("{names}", names))
-            attributes = [(re.compile(place.replace("{names}", names)), keys) for place, keys in _ATTRIBUTES]
+            names = json.loads(file["data"].attrs["observations"])
+            observations = {f"data/demo_N/obs/{name}" for name in names}
             found += [f"attribute {key}" for key in file.attrs]
             file.visititems_links(look)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise OSError(errno.EIO, describe_error(error)) from error
     return found
-
-
-def _observation_pattern(file: h5py.File) -> str:
-    """The observations that the export has written: of external episodes the file itself names them."""
-    described = json.loads(file["data"].attrs["env_args"])
-    if described["env_name"] != EXTERNAL_ENVIRONMENT:
-        return _OBSERVATIONS
-    return "|".join(re.escape(str(name)) for name in described["env_kwargs"]["observations"])
 
 
 DATASET = ReplaceableKind(

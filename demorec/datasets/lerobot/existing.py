@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, facts_of
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, fact_columns
 from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -41,7 +41,7 @@ class Existing:
         tasks: In the order of their indices.
         statistics: Of the camera features.
         configs: Of the sidecar: config digest -> configuration.
-        facts: Columns of facts that its table of episodes has -> type.
+        facts: Columns of its table of episodes beyond LeRobot's own -> type.
     """
 
     root: Path
@@ -61,8 +61,8 @@ def open_existing(root: Path) -> Existing:
     info = DatasetInfo.load(root)
     if info.is_old:
         raise ExportError(
-            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to; "
-            f"{_how_to_convert(root)}"
+            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to. This writes it as "
+            f"{CODEBASE_VERSION}: demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
         )
     try:
         lengths = [row["length"] for row in rows_in(root, "meta/episodes", ["length"])]
@@ -70,7 +70,7 @@ def open_existing(root: Path) -> Existing:
         rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
         tasks = tuple(read_tasks(root)) if info.total_tasks else ()
         found = read_json(root / STATS_PATH) if (root / STATS_PATH).exists() else {}
-        facts = facts_of(root)
+        facts = fact_columns(root)
         configs = read_json(root / CONFIGS_PATH) if (root / CONFIGS_PATH).exists() else {}
         statistics = {key: part for key in info.video_keys if (part := _statistics(found, key, info)) is not None}
         if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
@@ -148,16 +148,3 @@ def link_files(source: Path, target: Path) -> None:
                 except OSError:
                     pass  # another file system, or one without links
             shutil.copy2(path, copy)
-
-
-def _how_to_convert(root: Path) -> str:
-    """The command of LeRobot 0.6.1 that converts a dataset of v2.1, for a sentence."""
-    root = root.resolve()
-    arguments = f"--repo-id {shlex.quote(f'local/{root.name}')} --root {shlex.quote(str(root))} --push-to-hub false"
-    # The converter deletes what has these names, or puts it in the dataset's place.
-    taken = [name for name in (f"{root.name}_old", f"{root.name}_v30") if (root.parent / name).exists()]
-    first = f"move {' and '.join(taken)} away first, then " if taken else ""
-    return (
-        f"{first}LeRobot converts it in its place and leaves the old one beside it, as {root.name}_old: python -m "
-        f"lerobot.scripts.convert_dataset_v21_to_v30 {arguments}"
-    )

@@ -37,6 +37,12 @@ from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted
 from demorec.datasets.staging import CODED, staged_folder
 from demorec.episode.episode import Outcome
 
+_STATED_OPTIONS = (
+    "action", "state", "privileged", "features", "include_failures", "episodes", "fps", "depth", "motor_units", "boxes",
+    "progress", "hold_images",
+)  # fmt: skip
+"""Options that decide what the episodes contain; `demorec/export.json` has them."""
+
 
 def export_lerobot(
     sources: Sequence[Path], out: Path, options: ExportOptions, progress: ProgressCallback | None = None
@@ -95,7 +101,6 @@ class _Export:
         self._recordings: list[Path] = []
         self._silent: list[str] = []
         self._intake = Intake(found, options)
-        self._is_simulated = True
 
     def run(self, progress: ProgressCallback | None) -> ExportReport:
         aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
@@ -108,7 +113,6 @@ class _Export:
                 break
         self._intake.check()
         info = self._dataset_info(begun[-1])
-        self._is_simulated = begun[-1].is_simulated
         facts, there = self._facts(begun[-1]), self._existing
         with (
             DatasetWriter(
@@ -134,7 +138,6 @@ class _Export:
             num_episodes=finished.total_episodes,
             num_frames=finished.total_frames,
             new_episodes=finished.total_episodes - info.total_episodes,
-            new_frames=finished.total_frames - info.total_frames,
             skipped_failures=self._intake.skipped_failures,
             skipped_unknown=self._intake.skipped_unknown,
             skipped_unwanted=self._intake.skipped_unwanted,
@@ -186,7 +189,7 @@ class _Export:
 
     def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, reading: Reading) -> None:
         if reading.data is None or reading.record is None:
-            sidecar.add_attempt(reading.attempt, in_dataset=False)
+            sidecar.add_attempt(reading.attempt)
             return
         digest = writer.add(reading.data)
         sidecar.add(writer.num_episodes - 1, digest, reading.record, reading.attempt)
@@ -216,17 +219,8 @@ class _Export:
             )
 
     def _about_this_export(self) -> dict[str, Any]:
-        options = self._options
-        always = ("action", "privileged", "features", "include_failures", "episodes", "fps", "depth")
-        optional = {name: getattr(options, name) for name in ("motor_units", "boxes", "progress")}
-        return {
-            "demorec": version("demorec"),
-            **{name: getattr(options, name) for name in always},
-            **{name: value for name, value in optional.items() if value},
-            **({} if self._is_simulated else {"hold_pictures": options.hold_images}),
-            **({} if options.state == "joint" else {"state": options.state}),
-            **({} if options.language is None else {"language": options.spoken}),
-        }
+        options = {name: getattr(self._options, name) for name in _STATED_OPTIONS}
+        return {"demorec": version("demorec"), **options, "language": list(self._options.spoken)}
 
 
 def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:

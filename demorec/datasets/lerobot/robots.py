@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.core.errors import DemorecError, ExportError, describe_error
+from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.plain import digest, from_json, to_json
 from demorec.core.tables import ROBOTS
@@ -24,11 +24,10 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.writer import write_text
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import Feature
-from demorec.robots.assets import asset_path
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
 from demorec.robots.so101 import SO101_FOLLOWER
-from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml, read_links
+from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
 
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
@@ -59,9 +58,8 @@ class RobotRecord:
         joints: Feature -> for each of its elements the joint of the URDF of which it is the position, "" for none.
         units: Feature -> of its elements, where they are known; positions are in rad and m otherwise.
         calibration: Feature -> of its elements, as `Feature` has it; only of servos that say something else.
-        spec: Of a simulated arm: TCP link, limits, gripper, and `urdf`, the model that the meshes belong to.
-        meshes: Link -> the mesh files that this model draws it with, as its URDF names them, where it is installed;
-            the URDF here has their boxes.
+        spec: TCP link, limits and gripper of a simulated arm, and `urdf`, its model with meshes; the URDF here has
+            boxes in their place.
     """
 
     name: str
@@ -69,7 +67,6 @@ class RobotRecord:
     joints: Mapping[str, tuple[str, ...]]
     units: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     spec: RobotSpec | None = None
-    meshes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     calibration: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
 
     def described(self, feature: Feature) -> Feature:
@@ -117,7 +114,7 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     if episode.info.simulation is None:
         return _robot(name, portable_urdf(text), moving)
     spec = episode.info.robot
-    return _robot(name, text, moving, spec=spec, meshes=_mesh_names(spec.urdf))
+    return _robot(name, text, moving, spec=spec)
 
 
 def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> DatasetRobot:
@@ -193,17 +190,6 @@ def _portable(name: str) -> str:
     if found := _IN_PACKAGE.match(name):
         return f"package://{found[1]}"
     return re.split(r"[/\\]", name)[-1] if _ABSOLUTE.match(name) else name
-
-
-@functools.lru_cache(maxsize=8)
-def _mesh_names(model: str) -> Mapping[str, tuple[str, ...]]:
-    """Link -> mesh files of a model; none where it is not installed, or may not be looked at."""
-    try:
-        links = read_links(asset_path(model).read_text())
-    except (DemorecError, OSError, ValueError):
-        return {}
-    named = {link.name: tuple(shape.file for shape in link.visuals if shape.kind == "mesh") for link in links}
-    return {link: files for link, files in named.items() if files}
 
 
 def write_robot(root: Path, robot: DatasetRobot) -> None:

@@ -1,11 +1,11 @@
-"""What LeRobot has no place for and a user still needs, in the folder `demorec/` of the dataset.
+"""The sidecar: data that LeRobot has no place for, in the folder `demorec/` of the dataset.
 
-- `episodes/`: one row per episode: where it comes from (run's episode number, attempt, seed, config digest), how it
-  ended (every check with its value and limit), what happened when (phases, deliberate misses), the cameras with
-  intrinsics and extrinsics, poses of objects and goals, and `episode_info`: the complete description of scene and
-  robot as JSON, from which `demorec` can build the world again.
+- `episodes/`: one row per episode: its source (run's episode number, attempt, seed, config digest), its outcome (every
+  check with its value and limit), phases, cameras with intrinsics and extrinsics, final poses of objects, and
+  `episode_info`: the complete description of scene and robot as JSON, from which `demorec` can build the world again.
 - `camera_poses/`: one row per frame, for cameras that move.
-- `attempts/`: one row per attempt that was seen, failed ones included, for success rates.
+- `attempts/`: one row per attempt, failed ones included, for success rates. A failed attempt precedes the attempt that
+  became an episode.
 - `robots/`: what draws and moves the arms, in a form that needs nothing of ours (`demorec.datasets.lerobot.robots`).
 - `configs.json`: config digest -> resolved configuration; `export.json`: how the dataset was made.
 """
@@ -41,7 +41,7 @@ from demorec.datasets.lerobot.writer import write_text
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
     from demorec.episode.episode import Columns
-    from demorec.episode.scene import Scene
+    from demorec.episode.info import Camera
     from demorec.mcap import Recording
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
@@ -51,8 +51,7 @@ _TEXT, _WHOLE, _NUMBER, _FLAG = pa.string(), pa.int64(), pa.float64(), pa.bool_(
 _POSE, _VECTOR = pa.list_(_NUMBER, 7), pa.list_(_NUMBER)
 _CHECK = pa.struct({"name": _TEXT, "value": _NUMBER, "limit": _NUMBER, "unit": _TEXT, "passed": _FLAG})
 _PHASE = pa.struct({"name": _TEXT, "from": _WHOLE, "to": _WHOLE})
-_OBJECT = pa.struct({"name": _TEXT, "world_from_object_start": _VECTOR, "world_from_object_end": _VECTOR})
-_GOAL = pa.struct({"object": _TEXT, "onto": _TEXT, "world_from_goal_start": _VECTOR})
+_OBJECT = pa.struct({"name": _TEXT, "world_from_object_end": _VECTOR})
 _CAMERA = pa.struct(
     {
         "name": _TEXT,
@@ -61,7 +60,6 @@ _CAMERA = pa.struct(
         "intrinsics": _VECTOR,
         "mount": _TEXT,
         "mount_from_camera": _VECTOR,
-        "world_from_camera_start": _VECTOR,
     }
 )
 
@@ -72,22 +70,17 @@ EPISODE_SCHEMA = pa.schema(
         "run_episode_index": _WHOLE,
         "attempt": _WHOLE,
         "root_seed": pa.uint64(),
-        "task": _TEXT,
         "origin": _TEXT,
         "config_digest": _TEXT,
         "content_digest": _TEXT,
-        "frame_stride": _WHOLE,
         "success": _FLAG,
         "failure_phase": _TEXT,
         "failure_reason": _TEXT,
         "num_retries": _WHOLE,
         "final_state_digest": _TEXT,
         "checks": pa.list_(_CHECK),
-        "behaviour": pa.map_(_TEXT, _NUMBER),
         "phases": pa.list_(_PHASE),
-        "deliberate_miss_frames": pa.list_(_WHOLE),
         "objects": pa.list_(_OBJECT),
-        "goals": pa.list_(_GOAL),
         "cameras": pa.list_(_CAMERA),
         "episode_info": _TEXT,
         "robot_digest": _TEXT,
@@ -97,6 +90,7 @@ EPISODE_SCHEMA = pa.schema(
 
 ATTEMPT_SCHEMA = pa.schema(
     {
+        "episode_index": _WHOLE,
         "source": _TEXT,
         "run_episode_index": _WHOLE,
         "attempt": _WHOLE,
@@ -105,7 +99,6 @@ ATTEMPT_SCHEMA = pa.schema(
         "failure_reason": _TEXT,
         "object": _TEXT,
         **dict.fromkeys(("object_x", "object_y", "goal_x", "goal_y"), _NUMBER),
-        "in_dataset": _FLAG,
     }
 )
 
@@ -117,14 +110,13 @@ class EpisodeRecord:
     Attributes:
         row: Of the episodes' table, less the index.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
-        config_digest, config: Of its run.
+        config: Configuration of its run.
         robot: What draws and moves its arm; None where that is not known.
     """
 
     row: Mapping[str, Any]
     moving_cameras: Mapping[str, Array]
     robot: DatasetRobot | None
-    config_digest: str = ""
     config: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -134,8 +126,7 @@ class EpisodeRecord:
         row = {
             **{name: attempt[name] for name in ("source", "run_episode_index", "attempt", "success", "failure_reason")},
             "origin": episode.origin,
-            "frame_stride": info.fps // episode.fps if len(rows) > 1 else 1,
-            "cameras": episode.described_cameras(),
+            "cameras": [_described_camera(camera) for camera in info.cameras],
         }
         moving: dict[str, Array] = {}
         if (simulation := info.simulation) is not None:
@@ -145,7 +136,6 @@ class EpisodeRecord:
         return cls(
             row=row,
             moving_cameras=moving,
-            config_digest="" if simulation is None else simulation.config_digest,
             config={} if simulation is None else simulation.config,
             robot=robot_of(episode),
         )
@@ -156,17 +146,15 @@ def _simulated_row(episode: ExportEpisode) -> dict[str, Any]:
     info, columns, outcome = episode.info, episode.columns, episode.recording.outcome
     return {
         "root_seed": info.root_seed,
-        "task": info.task,
         "config_digest": info.config_digest,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "num_retries": 0 if outcome is None else outcome.num_retries,
         "final_state_digest": "" if outcome is None else outcome.final_state_digest,
         "checks": [] if outcome is None else [to_plain(check) for check in outcome.checks],
-        "behaviour": sorted(info.behaviour.items()),
         "phases": _phases(columns, episode.rows),
-        "deliberate_miss_frames": np.flatnonzero(columns.is_deliberate_miss[episode.rows]).tolist(),
-        "objects": _objects(columns),
-        "goals": _goals(info.scene),
+        "objects": [
+            {"name": name, "world_from_object_end": poses[-1].tolist()} for name, poses in columns.object_poses.items()
+        ],
         "episode_info": to_json(info),
     }
 
@@ -180,21 +168,18 @@ def _phases(columns: Columns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
     return phases
 
 
-def _objects(columns: Columns) -> list[dict[str, Any]]:
-    """Where the objects are, at the start and at the end."""
-    return [
-        {"name": name, "world_from_object_start": poses[0].tolist(), "world_from_object_end": poses[-1].tolist()}
-        for name, poses in columns.object_poses.items()
-    ]
-
-
-def _goals(scene: Scene) -> list[dict[str, Any]]:
-    """Where the goals are at the start."""
-    places = [scene.world_from_goal(goal).vector().tolist() for goal in scene.goals]
-    return [
-        {"object": goal.object, "onto": goal.onto, "world_from_goal_start": place}
-        for goal, place in zip(scene.goals, places, strict=True)
-    ]
+def _described_camera(camera: Camera) -> dict[str, Any]:
+    """A camera of a recording; None for unknown values."""
+    intrinsics = camera.intrinsics
+    placed = camera.mount_from_camera
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "intrinsics": None if intrinsics is None else list(intrinsics),
+        "mount": camera.mount or None,
+        "mount_from_camera": None if placed is None else placed.vector().tolist(),
+    }
 
 
 class SidecarWriter(Closing):
@@ -230,15 +215,15 @@ class SidecarWriter(Closing):
         self._episodes.add_row({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
         if robot is not None:
             write_robot(self._root, robot)
-        if record.config_digest or record.config:
-            self._configs.setdefault(record.config_digest, record.config)
-        self.add_attempt(attempt, in_dataset=True)
+        if record.config:
+            self._configs.setdefault(record.row["config_digest"], record.config)
+        self.add_attempt(attempt, episode_index)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)
 
-    def add_attempt(self, attempt: Mapping[str, Any], *, in_dataset: bool) -> None:
-        """An attempt that was seen, whether or not it is in the dataset."""
-        self._attempts.add_row({**attempt, "in_dataset": in_dataset})
+    def add_attempt(self, attempt: Mapping[str, Any], episode_index: int | None = None) -> None:
+        """Add an attempt; None: it is not in the dataset."""
+        self._attempts.add_row({**attempt, "episode_index": episode_index})
 
     def _add_camera_poses(self, episode_index: int, poses: Mapping[str, Array]) -> None:
         if self._camera_poses is None:
@@ -262,7 +247,7 @@ class SidecarWriter(Closing):
 
 
 def attempt_row(recording: Recording) -> dict[str, Any]:
-    """One attempt, as far as success rates need it, from the recording's metadata alone, less `in_dataset`.
+    """One attempt, as far as success rates need it, from the recording's metadata alone, less `episode_index`.
 
     Positions are in the world frame, metres, at the start; `success` is None where nobody said.
     """

@@ -1,0 +1,172 @@
+"""What the editing commands have in common: the new dataset, what is printed about it, words that name episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.paths import is_dataset
+
+if TYPE_CHECKING:
+    from demorec.datasets.editing.plan import Plan, Source
+
+MAX_SHOWN = 20
+"""Ranges of episodes, or differences of one level, that are printed."""
+DatasetPath = Annotated[Positional[Path], arg(metavar="DATASET", help="A dataset, or a run that has one.")]
+CONDITION_HELP = (
+    "Condition on columns of the table of episodes or of demorec's sidecar, and on episode_index, num_frames, "
+    'duration_s, task, score: success and num_frames < 300; "cube" in task.'
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edit:
+    """Flags of every command that writes a dataset."""
+
+    out: Path | None = None
+    """Folder of the new dataset."""
+    decode: bool = False
+    """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""
+    overwrite: bool = False
+    """Replace an existing dataset."""
+    dry_run: bool = False
+    """Print what would come out, and write nothing."""
+
+    def sources(self) -> Sequence[Source]:
+        """The datasets to read."""
+        raise NotImplementedError
+
+    def plan(self, sources: Sequence[Source]) -> Plan:
+        """The new dataset."""
+        raise NotImplementedError
+
+    def plans(self, sources: Sequence[Source]) -> Mapping[str, Plan]:
+        """Name within --out -> new dataset."""
+        self.check_out(sources, [""])
+        return {"": self.plan(sources)}
+
+    def run(self) -> int:
+        """Plan, write, and print what came out."""
+        from demorec.datasets.editing.write import write_plan
+        from demorec.datasets.lerobot.files import leave_pandas_out
+
+        leave_pandas_out()
+        if self.out is None and not self.dry_run:
+            raise ConfigError("Name the folder of the new dataset (--out NEW), or ask what it would be (--dry-run).")
+        for name, plan in self.plans(self.sources()).items():
+            say(*_changes(plan))
+            if self.out is None or self.dry_run:
+                self._print_result("Would be ", name, plan, "Would not be taken over")
+                continue
+            with ProgressBar("writing") as bar:
+                decoded, around = write_plan(
+                    plan, self.out / name, overwrite=self.overwrite, decode=self.decode, progress=bar.set
+                )
+            self._print_result("", name, plan, "Not taken over")
+            if around:
+                say(f"{counted(around, 'image')} beside cuts stay in the videos, since others need them.")
+            if decoded:
+                say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
+        return 0
+
+    def check_out(self, sources: Sequence[Source], names: Sequence[str]) -> None:
+        """Raise ConfigError if a new dataset cannot be written to one of these names within --out."""
+        from demorec.datasets.editing.write import check_target
+
+        outs = [self.out / name for name in names] if self.out is not None else []
+        refuse_inside(outs)
+        for out in outs:
+            check_target(out, [source.root for source in sources], overwrite=self.overwrite)
+
+    def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
+        from demorec.datasets.editing.beside import left_out
+
+        lengths = [place.length for source in plan.sources for place in source.places]
+        frames = sum(cut.last - cut.first for cut in plan.cuts)
+        text = f"{begin}{len(plan.cuts)} of {counted(len(lengths), 'episode')}, {frames} of {sum(lengths)} frames"
+        place = str(self.out / name) if self.out is not None else name
+        numbers = [cut.episode for cut in plan.cuts]
+        if self.dry_run and len(plan.sources) == 1 and numbers != list(range(len(lengths))):
+            say(f"episodes {_listed(numbers)}")
+        say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditOne(Edit):
+    """Flags of every command that makes one dataset of another."""
+
+    dataset: DatasetPath
+
+    def sources(self) -> Sequence[Source]:
+        """The dataset."""
+        from demorec.datasets.editing.plan import Source
+
+        return [Source(dataset_at(self.dataset))]
+
+
+def _changes(plan: Plan) -> list[str]:
+    """Lines about what is done to episodes."""
+    lines = []
+    if new := sum(bool(cut.task) for cut in plan.cuts):
+        lines.append(f"New instruction: {new} of {counted(len(plan.cuts), 'episode')}")
+    for cut in plan.cuts:
+        length = plan.sources[cut.source].places[cut.episode].length
+        if (cut.first, cut.last) != (0, length):
+            head = counted(cut.first, "frame")
+            lines.append(f"episode {cut.episode}: {head} cut at the beginning, {length - cut.last} at the end")
+    return lines
+
+
+def dataset_at(path: Path) -> Path:
+    """The named dataset, or that of a run; ConfigError for anything else."""
+    from demorec.runs.find import expect
+    from demorec.runs.run_file import DATASET
+
+    if expect(path, "dataset", "run").kind == "dataset":
+        return path
+    if not is_dataset(path / DATASET):
+        raise ConfigError(f"This run has no dataset in {DATASET}/, make one (demorec export lerobot): {path}")
+    return path / DATASET
+
+
+def episode_numbers(texts: Sequence[str]) -> list[int]:
+    """Numbers of episodes from 0,3,5:9 or 0 3 5:9; a range excludes its end."""
+    found: list[int] = []
+    try:
+        for part in " ".join(texts).replace(",", " ").split():
+            first, colon, last = part.partition(":")
+            found += range(int(first), int(last)) if colon else [int(first)]
+    except (ValueError, MemoryError, OverflowError):
+        found = []
+    if texts and not found:
+        raise ConfigError(f"Episodes are numbers and ranges, such as 0,3,5:9, not {' '.join(texts)!r}.")
+    return found
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Some of the numbers, as `episode_numbers` reads them."""
+    parts: list[tuple[int, int]] = []
+    for number in numbers:
+        if parts and parts[-1][1] == number:
+            parts[-1] = (parts[-1][0], number + 1)
+        else:
+            parts.append((number, number + 1))
+    texts = [f"{first}:{end}" if end - first > 1 else str(first) for first, end in parts]
+    return ",".join(texts[:MAX_SHOWN]) + (",..." if len(texts) > MAX_SHOWN else "")
+
+
+def pairs(words: Sequence[str], example: str) -> dict[str, str]:
+    """NAME=VALUE of each word; ConfigError for anything else."""
+    found = dict(word.partition("=")[::2] for word in words)
+    if not words or any("=" not in word for word in words) or len(found) != len(words):
+        given = f", not {' '.join(words)!r}" if words else ""
+        raise ConfigError(f"Each name is given once, with what it gets: {example}{given}.")
+    return found

@@ -1,0 +1,72 @@
+"""`demorec dataset score`: a score for each episode, with reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from demorec.cli.dataset.edit import DatasetPath, dataset_at
+from demorec.cli.shared.output import counted, say, say_json, tell
+from demorec.cli.shared.paths import refuse_inside
+from demorec.core.errors import ExportError
+
+if TYPE_CHECKING:
+    from demorec.datasets.editing.plan import Source
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """Rate every episode from 0 to 1 against the others of its task, with reasons.
+
+    Examples:
+      demorec dataset score cups
+      demorec dataset score cups --out scores.json
+    """
+
+    dataset: DatasetPath
+    out: Path | None = None
+    """JSON file for the scores."""
+    overwrite: bool = False
+    """Replace an existing file of scores."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> int:
+        """Score, print, and write."""
+        from demorec.datasets.lerobot.files import leave_pandas_out
+        from demorec.datasets.scoring.score import check_target, score_dataset, to_json, write_scores
+
+        leave_pandas_out()
+        root = dataset_at(self.dataset)
+        if self.out is not None:
+            refuse_inside([self.out])
+            check_target(self.out, source=root, overwrite=self.overwrite)
+        found = score_dataset(root)
+        if self.json:
+            say_json(to_json(found))
+        for episode in () if self.json else sorted(found, key=lambda episode: episode.score):
+            reasons = [f"{reason.text} (frames {reason.first} to {reason.last})" for reason in episode.reasons]
+            say(
+                f"{episode.score:.2f}  episode {episode.episode_index}" + (f": {'; '.join(reasons)}" if reasons else "")
+            )
+        if self.out is not None:
+            try:
+                write_scores(self.out, found)
+            except OSError as error:
+                raise ExportError(f"The scores cannot be written ({error.strerror}): {self.out}") from error
+            tell(f"Scores of {counted(len(found), 'episode')}: {self.out}")
+        return 0
+
+
+def add_scores(source: Source, names: Collection[str], file: Path | None) -> None:
+    """Let a dataset have scores if `score` is among the names of columns, and no column of its own is called so."""
+    from demorec.datasets.scoring.score import read_scores, score_dataset
+
+    if "score" not in names or any("score" in row for row in source.columns()):
+        return
+    if file is None:
+        source.scores = {episode.episode_index: episode.score for episode in score_dataset(source.root)}
+        return
+    source.scores = read_scores(file, {place.episode_index: place.length for place in source.places})
