@@ -53,7 +53,7 @@ def recording_of(name: str, path: Path) -> Path:
     config = GenerateConfig(task=name, robot=name, cameras=(name,), width=64, height=64, variation="full")
     spoilt.info = spoilt.info.with_simulation(
         task=name,
-        config={**spoilt.info.config, **to_plain(config)} | {"renderer": "raster"},
+        config=to_plain(config),
         behaviour={**spoilt.info.behaviour, f"calibration_{camera}_x": 0.01},
     )
     spoilt.frames = spoilt.frames[:8]
