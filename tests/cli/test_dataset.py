@@ -163,5 +163,5 @@ def test_the_home_folder_within_quotes(
     assert exit_code("dataset", "score", "cups", "--out", "~/scores.json") == 0
     assert f"Scores of 5 episodes: {cups.parent}/scores.json" in capsys.readouterr().err
     assert not Path("~").exists()
-    assert exit_code("dataset", "score", "cups", "--out", "x" * 250) == 1
+    assert exit_code("dataset", "score", "cups", "--out", "x" * 250) == 2
     assert "The scores cannot be written (File name too long)" in capsys.readouterr().err

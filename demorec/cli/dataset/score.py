@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from demorec.cli.dataset.edit import DatasetPath, dataset_at
 from demorec.cli.shared.output import counted, say, say_json, tell
 from demorec.cli.shared.paths import refuse_inside
-from demorec.core.errors import ExportError
+from demorec.core.errors import ExportError, write_error
 
 if TYPE_CHECKING:
     from demorec.datasets.editing.plan import Source
@@ -55,7 +55,7 @@ class Score:
             try:
                 write_scores(self.out, found)
             except OSError as error:
-                raise ExportError(f"The scores cannot be written ({error.strerror}): {self.out}") from error
+                raise write_error("The scores", error, self.out, ExportError) from error
             tell(f"Scores of {counted(len(found), 'episode')}: {self.out}")
         return 0
 
