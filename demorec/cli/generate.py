@@ -41,7 +41,7 @@ class Generate:
       generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
       generate-dataset --num-episodes 1000 --dry-run   (time, size and success rate)
       generate-dataset --executor ray --address auto --out /shared/cubes
-      generate-dataset --config recordings/cubes/run.json --out again   (the same episodes, compared bit for bit)
+      generate-dataset --config cubes/run.json --out again   (compares bit for bit)
     """
 
     config: Path | None = None

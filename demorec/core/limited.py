@@ -4,7 +4,8 @@ Such a command runs in a child process, forked before any library is loaded. The
 its limits, and turns its death into one sentence. Limits grow with the size of the files that the command line names.
 
 Memory is what the child has filled (resident and private), which the parent looks at fifty times a second. RLIMIT_DATA
-would count what allocators and threads merely reserve: 1 GB each for PyArrow and Rerun, more on machines of many cores.
+counts what allocators and threads merely reserve, too: 1 GB each for PyArrow and Rerun, more on machines of many cores.
+So it is set higher, as a bound that holds even where the parent is not scheduled in time.
 Linux alone reports all of this; elsewhere commands run without limits.
 """
 
@@ -37,6 +38,11 @@ READING_CPU_S = 20
 """10 s to read, and 10 s to load libraries and to compile kernels on first use (LeRobot takes 5 s, kernels 4 s)."""
 CPU_S_PER_MB = 10
 """`check` takes 2 s for each MB of a recording."""
+
+RESERVED_BYTES = 6_000_000_000
+"""Data that libraries and their threads may reserve without filling it."""
+RESERVED_BYTES_PER_CORE = 200_000_000
+"""A thread has a stack of 8 MB and an arena of 64 MB; several libraries start one for each core."""
 
 _TICK_S = 0.02
 _MAX_FILES = 20_000
@@ -97,7 +103,7 @@ def continue_in_child(words: Sequence[str]) -> None:
     child = os.fork()
     if child == 0:
         os.close(heard)
-        _limit_this_process(parent, limits.cpu_s)
+        _limit_this_process(parent, limits)
         signal.set_wakeup_fd(hears, warn_on_full_buffer=False)
         signal.pthread_sigmask(signal.SIG_SETMASK, usual)
         return
@@ -113,16 +119,22 @@ def remove_cpu_limit() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (hard, hard))
 
 
-def _limit_this_process(parent: int, cpu_s: int | None) -> None:
+def _limit_this_process(parent: int, limits: Limits) -> None:
     import ctypes
 
     ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it was killed before
         os._exit(1)
-    if cpu_s is not None:
-        soft, hard = resource.getrlimit(resource.RLIMIT_CPU)
-        lower = cpu_s if soft == resource.RLIM_INFINITY else min(soft, cpu_s)
-        resource.setrlimit(resource.RLIMIT_CPU, (lower, hard))
+    reserved = RESERVED_BYTES + RESERVED_BYTES_PER_CORE * (os.cpu_count() or 1)
+    _lower(resource.RLIMIT_DATA, limits.memory_bytes + reserved)
+    if limits.cpu_s is not None:
+        _lower(resource.RLIMIT_CPU, limits.cpu_s)
+
+
+def _lower(kind: int, value: int) -> None:
+    """Lower the soft limit of a resource unless it is lower already."""
+    soft, hard = resource.getrlimit(kind)
+    resource.setrlimit(kind, (value if soft == resource.RLIM_INFINITY else min(soft, value), hard))
 
 
 def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:

@@ -134,8 +134,10 @@ def _read_run(source: Path) -> Original:
 
 
 def _read_recording(source: Path) -> Original:
-    with open_recording(source, simulated=True) as recording:
+    with open_recording(source) as recording:
         info, digest = recording.info, recording.digest()
+    if info.simulation is None:
+        raise ConfigError(f"The recording was recorded by another robot or program, not generated: {source}")
     if info.origin:
         raise ConfigError(f"The recording is a {info.origin}, which generate-dataset did not make: {source}")
     config = parse_config(dict(info.config), GenerateConfig, source=str(source))

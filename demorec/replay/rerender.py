@@ -205,6 +205,15 @@ def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any
     return config
 
 
+def _video_options(info: EpisodeInfo, config: Mapping[str, Any]) -> VideoConfig:
+    """Read the video options of a drawing config. Raises ConfigError for impossible ones, recorded or new."""
+    config_as(info.config.get("video", {}), VideoConfig)
+    try:
+        return from_plain(config.get("video", {}), VideoConfig)
+    except ValueError as error:
+        raise ConfigError(f"The video options cannot be used ({error}).") from error
+
+
 def rerender(
     source: Path,
     out: Path,
@@ -237,11 +246,7 @@ def rerender(
             raise RecordingError(f"The recording has no frames: {source}")
         view, config = new_view(info, options), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
-        config_as(info.config.get("video", {}), VideoConfig)
-        try:
-            video = from_plain(config.get("video", {}), VideoConfig)
-        except ValueError as error:
-            raise ConfigError(f"The video options cannot be used ({error}).") from error
+        video = _video_options(info, config)
         new_info = replace(info, origin=f"render of {recording.digest()[:16]}").with_simulation(
             scene=view.scene, behaviour=view_behaviour(info, view), config=config, config_digest=digest(config)
         )
