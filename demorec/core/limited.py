@@ -3,8 +3,8 @@
 Such a command runs in a child process, forked before any library is loaded. The parent waits for it, kills it above
 its limits, and turns its death into one sentence. Limits grow with the size of the files that the command line names.
 
-Memory is what the child has filled (resident and private), which the parent looks at fifty times a second. RLIMIT_DATA
-would count what allocators and threads merely reserve: 1 GB each for PyArrow and Rerun, more on machines of many cores.
+Memory is what the child has filled (resident and private), which the parent looks at 20 to 100 times a second.
+RLIMIT_DATA would count what is merely reserved: 1 GB each by PyArrow and Rerun, and the stacks of threads.
 Linux alone reports all of this; elsewhere commands run without limits.
 """
 
@@ -38,7 +38,8 @@ READING_CPU_S = 20
 CPU_S_PER_MB = 10
 """`check` takes 2 s for each MB of a recording."""
 
-_TICK_S = 0.02
+_TICK_S, _LARGE_TICK_S = 0.05, 0.01
+"""Time between two looks at a child's memory, below half of its limit and above."""
 _MAX_FILES = 20_000
 """Files whose sizes are added up; the rest of a larger folder does not raise its limits."""
 _MAX_NAMES = 3
@@ -127,13 +128,17 @@ def _limit_this_process(parent: int, cpu_s: int | None) -> None:
 
 def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
     """Wait for the child; its exit code, -N after signal N, and whether it was killed for its memory."""
+    tick_s = _TICK_S
     while True:
-        told = signal.sigtimedwait((*_FORWARDED, signal.SIGCHLD), _TICK_S)
+        told = signal.sigtimedwait((*_FORWARDED, signal.SIGCHLD), tick_s)
         if told is None:
             family = [child, *_children(child)]
-            if any(_private_bytes(pid) > memory_bytes for pid in family):
+            filled = max(map(_private_bytes, family))
+            tick_s = _LARGE_TICK_S if filled > memory_bytes // 2 else _TICK_S
+            if filled > memory_bytes:
                 for pid in family:
-                    os.kill(pid, signal.SIGKILL)
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
                 return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), True
         elif told.si_signo == signal.SIGCHLD:
             pid, status = os.waitpid(child, os.WNOHANG)
@@ -145,7 +150,7 @@ def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
 
 def _pass_on(number: int, child: int, heard: int) -> None:
     """Send a signal to the child unless it was sent to the whole group: a second one would interrupt its clean-up."""
-    time.sleep(_TICK_S)
+    time.sleep(_LARGE_TICK_S)
     try:
         numbers = os.read(heard, 4096)  # written by Python's own handler (signal.set_wakeup_fd)
     except BlockingIOError:
@@ -156,18 +161,27 @@ def _pass_on(number: int, child: int, heard: int) -> None:
 
 def _children(pid: int) -> list[int]:
     """Processes that the main thread of a process has started, such as its workers."""
-    try:
-        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    except OSError:
-        return []
+    return [int(word) for word in _words_of(f"/proc/{pid}/task/{pid}/children")]
 
 
 def _private_bytes(pid: int) -> int:
-    try:
-        resident, shared = Path(f"/proc/{pid}/statm").read_text().split()[1:3]
-    except (OSError, ValueError):  # it has ended
-        return 0
+    """Memory that a process has filled; 0 when it has ended."""
+    _, resident, shared, *_ = _words_of(f"/proc/{pid}/statm") or (b"0", b"0", b"0")
     return (int(resident) - int(shared)) * resource.getpagesize()
+
+
+def _words_of(path: str) -> list[bytes]:
+    """Words of a file below /proc; none when the process has ended. Path.read_text would take five times as long."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return []
+    try:
+        return os.read(descriptor, 65536).split()
+    except OSError:
+        return []
+    finally:
+        os.close(descriptor)
 
 
 def _tell_death(command: str, limits: Limits, number: signal.Signals, is_too_large: bool) -> NoReturn:
