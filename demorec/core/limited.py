@@ -3,9 +3,9 @@
 Such a command runs in a child process, forked before any library is loaded. The parent waits for it, kills it above
 its limits, and turns its death into one sentence. Limits grow with the size of the files that the command line names.
 
-Memory is what the child has filled (resident and private), which the parent looks at fifty times a second. RLIMIT_DATA
-counts what allocators and threads merely reserve, too: 1 GB each for PyArrow and Rerun, more on machines of many cores.
-So it is set higher, as a bound that holds even where the parent is not scheduled in time.
+Memory is what the child has filled (resident and private), which the parent looks at 20 to 100 times a second.
+RLIMIT_DATA counts what is merely reserved, too: 1 GB each by PyArrow and Rerun, and the stacks of threads. So it is set
+higher, as a bound that holds even where the parent is not scheduled in time.
 Linux alone reports all of this; elsewhere commands run without limits.
 """
 
@@ -44,7 +44,10 @@ RESERVED_BYTES = 6_000_000_000
 RESERVED_BYTES_PER_CORE = 200_000_000
 """A thread has a stack of 8 MB and an arena of 64 MB; several libraries start one for each core."""
 
-_TICK_S = 0.02
+_TICK_S = 0.05
+"""Time between two looks at a child's memory."""
+_LARGE_TICK_S = 0.01
+"""The same above half of the limit."""
 _MAX_FILES = 20_000
 """Files whose sizes are added up; the rest of a larger folder does not raise its limits."""
 _MAX_NAMES = 3
@@ -113,10 +116,11 @@ def continue_in_child(words: Sequence[str]) -> None:
     _tell_death(words[0], limits, signal.Signals(-code), is_too_large)
 
 
-def remove_cpu_limit() -> None:
-    """Lift the limit on CPU time, for a program that the user works with (a viewer)."""
-    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-    resource.setrlimit(resource.RLIMIT_CPU, (hard, hard))
+def remove_limits() -> None:
+    """Lift the limits on CPU time and reserved memory, for a program that the user works with (a viewer)."""
+    for kind in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
+        hard = resource.getrlimit(kind)[1]
+        resource.setrlimit(kind, (hard, hard))
 
 
 def _limit_this_process(parent: int, limits: Limits) -> None:
@@ -139,13 +143,17 @@ def _lower(kind: int, value: int) -> None:
 
 def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
     """Wait for the child; its exit code, -N after signal N, and whether it was killed for its memory."""
+    tick_s = _TICK_S
     while True:
-        told = signal.sigtimedwait((*_FORWARDED, signal.SIGCHLD), _TICK_S)
+        told = signal.sigtimedwait((*_FORWARDED, signal.SIGCHLD), tick_s)
         if told is None:
             family = [child, *_children(child)]
-            if any(_private_bytes(pid) > memory_bytes for pid in family):
+            filled = max(map(_private_bytes, family))
+            tick_s = _LARGE_TICK_S if filled > memory_bytes // 2 else _TICK_S
+            if filled > memory_bytes:
                 for pid in family:
-                    os.kill(pid, signal.SIGKILL)
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
                 return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), True
         elif told.si_signo == signal.SIGCHLD:
             pid, status = os.waitpid(child, os.WNOHANG)
@@ -157,7 +165,7 @@ def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
 
 def _pass_on(number: int, child: int, heard: int) -> None:
     """Send a signal to the child unless it was sent to the whole group: a second one would interrupt its clean-up."""
-    time.sleep(_TICK_S)
+    time.sleep(_LARGE_TICK_S)
     try:
         numbers = os.read(heard, 4096)  # written by Python's own handler (signal.set_wakeup_fd)
     except BlockingIOError:
@@ -168,18 +176,27 @@ def _pass_on(number: int, child: int, heard: int) -> None:
 
 def _children(pid: int) -> list[int]:
     """Processes that the main thread of a process has started, such as its workers."""
-    try:
-        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    except OSError:
-        return []
+    return [int(word) for word in _words_of(f"/proc/{pid}/task/{pid}/children")]
 
 
 def _private_bytes(pid: int) -> int:
-    try:
-        resident, shared = Path(f"/proc/{pid}/statm").read_text().split()[1:3]
-    except (OSError, ValueError):  # it has ended
-        return 0
+    """Memory that a process has filled; 0 when it has ended."""
+    _, resident, shared, *_ = _words_of(f"/proc/{pid}/statm") or (b"0", b"0", b"0")
     return (int(resident) - int(shared)) * resource.getpagesize()
+
+
+def _words_of(path: str) -> list[bytes]:
+    """Words of a file below /proc; none when the process has ended. Path.read_text would take five times as long."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return []
+    try:
+        return os.read(descriptor, 65536).split()
+    except OSError:
+        return []
+    finally:
+        os.close(descriptor)
 
 
 def _tell_death(command: str, limits: Limits, number: signal.Signals, is_too_large: bool) -> NoReturn:

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from demorec.core.limited import remove_cpu_limit
+from demorec.core.limited import remove_limits
 
 _PATIENCE_S = 3.0
 """How long a program may take to end when it is asked to."""
@@ -172,7 +172,7 @@ def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[An
 
 
 def _stand_between(command: Sequence[str]) -> int:
-    remove_cpu_limit()
+    remove_limits()
     program = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the program, too
 
