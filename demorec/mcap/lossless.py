@@ -153,10 +153,6 @@ class LabelDecoder:
 
     def decode(self, data: bytes) -> NDArray[np.int32]:
         """As of `decode_labels`."""
-        return from_labels(self.labels(data))
-
-    def labels(self, data: bytes) -> NDArray[np.uint16]:
-        """(H, W) the labels as they are in the file, of which half of the time is saved; ValueError as of `decode`."""
         if len(data) < _PNG_HEAD.size:
             raise ValueError("a segmentation image that is cut off")
         signature, width, height, depth, color = _PNG_HEAD.unpack_from(data)
