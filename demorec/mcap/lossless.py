@@ -169,7 +169,7 @@ class LabelDecoder:
         if len(frames) != 1 or frames[0].format.name != "gray16be" or (frames[0].height, frames[0].width) != self._size:
             raise ValueError("a segmentation image that is damaged")
         lines = np.frombuffer(frames[0].planes[0], dtype=">u2").reshape(height, -1)  # FFmpeg may pad lines
-        return lines[:, :width].astype(np.uint16)
+        return from_labels(lines[:, :width].astype(np.uint16))
 
 
 def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:
