@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.robots.urdf import Urdf, UrdfJoint
@@ -85,14 +84,3 @@ def finest_lag(lags: Sequence[int], errors: Sequence[float]) -> float:
     low, middle, high = errors[best - 1 : best + 2]
     bend = low - 2 * middle + high
     return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0)
-
-
-def longest_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
-    """(length, start) of the longest run of True; (0, 0) when there is none."""
-    padded = np.concatenate([[False], np.asarray(flags, dtype=bool), [False]])
-    edges = np.flatnonzero(padded[1:] != padded[:-1])
-    if not len(edges):
-        return 0, 0
-    starts, lengths = edges[::2], edges[1::2] - edges[::2]
-    best = int(np.argmax(lengths))
-    return int(lengths[best]), int(starts[best])

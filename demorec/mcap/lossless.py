@@ -153,10 +153,6 @@ class LabelDecoder:
 
     def decode(self, data: bytes) -> NDArray[np.int32]:
         """As of `decode_labels`."""
-        return from_labels(self.labels(data))
-
-    def labels(self, data: bytes) -> NDArray[np.uint16]:
-        """(H, W) the labels as they are in the file, of which half of the time is saved; ValueError as of `decode`."""
         if len(data) < _PNG_HEAD.size:
             raise ValueError("a segmentation image that is cut off")
         signature, width, height, depth, color = _PNG_HEAD.unpack_from(data)
@@ -173,7 +169,7 @@ class LabelDecoder:
         if len(frames) != 1 or frames[0].format.name != "gray16be" or (frames[0].height, frames[0].width) != self._size:
             raise ValueError("a segmentation image that is damaged")
         lines = np.frombuffer(frames[0].planes[0], dtype=">u2").reshape(height, -1)  # FFmpeg may pad lines
-        return lines[:, :width].astype(np.uint16)
+        return from_labels(lines[:, :width].astype(np.uint16))
 
 
 def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:

@@ -198,12 +198,6 @@ def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequ
     return encode(CAMERA_INFO, header, *size, "plumb_bob", distortion, *matrices, 0, 0, whole_image)
 
 
-def read_camera_info(data: bytes) -> tuple[tuple[int, int], Array]:
-    """(height, width) in pixels and K (3, 3) of a `camera_info`."""
-    values, _ = decode(CAMERA_INFO, data)
-    return (values["height"], values["width"]), values["k"].astype(np.float64).reshape(3, 3)
-
-
 def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
     """tf2_msgs/TFMessage at time 0: (parent frame, child frame, parent_from_child) each."""
     return encode(

@@ -166,12 +166,6 @@ class Recording(EpisodeFile):
         held = np.maximum(np.maximum.accumulate(self._shown(camera)), 0)
         return self._images(camera, held[list(frames)].tolist())
 
-    def calibration(self, camera: str) -> tuple[tuple[int, int], NDArray[np.float64]]:
-        """(height, width) in pixels and K (3, 3) in a camera's calibration message, which other programs go by."""
-        for _, found in self._read(channels.camera_topic(camera, "camera_info"), messages.read_camera_info):
-            return found
-        raise RecordingError(f"The recording has no calibration of the camera {camera!r}: {self.path}")
-
     def to_pandas(self) -> pd.DataFrame:
         """All numbers as a table, one row a frame, bit-exact float64; the index is `frame_index`.
 

@@ -11,7 +11,6 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from demorec.core.errors import ConfigError
-from demorec.core.geometry import Array
 from demorec.core.plain import listed
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf, parse_xml, read_numbers
@@ -28,23 +27,19 @@ _AXES = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
 def check_masses(model: str) -> None:
     """Raise ConfigError unless the URDF of a robot, named as by `asset_path`, says what its links weigh."""
     try:
-        link_masses(asset_path(model).read_text())
+        require_masses(asset_path(model).read_text())
     except ValueError as error:
         raise ConfigError(f"The robot cannot be simulated, since {error}: {model}") from error
 
 
-def link_masses(text: str) -> dict[str, tuple[float, Array]]:
-    """Link -> mass, kg, and centre of mass in the link's frame (3,), metres, of every link that weighs something.
-
-    Raises:
-        ValueError: The text is no URDF; or a link moves without a mass and an inertia that a body can have.
-    """
+def require_masses(text: str) -> None:
+    """Raise ValueError unless the text is a URDF in which each moving link has a mass and inertia of a body."""
     urdf, links = Urdf.parse(text), {link.attrib["name"]: link for link in parse_xml(text).findall("link")}
     carrier = {urdf.root: urdf.root}
     """Link -> the link that it is rigidly one with, which hangs on a joint that moves, or the root."""
     for joint in urdf.depth_first():
         carrier[joint.child] = carrier[joint.parent] if joint.kind == "fixed" else joint.child
-    masses: dict[str, tuple[float, Array]] = {}
+    masses: dict[str, float] = {}
     wrong: dict[str, str] = {}
     for name, link in links.items():
         try:
@@ -52,7 +47,7 @@ def link_masses(text: str) -> dict[str, tuple[float, Array]]:
         except ValueError as error:
             wrong[name] = str(error)
     carried = dict.fromkeys(carrier.values(), 0.0)
-    for name, (mass, _) in masses.items():
+    for name, mass in masses.items():
         carried[carrier[name]] += mass
     for name, mass in carried.items():
         if not mass and name != urdf.root:
@@ -63,7 +58,6 @@ def link_masses(text: str) -> dict[str, tuple[float, Array]]:
             f"its URDF does not say what these links weigh: {listing}; give each the mass and inertia of a body (only "
             "frames without shapes on fixed joints need none)"
         )
-    return {name: found for name, found in masses.items() if found[0]}
 
 
 def with_massless_frames(text: str) -> str:
@@ -75,20 +69,18 @@ def with_massless_frames(text: str) -> str:
     return ET.tostring(robot, encoding="unicode") if without else text
 
 
-def _mass(link: ET.Element, *, must_be_whole: bool) -> tuple[float, Array]:
-    """Of one link; ValueError, with what is wrong, unless a body can have it and `must_be_whole` holds."""
+def _mass(link: ET.Element, *, must_be_whole: bool) -> float:
+    """kg of one link; ValueError, with what is wrong, unless a body can have it and `must_be_whole` holds."""
     inertial = link.find("inertial")
     if inertial is None:
         if must_be_whole and (link.find("visual") is not None or link.find("collision") is not None):
             raise ValueError("moves and has a shape, but no <inertial>")
-        return 0.0, np.zeros(3)
+        return 0.0
     parts = inertial.find("mass"), inertial.find("inertia")
     if parts[0] is None or parts[1] is None:
         raise ValueError("an <inertial> without mass or inertia")
     (mass,) = read_numbers(parts[0].get("value", ""), 1)
     inertia = np.array([read_numbers(parts[1].get(axis, ""), 1) for axis in _AXES]).reshape(3, 3)
-    origin = inertial.find("origin")
-    centre = np.array(read_numbers("0 0 0" if origin is None else origin.get("xyz", "0 0 0"), 3))
     if not 0 <= mass <= MAX_MASS:
         raise ValueError(f"a mass of {mass:g} kg")
     least, *_, most = np.linalg.eigvalsh(inertia)
@@ -96,4 +88,4 @@ def _mass(link: ET.Element, *, must_be_whole: bool) -> tuple[float, Array]:
         raise ValueError(f"an inertia whose smallest principal value is {least:.3g} kg m^2")
     if most > MAX_GYRATION**2 * max(mass, 1.0) or least < -1e-9:
         raise ValueError(f"principal inertias of {least:.3g} to {most:.3g} kg m^2 for {mass:g} kg")
-    return mass, centre
+    return mass

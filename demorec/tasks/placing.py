@@ -11,7 +11,6 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.conditions import DISTURBED, MAX_DISTURBANCE
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal, Scene
 from demorec.robots.robot import RobotSpec
@@ -24,7 +23,7 @@ from demorec.tasks.recovery import finish, put_back
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
 from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert
-from demorec.tasks.success import at_most, gripper_open_check, placement_checks
+from demorec.tasks.success import MAX_DISTURBANCE, at_most, gripper_open_check, placement_checks
 
 TALLEST = 0.07
 """Height, metres, above which no thing on the table reaches."""
@@ -153,7 +152,7 @@ def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
     moved = {goal.object for goal in world.scene.goals}
     return tuple(
         at_most(
-            f"{DISTURBED}:{body.name}",
+            f"disturbed:{body.name}",
             math.dist(world.pose(body.name).position[:2], body.world_from_body.position[:2]),
             MAX_DISTURBANCE,
             "m",

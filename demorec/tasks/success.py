@@ -7,10 +7,19 @@ import math
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.conditions import MAX_DISTANCE, MAX_HEIGHT_ERROR, MAX_SPEED, MAX_SPIN, MAX_TILT, MIN_OPENING
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal
 from demorec.sim.world import World
+
+MAX_DISTANCE = 0.02
+MAX_HEIGHT_ERROR = 0.004
+MAX_TILT = math.radians(5.0)
+MAX_SPEED = 0.01
+MAX_SPIN = 0.1
+MAX_DISTURBANCE = 0.02
+"""How far an object that is not to be moved may end from where it was, metres."""
+MIN_OPENING = 0.875
+"""Share of the gripper's full opening that counts as open."""
 
 
 def goal_pose(world: World, goal: Goal) -> Pose:

@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.conditions import MAX_TILT
 from demorec.episode.episode import SuccessCheck
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.render.cameras import FRONT, TOP, WORKSPACE, CameraPreset
@@ -23,7 +22,7 @@ from demorec.tasks.reach import Reach, within
 from demorec.tasks.sampling import Sampler, wording
 from demorec.tasks.script import Behaviour, Step, lasting, steady_width
 from demorec.tasks.skills import Expert
-from demorec.tasks.success import at_least, at_most, gripper_open_check, rest_checks, tilt_of
+from demorec.tasks.success import MAX_TILT, at_least, at_most, gripper_open_check, rest_checks, tilt_of
 
 ROBOT_SCALE = 1.3
 BASE = (1.0, 0.0, 0.1)

@@ -106,12 +106,12 @@ def test_progress_of_a_policy_and_files_of_other_programs(tmp_path: Path, capsys
     export(run, source)
     index = np.arange(18)
     counters = {name: data_table(source).column(name) for name in ("index", "episode_index", "frame_index")}
-    pq.write_table(pa.table({**counters, "progress_sparse": index / 18}), source / "sarm_progress.parquet")
+    pq.write_table(pa.table({**counters, "progress_dense": index / 18}), source / "sarm_progress.parquet")
     (source / "meta/modality.json").write_text("{}")
     edit("reorder", source, "--order", "1,2,0", "--out", tmp_path / "r")
     assert "taken over: meta/modality.json (of a kind that" in capsys.readouterr().out
     edit("trim", tmp_path / "r", "--head", 1, "--out", tmp_path / "t")
     assert pq.read_table(tmp_path / "t/sarm_progress.parquet").to_pydict() == {
         **{name: data_table(tmp_path / "t").column(name).to_pylist() for name in counters},
-        "progress_sparse": [number / 18 for number in (*range(7, 13), *range(14, 18), *range(1, 6))],
+        "progress_dense": [number / 18 for number in (*range(7, 13), *range(14, 18), *range(1, 6))],
     }

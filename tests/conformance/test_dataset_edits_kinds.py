@@ -99,19 +99,6 @@ def test_in_another_order_and_in_parts(made: tuple[Path, Any], tmp_path: Path) -
     assert all(same(found[len(was)], was) for was in before if len(was) != 14)
 
 
-def test_with_torchcodec(made: tuple[Path, Any], tmp_path: Path) -> None:
-    try:
-        import torchcodec.decoders  # noqa: F401
-    except (ImportError, RuntimeError, OSError) as error:
-        pytest.skip(f"torchcodec does not load here: {str(error).splitlines()[0]}")
-    root, _ = made
-    edit("trim", root, "--head", 3, "--tail", 2, "--out", tmp_path / "t")
-    edit("reorder", tmp_path / "t", "--order", "5,0,3,1,4,2", "--out", tmp_path / "r")
-    before, found = items(root, "torchcodec"), items(tmp_path / "r", "torchcodec")
-    for episode, number in zip(found, (5, 0, 3, 1, 4, 2), strict=True):
-        assert same(episode, before[number][3:-2], but=("timestamp",))
-
-
 @pytest.mark.parametrize("made", ["all types"], indirect=True)
 def test_statistics_of_arrays_are_those_of_their_last_dimension(made: tuple[Path, Any], tmp_path: Path) -> None:
     """As LeRobot has them, whose own dataset is the model; with depth, whose mean is that of what LeRobot decodes."""

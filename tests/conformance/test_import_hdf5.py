@@ -23,14 +23,13 @@ from support.hdf5 import (
     write_robomimic,
 )
 
-from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error
+from demorec.datasets.hdf5.foreign import Hdf5Error
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
 from demorec.sources.frames_writer import FramesImport, Image
 from demorec.sources.hdf5_arrays import StoredCamera
-from demorec.sources.hdf5_import import episode_places, import_hdf5
+from demorec.sources.hdf5_import import import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
-from demorec.sources.mapping import Episodes
 
 DEMOS = ("demo_0", "demo_1", "demo_10")
 
@@ -413,16 +412,6 @@ def test_an_outcome_is_a_boolean_or_a_number(
         for name in DEMOS:
             opened[f"data/{name}"].attrs["outcome"] = value
     _refused(file, mapping, f"says outcome = {shown}, allowed are booleans and numbers", capsys)
-
-
-def test_episodes_are_in_the_order_of_their_numbers_however_long_these_are(tmp_path: Path) -> None:
-    names = ["demo_2", "demo_010", "demo_" + "9" * 5000, "demo_9"]
-    with h5py.File(tmp_path / "many.hdf5", "w") as file:
-        for name in names:
-            file[f"data/{name}/actions"] = np.zeros((2, 1))
-    with ForeignFile(tmp_path / "many.hdf5") as opened:
-        places = episode_places(opened, Episodes(group="data"))
-    assert [place.removeprefix("data/") for place in places] == ["demo_2", "demo_9", "demo_010", names[2]]
 
 
 def test_a_mask_leaves_links_out(tmp_path: Path) -> None:

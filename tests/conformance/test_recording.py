@@ -395,19 +395,3 @@ def world_from(frame: str, tree: dict[str, tuple[str, np.ndarray[Any, Any]]]) ->
         frame, parent_from_child = tree[frame]
         result = parent_from_child @ result
     return result
-
-
-def test_segment_names_are_pybullets_links() -> None:
-    pybullet = pytest.importorskip("pybullet")
-    from demorec.mcap.lossless import segment_names
-
-    info, _, _ = make_episode(num_frames=1)
-    names = dict(segment_names(info))
-    client = pybullet.connect(pybullet.DIRECT)
-    try:
-        body = pybullet.loadURDF(str(asset_path(info.robot.urdf)), physicsClientId=client)
-        for index in range(pybullet.getNumJoints(body, physicsClientId=client)):
-            link = pybullet.getJointInfo(body, index, physicsClientId=client)[12].decode()
-            assert names[2 + ((index + 1) << 24)] == f"panda/{link}"
-    finally:
-        pybullet.disconnect(client)

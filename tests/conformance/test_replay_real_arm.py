@@ -14,10 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 from support.check import simulate, simulate_run
 from support.commands import exit_code
-from support.export import data_table, info
-from support.lerobot_tools import Command, run_commands
 
-from demorec.robots.motors import CALIBRATIONS, MotorUnits
+from demorec.robots.motors import CALIBRATIONS
 from demorec.robots.so101 import SO101
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
@@ -153,38 +151,3 @@ def test_the_jaw_turns_as_far_as_a_real_one(dataset: Path, tmp_path: Path, capsy
     for tracking in replayed(capsys, tmp_path / "d", *DEGREES):
         assert tracking["gripper"][0] < 1e-3
     assert SO101.gripper.width(np.array([1.74533])) > 2 * SO101.gripper.open_width
-
-
-@pytest.fixture(scope="module")
-def driven(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What LeRobot recorded in either unit, through a stub of the bus, whose servos are at once where they are sent."""
-    folder = tmp_path_factory.mktemp("driven")
-    state = np.array(data_table(dataset)["observation.state"].to_pylist())[:40]
-    names = tuple(info(dataset)["features"]["observation.state"]["names"])
-    share = np.array([m["range_max"] - m["range_min"] for m in json.loads(CALIBRATION.read_text()).values()])
-    of_range = state * np.append(4095 / 360 * 200 / share[:5], 1.0)
-    commands = []
-    for units, values in (("degrees", state), ("range_m100_100", of_range)):
-        script = folder / f"{units}.json"
-        script.write_text(json.dumps({"names": names, "rows": values.tolist()}))
-        arm = ["--robot.type=so101_follower", "--robot.port=none", "--robot.id=so101_urdf"]
-        arm += [f"--robot.calibration_dir={CALIBRATIONS}", f"--robot.use_degrees={units == 'degrees'}".lower()]
-        camera = "--robot.cameras={front: {type: still, width: 96, height: 96, fps: 30}}"
-        flags = ["repo_id=local/real", f"root={folder / units}", "no_stamp=true", "num_episodes=1", "episode_time_s=1"]
-        flags += ["fps=30", "single_task=Move.", "push_to_hub=false", "rgb_encoder.vcodec=h264"]
-        teleop = ["--teleop.type=scripted", f"--teleop.script={script}"]
-        record = [*(f"--dataset.{flag}" for flag in flags), "--play_sounds=false"]
-        stub = {"STUB_CALIBRATION": str(CALIBRATION)}
-        commands.append(Command(command="lerobot_record", args=[*arm, camera, *teleop, *record], env=stub))
-    run_commands(commands, folder)
-    return folder
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("units", ["degrees", "range_m100_100"])
-def test_what_lerobot_recorded_of_its_own_driver(
-    driven: Path, units: MotorUnits, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tracking,) = replayed(capsys, driven / units, "--robot", "so101", "--motor-units", units)
-    # The stub's servos jump: the simulated ones are a control step behind them.
-    assert max(tracking[joint][0] for joint in ARM) < 2.0

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.docs import ROOT
-from support.export import export, make_run
 
 from demorec.core.errors import MissingDependencyError
 from demorec.learn.evaluate.policy import Policy
@@ -37,29 +34,6 @@ def test_lerobots_parser_takes_the_configs(path: Path, monkeypatch: pytest.Monke
     assert config.batch_size == json.loads(path.read_text())["batch_size"]
     assert config.policy.push_to_hub is False
     assert config.dataset.video_backend == "pyav"
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_the_faster_reader_trains_the_same_policy(tmp_path: Path) -> None:
-    """Twelve updates by lerobot-train and by the plug-in's command, without images: the same losses and weights."""
-    export(make_run(tmp_path / "run", (20, 24), width=64, height=64), tmp_path / "d", privileged=True)
-    results = []
-    for program in ("lerobot-train", "lerobot-train-fast"):
-        out = tmp_path / program
-        done = subprocess.run(
-            [Path(sys.executable).parent / program,
-             f"--config_path={ROOT / 'examples' / 'act_numbers.json'}", f"--dataset.root={tmp_path / 'd'}",
-             f"--output_dir={out}", "--batch_size=4", "--steps=12", "--log_freq=1"],
-            check=False, capture_output=True, text=True, timeout=280,
-        )  # fmt: skip
-        text = done.stdout + done.stderr
-        assert done.returncode == 0, text[-3000:]
-        losses = re.findall(r"step:(\S+) .*?loss:(\S+) grdn:(\S+)", text)
-        assert len(losses) == 12
-        weights = out / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
-        results.append((losses, weights.read_bytes()))
-    assert results[0] == results[1]
 
 
 def test_a_policy_of_an_unknown_type_names_its_package(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

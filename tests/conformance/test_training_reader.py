@@ -49,14 +49,6 @@ def assert_same(fast: Any, slow: Any) -> None:
             assert_same_item(item, slow[row])
 
 
-@pytest.mark.parametrize("as_bytes", [True, False])
-def test_every_window_is_equal(as_bytes: bool, root: Path) -> None:
-    _, plain = pair(root)
-    keys = [key for key in plain.meta.features if key.startswith("observation.")]
-    windows = {**{key: [-2 / 30, 0.0] for key in keys}, "action": [k / 30 for k in range(16)]}
-    assert_same(*pair(root, delta_timestamps=windows, return_uint8=as_bytes))
-
-
 def test_language_is_equal(tmp_path: Path) -> None:
     root = tmp_path / "spoken"
     export(make_run(tmp_path / "run", (5, 6)), root, language=())
@@ -77,39 +69,6 @@ def test_language_is_equal(tmp_path: Path) -> None:
     assert len(fast[3]["language_persistent"]) > 3
     assert list(fast[3]["language_persistent"][0])[3] == "timestamp"
     assert fast[3]["language_persistent"][0] is not fast[4]["language_persistent"][0]
-
-
-def test_rows_that_say_nearly_the_same_are_told_apart(tmp_path: Path) -> None:
-    """What stands in many rows is read once, whoever wrote the dataset: only where it is the same to the bit."""
-    root = tmp_path / "spoken"
-    export(make_run(tmp_path / "run", (6, 6)), root, language=())
-    path = next((root / "data").glob("*/*.parquet"))
-    table = pq.read_table(path)
-    column = table.column("language_persistent")
-    rows = column.to_pylist()
-    rows[2][1]["content"] = "something else"
-    rows[3][0]["timestamp"] = -0.0
-    rows[5] = []
-    rows[8] = rows[8][1:]
-    rows[9][2]["content"] = None
-    own = pa.array(
-        [[{**said, "tool_calls": None} for said in row] for row in rows], pa.list_(_plain_state(column.type))
-    )
-    pq.write_table(table.set_column(table.column_names.index("language_persistent"), "language_persistent", own), path)
-    fast, slow = pair(root)
-    assert_same(fast, slow)
-    assert [len({str(fast[row]["language_persistent"]) for row in rows}) for rows in ((0, 1, 2, 3), (7, 8, 9))] == [
-        3,
-        3,
-    ]
-    fast[6]["language_persistent"][0]["content"] = "changed by somebody"
-    assert_same(fast, slow)
-
-
-def _plain_state(kind: pa.ListType) -> pa.StructType:
-    """Statements with calls as text: pyarrow makes no JSON of Python's values."""
-    calls = pa.field("tool_calls", pa.list_(pa.string()))
-    return pa.struct([calls if field.name == "tool_calls" else field for field in kind.value_type])
 
 
 def test_the_example_of_the_docs_runs(root: Path) -> None:

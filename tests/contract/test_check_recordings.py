@@ -275,6 +275,17 @@ def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
     assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "images_decode") == "fail"
 
 
+def test_a_depth_image_that_is_cut_off(tmp_path: Path) -> None:
+    path = simulate(tmp_path / "good.mcap", fps=10, cameras=("front",), width=32, height=32, depth=True)
+    topic = channels.camera_topic("front", "depth")
+    at = 2 * SECOND
+    spoilt = rewrite_messages(
+        path, tmp_path / "s.mcap", lambda m: [(*m[:2], m[2][:-40], m[3])] if (m[0], m[3]) == (topic, at) else [m]
+    )
+    assert level_of(path, "images_decode") == "pass"
+    assert level_of(spoilt, "images_decode") == "fail"
+
+
 # ------------------------------------------------------------------------------------------------- the command
 
 

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from support.export import export, make_run
 
 from demorec.core.errors import ConfigError
@@ -74,15 +72,6 @@ def round_trips(dataset: Path, at: Path, order: list[int], seed: int, share: flo
 
 def test_one_round_trip(dataset: Path, tmp_path: Path) -> None:
     round_trips(dataset, tmp_path, [3, 0, 4, 2, 1], seed=1, share=0.4)
-
-
-@pytest.mark.long
-@settings(max_examples=4, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.permutations(range(len(LENGTHS))), st.integers(0, 99), st.floats(0.1, 0.9))
-def test_round_trips(
-    dataset: Path, tmp_path_factory: pytest.TempPathFactory, order: list[int], seed: int, share: float
-) -> None:
-    round_trips(dataset, tmp_path_factory.mktemp("trips"), order, seed, share)
 
 
 def test_differences_of_boxes_are_named(dataset: Path, tmp_path: Path) -> None:

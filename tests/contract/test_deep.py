@@ -181,6 +181,19 @@ def test_a_topic_that_no_recording_has(blind: Path, tmp_path: Path, simulators: 
     assert ("/mine", "messages", ()) in found(deep_check(spoilt, simulators))
 
 
+@pytest.mark.parametrize(
+    "edit",
+    [
+        pytest.param(lambda m: () if m[0] == "/ee_pose" and m[3] == 2 * 10**9 else (m,), id="one less"),
+        pytest.param(lambda m: () if m[0] == "/tf_static" else (m,), id="none"),
+        pytest.param(lambda m: (m, m) if m[0] == "/ee_pose" and m[3] == 2 * 10**9 else (m,), id="one twice"),
+    ],
+)
+def test_other_messages_of_a_topic(edit: Any, blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
+    spoilt = rewrite_messages(blind, tmp_path / "spoilt.mcap", edit)
+    assert deep_check(spoilt, simulators).level == "fail"
+
+
 # ----------------------------------------------------------------------------------------------------- the metadata
 
 

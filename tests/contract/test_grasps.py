@@ -54,12 +54,6 @@ def test_fingers_stand_as_far_apart_as_the_cube_is_wide(robot: str, side: float,
     assert smallest_opening(with_cube(made, side=side, mass=mass, friction=friction)) > side - 2 * SINKING
 
 
-def test_fingers_stay_outside_of_cubes_that_are_sorted() -> None:
-    made = episode(10, task="sort_by_color", seed=4)
-    side = min(min(body.shape.size) for body in made.info.scene.movable)
-    assert smallest_opening(made) > side - 2 * SINKING
-
-
 def test_an_episode_that_crushes_something_is_a_failure_and_the_next_attempt_does_better() -> None:
     """Here the hand brushes the tower on its way down to the third cube."""
     options: dict[str, Any] = {"task": "stack_three", "robot": "iiwa", "variation": "full", "seed": 71013}

@@ -24,7 +24,7 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
 from demorec.episode.episode import Columns
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.sensed import SENSED, ObservationRows, Sensed
+from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
@@ -112,17 +112,6 @@ def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> 
         command = np.append(columns.command_joint_target[t], columns.command_gripper[t])
         observation, *_, found = env.step(command)
         assert np.array_equal(found["command"].astype(np.float32), exported["command"][t])
-    env.close()
-
-
-def test_a_new_sensed_feature_needs_no_change_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    first = Sensed(quantity="joint_effort", meaning="effort of the first joint (N m)", names=lambda _: ("x",), plots=())
-    monkeypatch.setattr("demorec.episode.sensed.SENSED", {**SENSED, "observation.first": first})
-    monkeypatch.setattr("demorec.episode.features.SENSED", {**SENSED, "observation.first": first})
-    monkeypatch.setattr("demorec.gym_env.SENSED", {**SENSED, "observation.first": first})
-    env = make(sensed=("observation.first",))
-    observation, _ = env.reset(seed=0)
-    assert observation["first"] == np.float32(env.situation.observation.joint_effort[0])
     env.close()
 
 

@@ -32,7 +32,7 @@ class TestEveryTask(TaskContract):
     def _row(cls, task: str) -> None:
         cls.task = task
 
-    # `test_check_clean.py` and `test_replay.py` have quick ones.
+    # `test_check_recordings.py` and `test_replay.py` have quick ones.
     @pytest.mark.slow
     def test_its_recording_passes_every_check_and_replays_to_the_bit(self, tmp_path: Path) -> None:
         super().test_its_recording_passes_every_check_and_replays_to_the_bit(tmp_path)

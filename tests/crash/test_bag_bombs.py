@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 from PIL import Image
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -59,27 +58,6 @@ def two_fields_a_type(folder: Path) -> Path:
     return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2msg", schema, "cdr", [b"\x00\x01\x00\x00" + bytes(5000)] * 2)
 
 
-def a_definition_that_computes(folder: Path) -> Path:
-    text = "module a { module msg { const long X = 1 << 60000000000; struct T0 { double x; }; }; };"
-    return _mcap(folder / "bag.mcap", "a/msg/T0", "ros2idl", text.encode(), "cdr", [b"\x00\x01\x00\x00"])
-
-
-def _proto() -> bytes:
-    """A message with a list of messages of 3,000 fields."""
-    file = descriptor_pb2.FileDescriptorProto(name="a.proto", package="a", syntax="proto3")
-    file.message_type.add(name="Top").field.add(name="items", number=1, type=11, label=3, type_name=".a.Item")
-    item = file.message_type.add(name="Item")
-    for number in range(3000):
-        item.field.add(name=f"f{number}", number=number + 1, type=9, label=1)
-    schema: bytes = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
-    return schema
-
-
-def empty_elements_of_many_fields(folder: Path) -> Path:
-    """20,000 elements of two bytes, each with 3,000 fields."""
-    return _mcap(folder / "bag.mcap", "a.Top", "protobuf", _proto(), "protobuf", [b"\x0a\x00" * 20_000] * 3)
-
-
 def lists_of_nothing(folder: Path) -> Path:
     """JSON of 60 MB, which compresses to some kilobytes: 20 million lists."""
     text = b'{"position": [' + b"[]," * 20_000_000 + b"[]]}"
@@ -112,14 +90,6 @@ def _database(folder: Path, script: str) -> Path:
 _MANY = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 300)"
 
 
-def columns_that_compute(folder: Path) -> Path:
-    return _database(
-        folder,
-        f"""DROP TABLE messages; CREATE TABLE messages (k, topic_id AS (1), timestamp AS (k), rowid AS (1000 - k),
-        data AS (zeroblob(100000000))); {_MANY} INSERT INTO messages (k) SELECT k FROM n;""",
-    )
-
-
 def a_view_of_messages(folder: Path) -> Path:
     return _database(
         folder,
@@ -134,11 +104,6 @@ def _folder(folder: Path, metadata: Callable[[str], str]) -> Path:
     (bag / "metadata.yaml").write_text(metadata(text))
     assert (bag / "metadata.yaml").read_text() != text
     return bag
-
-
-def merge_keys(folder: Path) -> Path:
-    lines = ["a0: &a0 {x: 1}"] + [f"a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}], y{k}: 1}}" for k in range(1, 40)]
-    return _folder(folder, lambda text: "\n".join(lines) + "\n" + text)
 
 
 def images_of_nothing(folder: Path) -> Path:
@@ -168,10 +133,13 @@ def a_chunk_of_zeros(folder: Path) -> Path:
 
 
 BAGS = (
-    two_fields_a_type, a_definition_that_computes, empty_elements_of_many_fields, lists_of_nothing,
-    messages_that_claim_64_megabytes, columns_that_compute, a_view_of_messages, images_of_nothing, a_chunk_of_zeros,
-    pytest.param(merge_keys, marks=pytest.mark.long),
-)  # fmt: skip
+    two_fields_a_type,
+    lists_of_nothing,
+    messages_that_claim_64_megabytes,
+    a_view_of_messages,
+    images_of_nothing,
+    a_chunk_of_zeros,
+)
 
 
 def _size(bag: Path) -> int:
@@ -243,22 +211,6 @@ def test_a_link_out_of_the_bag_is_not_followed(tmp_path: Path, commands: Limited
     file.unlink()
     file.symlink_to(beside.name)
     assert commands.run("import", "--suggest", bag).code == 0
-
-
-def test_fields_that_are_called_like_methods(tmp_path: Path, commands: LimitedCommands) -> None:
-    names = ("DESCRIPTOR", "FromString", "ParseFromString", "HasField", "position")
-    file = descriptor_pb2.FileDescriptorProto(name="a.proto", package="a", syntax="proto3")
-    top = file.message_type.add(name="Top")
-    for number, name in enumerate(names, 1):
-        top.field.add(name=name, number=number, type=1, label=3)
-    top.nested_type.add(name="SerializeToString")
-    schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
-    data = b"".join(bytes([number << 3 | 2, 16]) + np.array([number, 0.5]).tobytes() for number in range(1, 6))
-    bag = _mcap(tmp_path / "bag.mcap", "a.Top", "protobuf", schema, "protobuf", [data] * 9)
-    told = commands.run("import", "--suggest", bag)
-    assert told.code == 0, told.text
-    assert "DESCRIPTOR: [1, 0.5]; FromString: [2, 0.5]" in told.text
-    assert "position: [5, 0.5]" in told.text
 
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])

@@ -6,15 +6,12 @@ import io
 import json
 import random
 import shutil
-import sqlite3
 import struct
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from google.protobuf import descriptor_pb2
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
@@ -22,7 +19,6 @@ from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
 from support.fuzz import changed_bytes
 
-_NAMES = ("x", "name", "position", "header", "data", "DESCRIPTOR", "FromString", "HasField", "__class__", "encoding")
 _NUMBERS: tuple[Any, ...] = (
     0, -1, 1, 2**31, 2**63 - 1, 2**63, 10**19, 1e30, 1e300, float("inf"), float("-inf"), float("nan"), None, True,
     "text", "", "12", [], [1], {}, {"a": 1}, [[1.0], []], ["a", None], "\ud800", "\x00\x1b[2J\u202e", 0.5,
@@ -94,8 +90,8 @@ class FuzzedBags:
         """What it is, and the arguments of `demorec`."""
         chance = random.Random(number)
         kinds: tuple[Callable[[random.Random, Path], tuple[Path, str]], ...] = (
-            self._bytes, self._ros1_bytes, self._database_bytes, self._database, self._yaml, self._toml,
-            self._json, self._json, self._definition, self._protobuf, self._image, self._image,
+            self._bytes, self._ros1_bytes, self._database_bytes, self._yaml, self._toml,
+            self._json, self._json, self._image, self._image,
         )  # fmt: skip
         make = kinds[number % len(kinds)]
         bag, mapping = make(chance, self.folder)
@@ -126,49 +122,6 @@ class FuzzedBags:
         data = self._db3 if chance.random() < 0.7 else self._db3[: int(len(self._db3) * chance.random())]
         path = folder / "bytes.db3"
         path.write_bytes(b"SQLite format 3\0" + changed_bytes(data, chance)[16:])
-        return path, bag_mappings.SO101
-
-    def _database(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
-        path = folder / "odd.db3"
-        path.write_bytes(self._db3)
-        values = ("NULL", "x'00ff'", "'text'", "1e300", "-1", "9223372036854775807", "''", "zeroblob(100000)")
-        table, column = chance.choice(
-            (("topics", "id"), ("topics", "name"), ("topics", "type"), ("topics", "serialization_format"),
-             ("messages", "topic_id"), ("messages", "timestamp"), ("messages", "data"))
-        )  # fmt: skip
-        value = chance.choice(values)
-        with closing(sqlite3.connect(path)) as database, database:
-            match chance.randrange(5):
-                case 0:
-                    database.execute(f"CREATE TABLE changed AS SELECT * FROM {table}")
-                    database.execute(f"DROP TABLE {table}")
-                    database.execute(f"ALTER TABLE changed RENAME TO {table}")
-                    database.execute(f"UPDATE {table} SET {column} = {value} WHERE rowid % 3 = 0")
-                case 1:
-                    database.execute(f"ALTER TABLE {table} RENAME TO other")
-                    database.execute(f"CREATE VIEW {table} AS SELECT *, randomblob(100000000) AS more FROM other")
-                case 2:
-                    columns = {
-                        "topics": "id, name, type, serialization_format",
-                        "messages": "topic_id, timestamp, data",
-                    }
-                    told = columns[table].replace(column, f"{column} AS (zeroblob(100000000)) VIRTUAL")
-                    database.execute(f"DROP TABLE {table}")
-                    database.execute(f"CREATE TABLE {table} (k, {told})")
-                    for _ in range(30):
-                        database.execute(f"INSERT INTO {table} (k) VALUES (1)")
-                case 3:
-                    text = chance.choice(("NULL", "x'ff'", "'float64 x'", "'a/B c'", "5"))
-                    database.execute("DROP TABLE IF EXISTS message_definitions")
-                    database.execute(
-                        "CREATE TABLE message_definitions (topic_type, encoding, encoded_message_definition)"
-                    )
-                    database.execute(
-                        f"INSERT INTO message_definitions SELECT type, 'ros2msg', {text} FROM topics LIMIT 2"
-                    )
-                case _:
-                    database.execute(f"DROP TABLE {table}")
-                    database.execute(f"CREATE TABLE {table} (rowid, x)")
         return path, bag_mappings.SO101
 
     def _yaml(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
@@ -250,65 +203,6 @@ class FuzzedBags:
                     values["header"]["stamp"] = dict(stamp)  # type: ignore[index]
                     text = json.dumps(change(name, values))
                     writer.add_message(channels[name], moment, text.encode(errors="replace"), moment)
-            writer.finish()
-        return path
-
-    def _definition(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
-        """A definition of random types, and random bytes that are said to be of it."""
-        scalar = ("float64", "uint8", "string", "int32", "bool", "wstring", "char", "time", "duration", "float32")
-        count = chance.choice((1, 2, 5, 31, 40))
-        array = ("", "", "[]", "[0]", "[3]", "[1000]", "[<=5]", "[99999999999]", "[-1]")
-        parts = []
-        for number in range(count):
-            fields = [
-                f"{chance.choice(scalar) if chance.random() < 0.5 else f'a/T{min(count, number + 1)}'}"
-                f"{chance.choice(array)} {chance.choice((*_NAMES, f'f{number}'))}"
-                for _ in range(chance.choice((0, 1, 2, 2, 20)))
-            ]
-            parts.append(f"{'=' * 80}\nMSG: a/T{number}\n" * (number > 0) + "\n".join(fields) + "\n")
-        text = "".join(parts).encode()
-        if chance.random() < 0.2:
-            text = changed_bytes(text, chance)
-        encoding, of_message = chance.choice((("ros2msg", "cdr"), ("ros1msg", "ros1"), ("ros2idl", "cdr")))
-        if encoding == "ros2idl":
-            inner = "".join(f"{chance.choice(('double', 'string', 'sequence<T>'))} f{k};" for k in range(count))
-            text = f"module a {{ module msg {{ struct T0 {{ {inner} }}; }}; }};".encode()
-        size = chance.choice((0, 4, 100, 50_000))
-        data = b"\x00\x01\x00\x00" + (bytes(size) if chance.random() < 0.5 else chance.randbytes(size))
-        return self._one_topic(folder, "a/T0", encoding, text, of_message, [data] * 5), MAPPING
-
-    def _protobuf(self, chance: random.Random, folder: Path) -> tuple[Path, str]:
-        file = descriptor_pb2.FileDescriptorProto(name="a.proto", package="a", syntax="proto3")
-        top = file.message_type.add(name="Top")
-        other = file.message_type.add(name=chance.choice(("Other", "DESCRIPTOR", "FromString")))
-        for kind in (top, other):
-            for number in range(chance.choice((1, 5, 3000 if kind is other else 5))):
-                name = _NAMES[number] if number < len(_NAMES) and chance.random() < 0.5 else f"f{number}"
-                is_message = chance.random() < 0.4
-                kind.field.add(
-                    name=name, number=number + 1, type=11 if is_message else chance.choice((1, 2, 3, 8, 9, 12)),
-                    label=chance.choice((1, 3)), type_name=f".a.{other.name}" if is_message else None,
-                )  # fmt: skip
-        schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
-        if chance.random() < 0.2:
-            schema = changed_bytes(schema, chance)
-        data = chance.choice(
-            (b"", b"\x0a\x00" * chance.choice((1, 20_000)), chance.randbytes(50), b"\x0a\x02\x0a\x00" * 9)
-        )
-        return self._one_topic(folder, "a.Top", "protobuf", schema, "protobuf", [data] * 5), MAPPING
-
-    def _one_topic(
-        self, folder: Path, name: str, encoding: str, schema: bytes, of_message: str, messages: list[bytes]
-    ) -> Path:
-        path = folder / "topic.mcap"
-        with path.open("wb") as file:
-            writer = Writer(file, compression=CompressionType.ZSTD)
-            writer.start()
-            number = writer.register_schema(name, encoding, schema)
-            for topic in ("/joints", "/image", "/info"):
-                channel = writer.register_channel(topic, of_message, number)
-                for at, data in enumerate(messages):
-                    writer.add_message(channel, bags.EPOCH_NS + at * 10**7, data, 0)
             writer.finish()
         return path
 

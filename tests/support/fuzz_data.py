@@ -48,13 +48,6 @@ _CELLS: tuple[Any, ...] = (
     None, 0, 1, -1, 2**40, 2**62, 0.5, 1e30, float("nan"), float("inf"), "", "x", "x" * 10_000, True, [], [1.0], [None],
     ["x"], b"\x89PNG", {"bytes": b"x", "path": None}, {"bytes": None, "path": "/etc/passwd"}, [[1]], [{"role": "x"}],
 )  # fmt: skip
-_TOML = (
-    "0", "-1", "1", "9" * 30, "9" * 5000, "1e300", "inf", "nan", "true", '""', '"\\u0000"', '"a\\u0000b"', "[]", "[[]]",
-    "[[0, 1]]", "{}", "{a = 1}", "2001-99-99", "2001-01-01", '"data"', '"/"', '"../x"', '"obs"',
-    '"' + "a/" * 3000 + '"',
-    '["a", "a"]', "[0, 0]", "[99999]", "[-1]", '"\\u202e<script>"', '"action"', '"degree"', '"percent"', "[[1, 0]]",
-    '"' + "x" * 70_000 + '"', "'''\n'''", "[[-1e300, 1e300]]",
-)  # fmt: skip
 _MAPPING = """
 [robot]
 name = "panda"
@@ -108,7 +101,7 @@ class FuzzedData:
         """What was changed, and the arguments of the command that meets it."""
         chance = random.Random(number)
         made: Callable[[random.Random], Case] = chance.choice(
-            (self._dataset,) * 3 + (self._hdf5, self._recording) * 2 + (self._mapping, self._run, self._policy)
+            (self._dataset,) * 3 + (self._hdf5, self._recording) * 2 + (self._run, self._policy)
         )
         return made(chance)
 
@@ -141,23 +134,6 @@ class FuzzedData:
         mapping.write_text(_MAPPING)
         rest = ["--suggest"] if chance.random() < 0.4 else ["--mapping", mapping, "--out", self.folder / "out"]
         return f"HDF5 {what}", list(map(str, ["import", "hdf5", path, *rest]))
-
-    def _mapping(self, chance: random.Random) -> Case:
-        lines = _MAPPING.strip().splitlines()
-        for _ in range(chance.choice((1, 1, 2, 3))):
-            at = chance.randrange(len(lines))
-            key = lines[at].partition("=")[0] if "=" in lines[at] else "x "
-            lines[at] = chance.choice(
-                (f"{key}= {chance.choice(_TOML)}", "", lines[at] * 2, chance.choice(lines), lines[at][: len(key)])
-            )
-        path = self.folder / "mapping.toml"
-        text = "\n".join(lines)
-        path.write_bytes(changed_bytes(text.encode(), chance) if chance.random() < 0.2 else text.encode())
-        return f"mapping {text[:200]!r}", list(
-            map(
-                str, ["import", "hdf5", self.folder / "robomimic.hdf5", "--mapping", path, "--out", self.folder / "out"]
-            )
-        )
 
     def _run(self, chance: random.Random) -> Case:
         root = self.folder / "changed"

@@ -184,7 +184,6 @@ def trajectory_part(topic: str, names: Sequence[str]) -> Part:
 
 
 UR = tuple(f"{name}_joint" for name in ("shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "shoulder_pan"))
-FR3 = tuple(f"fr3_joint{k}" for k in range(1, 8))
 OMX = ("joint1", "joint2", "joint3", "joint4", "joint5", "gripper_joint_1")
 SIX = tuple(f"joint_{k}" for k in range(1, 7))
 
@@ -203,10 +202,6 @@ def _two_publishers() -> Sequence[Topic]:
 
 def _mcap(notes: Notes, path: Path) -> Path:
     return bags.write_mcap(notes, path / "bag.mcap")
-
-
-def _ros1(notes: Notes, path: Path) -> Path:
-    return bags.write_ros1(notes, path / "bag.bag")
 
 
 def _foxglove(notes: Notes, path: Path) -> Path:
@@ -270,14 +265,6 @@ LAYOUTS: dict[str, Layout] = {
         ),
         write=_mcap,
     ),
-    "Isaac": Layout(
-        topics=(joints("/joint_states", FR3, rate=60), joints("/joint_command", FR3, shift=0.1, rate=60),
-                raw_camera("/rgb")),
-        state=(joint_part("/joint_states", FR3),),
-        action=(joint_part("/joint_command", FR3),),
-        clock_ns=70_000_000,
-        write=_sqlite,
-    ),
     "RealSense": Layout(
         topics=(joints("/joint_states", SIX), raw_camera("/camera/camera/color/image_raw"),
                 depth_camera("/camera/camera/aligned_depth_to_color/image_raw"),
@@ -285,25 +272,11 @@ LAYOUTS: dict[str, Layout] = {
         state=(joint_part("/joint_states", SIX),),
         cameras=2,
     ),
-    "ROS 1": Layout(
-        topics=(joints("/joint_states", SIX), joints("/joint_states_desired", SIX, shift=0.1),
-                camera("/usb_cam/image_raw/compressed")),
-        state=(joint_part("/joint_states", SIX),),
-        action=(joint_part("/joint_states_desired", SIX),),
-        write=_ros1,
-    ),
     "two publishers": Layout(
         topics=(*_two_publishers(), joints("/lead_arm/joint_states", UR, shift=0.1),
                 camera("/camera/image_raw/compressed")),
         state=(joint_part("/joint_states", UR), joint_part("/joint_states", ("robotiq_85_left_knuckle_joint",))),
         action=(joint_part("/lead_arm/joint_states", UR),),
-    ),
-    "leader and follower": Layout(
-        topics=(joints("/follower/joint_states", OMX), joints("/leader/joint_states", OMX, shift=0.1),
-                joints("/follower/joint_command", OMX, shift=0.1), camera("/cam_wrist/image_raw/compressed")),
-        state=(joint_part("/follower/joint_states", OMX),),
-        action=(joint_part("/leader/joint_states", OMX),),
-        write=_sqlite,
     ),
     "Foxglove's own messages": Layout(
         topics=(*_two_publishers(), joints("/teleop/joint_states", UR, shift=0.1), camera("/camera/front")),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -20,8 +19,7 @@ from support.export import data_table, export
 from support.external import TOP, URDF, Episode, make_external, write_external
 
 from demorec.core.errors import MissingDependencyError
-from demorec.core.plain import digest, from_json, to_json
-from demorec.datasets.lerobot.robots import RobotRecord, portable_urdf, read_robot
+from demorec.datasets.lerobot.robots import portable_urdf, read_robot
 from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
 from demorec.view import bodies as played_robot
@@ -163,29 +161,6 @@ def test_a_description_that_changed_is_found(name: str, dataset: Path) -> None:
     assert level_of(dataset, "joint_limits", "dataset") == "pass"
     FAULTS[name](dataset)
     assert level_of(dataset, "joint_limits", "dataset") == "fail"
-
-
-def test_another_arm_is_found_though_all_digests_fit(dataset: Path) -> None:
-    record_file, urdf_file = files_of(dataset)
-    spoil_text(dataset)
-    record = from_json(record_file.read_text(), RobotRecord)
-    sha256 = hashlib.sha256(urdf_file.read_bytes()).hexdigest()
-    changed = replace(record, urdf_sha256=sha256)
-    rename(dataset, record_file, urdf_file, changed)
-    assert level_of(dataset, "forward_kinematics", "dataset") == "fail"
-
-
-def rename(root: Path, record_file: Path, urdf_file: Path, record: RobotRecord) -> None:
-    """Put another record in the place of one, under its own name, in the table of episodes too."""
-    name = digest(record)
-    assert name != record_file.stem
-    record_file.unlink()
-    record_file.with_name(f"{name}.json").write_text(to_json(record))
-    urdf_file.rename(urdf_file.with_name(f"{name}.urdf"))
-    (path,) = (root / "demorec" / "episodes").rglob("*.parquet")
-    table = pq.read_table(path)
-    column = table.schema.get_field_index("robot_digest")
-    pq.write_table(table.set_column(column, table.schema.field(column), [[name] * table.num_rows]), path)
 
 
 def test_an_arm_whose_model_is_not_installed_is_drawn_from_the_dataset(

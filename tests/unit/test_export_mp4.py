@@ -76,23 +76,6 @@ def test_every_image_and_time_comes_back(tmp_path: Path, codec: str, fps: int) -
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected)
 
 
-def test_the_index_is_in_front_and_seeking_finds_keyframes(tmp_path: Path) -> None:
-    video, expected = coded("h264", 20)
-    writer = Mp4Writer(tmp_path / "a.mp4", video, fps=30)
-    writer.add(video)
-    writer.close()
-    data = (tmp_path / "a.mp4").read_bytes()
-    assert data.index(b"moov") < data.index(b"mdat")
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        stream = container.streams.video[0]
-        container.seek(round(13 / 30 / present(stream.time_base)), stream=stream)
-        frame = next(container.decode(stream))
-        assert frame.key_frame
-        number = round(frame.time * 30)
-        assert number in (12, 13)
-        assert np.array_equal(frame.to_ndarray(format="rgb24"), expected[number])
-
-
 def test_images_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path) -> None:
     videos = [coded("h264", count, seed=count)[0] for count in (5, 9, 3, 7)]
     aside = tmp_path / "aside"

@@ -22,7 +22,7 @@ from support.external import (
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_IMAGE, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
-from demorec.mcap import EpisodeWriter, Recording, recover
+from demorec.mcap import EpisodeWriter, Recording
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 45, 100])
@@ -129,16 +129,3 @@ def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str,
     with pytest.raises(ConfigError, match=words):
         EpisodeWriter(tmp_path / "a.mcap", info)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.999])
-def test_a_file_that_was_cut_anywhere_gives_whole_frames(tmp_path: Path, share: float) -> None:
-    episode = make_external(num_frames=100)
-    data = write_external(tmp_path / "a.mcap", episode).read_bytes()
-    (tmp_path / "b.mcap").write_bytes(data[: int(share * len(data))])
-    result = recover(tmp_path / "b.mcap", tmp_path / "c.mcap")
-    with Recording(tmp_path / "c.mcap") as recording:
-        columns = recording.columns()
-    assert 0 < columns.num_frames == result.num_frames <= 100
-    for index in range(result.num_frames):
-        assert columns.features["action"][index].tolist() == episode.frames[index].samples["action"].vector.tolist()

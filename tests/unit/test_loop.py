@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,10 +12,9 @@ import numpy as np
 import pytest
 from support.sim import episode, run
 
-import demorec.loop
 from demorec.core.plain import to_json
 from demorec.episode.episode import Frame, Outcome
-from demorec.loop import Episode, ScriptAgent, Session, make_world
+from demorec.loop import Episode
 
 
 @pytest.fixture(scope="module")
@@ -121,22 +119,3 @@ def test_joint_samples_at_the_physics_rate() -> None:
     assert all(len(frame.joint_samples) == 7 for frame in frames[1:])
     times = [t for frame in frames[1:] for t in (*(s.time_ns for s in frame.joint_samples), frame.time_ns)]
     assert np.abs(np.diff(times) - 1e9 / 240).max() <= 1
-
-
-def test_breaking_off_leaves_the_world_usable(ran: tuple[Episode, list[Frame], Outcome]) -> None:
-    prepared, _, outcome = ran
-    with make_world(prepared.info) as world:
-        session = Session.of_episode(world, prepared)
-        for frame in session.run(ScriptAgent(prepared)):
-            if frame.frame_index == 20:
-                break
-        with pytest.raises(RuntimeError, match="has not ended"):
-            _ = session.outcome
-        assert run(prepared, world)[1].final_state_digest == outcome.final_state_digest
-
-
-def test_nothing_else_steps_a_world() -> None:
-    package = Path(demorec.loop.__file__).parents[1]
-    steps = re.compile(r"stepSimulation|\bworld\.apply\(")
-    found = {path.relative_to(package).parts[0] for path in package.rglob("*.py") if steps.search(path.read_text())}
-    assert found == {"sim", "loop"}

@@ -6,31 +6,25 @@ import base64
 import colorsys
 import math
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import ConvexHull
 from support.commands import exit_code
 from support.present import present
 from support.sim import body_index, episode, run
 
 from demorec.core.errors import ConfigError, SceneError
-from demorec.core.geometry import Pose
 from demorec.core.tables import OBJECTS, RENDERERS, ROBOTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
 from demorec.episode.variation import Ranges
 from demorec.loop import ScriptAgent, Session, make_world
 from demorec.objects.antipodal import antipodal_grasps
-from demorec.objects.folder import load_shelf, on_steadiest_side, read_solid
+from demorec.objects.folder import load_shelf, read_solid
 from demorec.objects.shelf import Kind
-from demorec.objects.solids import dish
 from demorec.render.painter import Painter
-from demorec.robots.assets import data_folder
 from demorec.sim.solids import at_rest, with_parts
-from demorec.tasks.grasping import hand_down, hand_yaw, places_of
 
 pytestmark = pytest.mark.slow
 
@@ -105,14 +99,6 @@ def test_a_mesh_comes_back_from_its_text_and_a_broken_one_is_refused() -> None:
         encode_mesh(block(0.7, 0.1, 0.1))
 
 
-def test_a_mesh_without_a_face_or_with_one_turned_round_is_open() -> None:
-    mesh = block(0.04, 0.04, 0.04)
-    assert mesh.is_closed()
-    turned = np.concatenate([mesh.faces[:1, ::-1], mesh.faces[1:]])
-    for faces in (mesh.faces[1:], turned):
-        assert not SolidMesh(points=mesh.points, faces=faces, parts=mesh.parts).is_closed()
-
-
 def test_things_come_to_rest_as_they_stand_and_what_is_balanced_falls() -> None:
     text, height = at_rest(encode_mesh(block(0.03, 0.05, 0.04)))
     np.testing.assert_allclose(decode_mesh(text).extents, (0.03, 0.05, 0.04), atol=2e-5)
@@ -133,12 +119,6 @@ def test_a_box_is_grasped_across_the_side_that_fits_and_not_by_its_edges() -> No
     best = grasps[0]
     assert math.hypot(best.x, best.y) < 4e-3
     assert not antipodal_grasps(encode_mesh(block(0.09, 0.075, 0.03)), PANDA_HAND, up=UP)
-
-
-def test_a_grasp_follows_the_direction_that_is_up() -> None:
-    text = encode_mesh(block(0.09, 0.03, 0.05))
-    (best, *_) = antipodal_grasps(text, PANDA_HAND, up=(0.0, 1.0, 0.0))  # lies on its side: 0.05 across now
-    assert best.width == pytest.approx(0.05, abs=1e-3)
 
 
 def test_what_sticks_out_where_a_finger_would_come_down_forbids_the_grasp() -> None:
@@ -219,30 +199,6 @@ def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> 
     assert np.hypot(inside[:, 0], inside[:, 1]).max() < vessel.shape.size[0] / 2
 
 
-@pytest.mark.long
-def test_fingers_sink_into_a_light_thing_no_deeper_than_their_stiffness_gives() -> None:
-    """20 N at 120 kN/m; with the 50 iterations that heavier things get the solver leaves them far deeper."""
-    made = next(
-        made
-        for made in (episode(number, task="pick_anything") for number in range(60, 100))
-        if made.info.scene.body(made.info.scene.goals[0].object).mass < 0.022
-    )
-    scene = made.info.scene
-    few = replace(scene, physics=replace(scene.physics, grip_iterations=0))
-    deepest, reason = {}, {}
-    for each in (scene, few):
-        prepared = replace(made, info=made.info.with_simulation(scene=each))
-        with make_world(prepared.info) as world:
-            session, depths = Session.of_episode(world, prepared), [0.0]
-            for _ in session.run(ScriptAgent(prepared)):
-                body = body_index(world, scene.goals[0].object)
-                depths += [-contact[8] for contact in world.client.getContactPoints(world.arm.body, body)]
-            deepest[each is few], reason[each is few] = max(depths), session.outcome.failure_reason
-    assert deepest[False] == pytest.approx(20.0 / 120e3, abs=1e-4)
-    assert deepest[True] > 1e-3
-    assert (reason[False], reason[True]) == ("", "crush")
-
-
 def test_things_wear_the_texture_of_their_material_in_tints_of_their_colour() -> None:
     worn: dict[str, set[str]] = {}
     for number in range(40):
@@ -274,36 +230,6 @@ def test_a_room_stands_around_the_table_and_other_tasks_have_none() -> None:
             closest = np.abs(body.world_from_body.inverse().position)[0] - 0.01
             assert 1.2 < closest < farthest
     assert not [body for body in episode(0, task="pick_place").info.scene.bodies if body.name.startswith("wall")]
-
-
-def test_a_dish_is_hollow_for_physics_too() -> None:
-    bowl = dish(0.08, 0.11, 0.03, thickness=0.004)
-    assert bowl.is_closed()
-    hulls = [ConvexHull(bowl.points[part]) for part in bowl.parts]
-    assert sum(hull.volume for hull in hulls) == pytest.approx(as_trimesh(bowl).volume, rel=0.03)
-    for point, is_solid in (
-        ((0.0, 0.0, 0.002), True),
-        ((0.0, 0.0, 0.01), False),
-        ((0.07, 0.0, 0.02), False),
-        ((0.098, 0.0, 0.02), True),
-    ):
-        assert any((hull.equations @ (*point, 1.0) <= 0).all() for hull in hulls) is is_solid
-
-
-def test_what_may_lie_at_any_yaw_can_be_put_down_all_around_from_the_present_yaw_on() -> None:
-    scene = episode(0, task="pick_anything").info.scene
-    body = scene.body(scene.goals[0].object)
-    pose = body.world_from_body
-    hand = hand_down(pose.position + np.array([0.004, -0.003, 0.01]), 0.7)
-    wanted = Pose(position=pose.position + np.array([0.1, 0.2, 0.0]), quat_xyzw=pose.quat_xyzw)
-    places = places_of(body, pose, wanted, hand=hand, yaw_symmetry=24)
-    yaws = [hand_yaw(place) for place in places]
-    assert yaws[0] == pytest.approx(0.7)
-    assert len({round(yaw, 6) for yaw in yaws}) == 24
-    turns = [abs(math.remainder(yaw - 0.7, 2 * math.pi)) for yaw in yaws]
-    assert turns == pytest.approx(sorted(turns))
-    for place in places:
-        np.testing.assert_allclose((place @ hand.inverse() @ pose).position, wanted.position, atol=1e-9)
 
 
 def test_tasks_with_things_of_their_own_refuse_shelves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -395,29 +321,6 @@ def test_random_shapes_are_closed_and_lie_flat() -> None:
         shape = kind.shape(number)
         assert shape.is_closed()
         assert float(shape.extents[2]) < 0.07
-
-
-@pytest.mark.long
-def test_the_random_shelf_has_those_of_pybullet_that_a_hand_gets_around() -> None:
-    """About every third of a thousand; which ones, by trimesh's boxes, whichever side they lie on."""
-    (kind,) = OBJECTS.load("random").kinds
-    shapes = [as_trimesh(kind.shape(number)) for number in range(kind.count)]
-    sizes = np.array([(shape.volume, shape.area) for shape in shapes])
-    fitting = 0
-    for path in sorted(data_folder().glob("random_urdfs/*/*.obj"))[::25]:
-        mesh = trimesh.load(path, force="mesh").apply_scale(0.015)
-        fits = float(mesh.extents[:2].min()) < 0.07
-        found = np.isclose(sizes, (mesh.volume, mesh.area), rtol=1e-3, atol=0.0).all(axis=1)
-        assert bool(found.any()) == fits, path.name
-        fitting += fits
-    assert 5 < fitting < 35
-
-
-def test_a_slab_on_edge_is_laid_on_its_steadiest_side() -> None:
-    laid = on_steadiest_side(block(0.09, 0.03, 0.12))
-    assert laid.extents[2] == pytest.approx(0.03, abs=2e-5)
-    assert sorted(laid.extents.tolist()) == pytest.approx([0.03, 0.09, 0.12], abs=2e-5)
-    assert laid.is_closed()
 
 
 def test_a_folder_without_meshes_is_refused(tmp_path: Path) -> None:

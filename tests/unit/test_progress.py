@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 
 import pytest
@@ -80,28 +79,6 @@ def test_there_is_neither_a_flood_nor_a_silence(
     capsys: pytest.CaptureFixture[str], total: int, seconds_each: float, fewest: int, most: int
 ) -> None:
     assert fewest <= len(lines_of(capsys, total=total, seconds_each=seconds_each)) <= most
-
-
-def test_no_line_follows_the_end(capsys: pytest.CaptureFixture[str]) -> None:
-    """A line that is being written when the job ends is written before `close` returns."""
-    writing, go_on = threading.Event(), threading.Event()
-
-    def clock() -> float:
-        if threading.current_thread() is not threading.main_thread():
-            writing.set()
-            assert go_on.wait(30)
-            return 1e6
-        return 0.0
-
-    bar = ProgressBar("generating", total=3, is_terminal=False, clock=clock, quiet=0.01)
-    assert writing.wait(30)
-    closing = threading.Thread(target=bar.close)
-    closing.start()
-    closing.join(0.05)
-    assert closing.is_alive()
-    go_on.set()
-    closing.join(30)
-    assert capsys.readouterr().err.startswith("generating: 0 of 3 episodes")
 
 
 def test_lines_come_by_themselves_until_the_end(capsys: pytest.CaptureFixture[str]) -> None:

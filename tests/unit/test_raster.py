@@ -17,7 +17,6 @@ from demorec.episode.mesh import SolidMesh
 from demorec.episode.scene import Light, Texture
 from demorec.render.painter import Painter
 from demorec.render.raster import RasterRenderer
-from demorec.render.raster.kernels import antialias, records, shade, still, triangles, vertices
 
 
 @pytest.fixture
@@ -61,29 +60,6 @@ def test_keeping_what_stands_still_changes_no_bit(client: Any, antialias: bool) 
     assert len(distinct) == 25
 
 
-def test_the_rehearsal_compiles_all_that_scenes_need(client: Any) -> None:
-    bodies = scenes.panda_scene(client)
-    for smooth in (True, False):
-        with RasterRenderer() as raster:
-            raster.setup(
-                scenes.setup(
-                    client, *scenes.panda_cameras(96, 64), mounts=scenes.panda_mounts(bodies), antialias=smooth
-                )
-            )
-            scenes.draw(raster, client)
-    kernels = [
-        value
-        for module in (antialias, records, shade, still, triangles, vertices)
-        for value in vars(module).values()
-        # What is compiled into its callers may be typed once for each of them.
-        if hasattr(value, "signatures") and not value.targetoptions.get("forceinline")
-    ]
-    used = [kernel for kernel in kernels if kernel.signatures]
-    assert len(used) >= 15
-    # A second signature would be compiled in every worker, outside of the lock.
-    assert {kernel.__name__: len(kernel.signatures) for kernel in used if len(kernel.signatures) > 1} == {}
-
-
 @pytest.mark.parametrize("mass", [0.0, 1.0])
 def test_changed_colours_are_noticed(client: Any, mass: float) -> None:
     body = scenes.add(client, "box", (0.3, 0.3, 0.3), rgbaColor=[1, 0, 0, 1], mass=mass)
@@ -95,33 +71,6 @@ def test_changed_colours_are_noticed(client: Any, mass: float) -> None:
     seen = red.segmentation == body
     assert red.color[seen].mean(0).argmax() == 0
     assert blue.color[seen].mean(0).argmax() == 2
-
-
-def test_what_stood_still_and_was_moved_is_noticed(client: Any) -> None:
-    body = scenes.add(client, "box", (0.2, 0.2, 0.2))
-    raster = RasterRenderer()
-    raster.setup(scenes.setup(client, scenes.camera(64, 64)))
-    before = scenes.draw(raster, client)["front"]
-    client.resetBasePositionAndOrientation(body, [0.2, 0.0, 0.0], [0, 0, 0, 1])
-    after = scenes.draw(raster, client)["front"]
-    assert not np.array_equal(present(before.segmentation), present(after.segmentation))
-    assert same(after, image(client, scenes.camera(64, 64)))
-
-
-def test_procedural_textures_are_drawn(client: Any) -> None:
-    from demorec.render.procedural import texture_pixels
-
-    texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=2.0)
-    body = scenes.add(client, "box", (0.4, 0.4, 0.4), rgbaColor=[1, 1, 1, 1])
-    plain = image(client, scenes.camera(128, 128))
-    checked = image(client, scenes.camera(128, 128), textures={body: texture})
-    top = plain.segmentation == body
-    assert plain.color[top].max() - plain.color[top].min() < 140
-    assert checked.color[top].min() < 10
-    # Half of a checkerboard is black.
-    dark = (checked.color[top].max(-1) < 0.5 * plain.color[top].max(-1)).mean()
-    assert abs(dark - 0.5) < 0.06
-    assert texture_pixels(texture).mean() == pytest.approx(127.5, abs=1)
 
 
 def test_each_face_of_a_solid_wears_the_texture_as_seen_along_its_axis(client: Any, tmp_path: Path) -> None:

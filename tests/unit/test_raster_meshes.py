@@ -74,16 +74,6 @@ def test_decimation_stays_near_the_surface() -> None:
     assert np.allclose((few.normals**2).sum(-1), 1, atol=1e-6)
 
 
-def test_a_mesh_whose_edges_resist_is_coarsened_first() -> None:
-    """Of a part of SO-101 fewer than 270 triangles cannot be had by collapsing edges."""
-    mesh = load_mesh(SO101_MESHES / "base_motor_holder_so101_v1.obj")
-    few = decimate(mesh, 40)
-    assert few.num_faces <= 60
-    low, high = mesh.points.min(0), mesh.points.max(0)
-    assert np.allclose(few.points[few.faces].min((0, 1)), low, atol=0.1 * (high - low).max())
-    assert np.allclose(few.points[few.faces].max((0, 1)), high, atol=0.1 * (high - low).max())
-
-
 def test_the_cache_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DEMOREC_CACHE", str(tmp_path))
     source = Path(scenes.DATA) / "cube.obj"

@@ -18,21 +18,6 @@ def message(channel: int, time_ns: int, data: bytes) -> bytes:
     return struct.pack("<BQ", 5, len(content)) + content
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        message(1, 0, b"abc")[:-1],
-        message(1, 0, b"abc") + b"\5",
-        struct.pack("<BQ", 5, 2**62) + bytes(40),
-        struct.pack("<BQ", 5, 21) + bytes(21),
-        message(1, 0, b"abc") + struct.pack("<BQ", 5, 0),
-    ],
-)
-def test_records_that_do_not_fill_their_chunk_are_refused(content: bytes) -> None:
-    with pytest.raises((ValueError, struct.error)):
-        blocks_of([content], {"/one": 1})
-
-
 def test_images_of_several_formats_and_cut_off_ones() -> None:
     made = [compressed_image(0, "a", "h264", b"one")]
     made += [compressed_image(7, "a longer frame", "jpeg", b"three")]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import tracemalloc
-import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,10 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.external import TOP, make_external
-from support.recording import make_episode, write_episode
+from support.recording import make_episode
 
-from demorec.check.episode import CheckedEpisode
-from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.episode.episode import frame_time_ns
 from demorec.mcap import EpisodeWriter, Recording
 
@@ -113,35 +109,3 @@ def test_numbers_of_a_external_episode_are_read_without_its_images(tmp_path: Pat
         assert peak_bytes(recording.columns) < num_bytes * 0.7
         stamps = recording.columns().image_stamps["top"].tolist()
     assert stamps == [frame.time_ns for frame in given.frames]
-
-
-@pytest.fixture
-def no_collection() -> Iterator[None]:
-    """Memory is freed by counting references alone."""
-    gc.collect()
-    gc.disable()
-    yield
-    gc.enable()
-
-
-@pytest.mark.usefixtures("no_collection")
-@pytest.mark.parametrize("simulated", [True, False])
-def test_a_writer_frees_its_encoders_at_once(tmp_path: Path, simulated: bool) -> None:
-    if simulated:
-        info, frames, _ = make_episode(num_frames=2, cameras=("front",))
-        writer = EpisodeWriter(tmp_path / "a.mcap", info)
-        writer.write(frames[0])
-    else:
-        writer = EpisodeWriter(tmp_path / "a.mcap", make_external().info)
-    writer.discard()
-    seen = weakref.ref(writer)
-    del writer
-    assert seen() is None
-
-
-@pytest.mark.usefixtures("no_collection")
-def test_a_check_frees_its_images_at_once(tmp_path: Path) -> None:
-    path = write_episode(tmp_path / "a.mcap", num_frames=40)
-    report = check_subject(Subject(path=path, kind="recording"), CheckOptions())
-    assert any(result.check == "images_decode" for result in report.results)
-    assert not any(vars(thing) for thing in gc.get_objects() if isinstance(thing, CheckedEpisode))

@@ -143,15 +143,3 @@ def test_a_stream_says_how_its_colours_are_meant(codec: Codec, decoder: str) -> 
     r, b = luma + 1.402 * red, luma + 1.772 * blue
     shown = 255 * np.stack([r, (luma - 0.299 * r - 0.114 * b) / 0.587, b], axis=-1)
     np.testing.assert_allclose(shown, colours, atol=4)
-
-
-@pytest.mark.parametrize("codec", ["h264", "av1"])
-def test_an_encoder_leaves_the_scheduling_alone(codec: Codec) -> None:
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # other libraries' encoders leave another one behind
-    policy, before = os.sched_getscheduler(0), set(Path("/proc/self/task").iterdir())
-    encoder = make_encoder(video=VideoConfig(codec=codec), width=96, height=64, fps=30)
-    threads = [int(task.name) for task in set(Path("/proc/self/task").iterdir()) - before]
-    assert {os.sched_getscheduler(thread) for thread in [0, *threads]} == {policy}
-    encoder.encode(np.zeros((64, 96, 3), np.uint8))
-    encoder.finish()
-    assert os.sched_getscheduler(0) == policy

@@ -13,28 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from support.sim import body_index, episode, run
 
-from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Frame
 from demorec.episode.scene import Body, Shape, ShapeKind
 from demorec.loop import Episode, make_world
-from demorec.robots.panda import PANDA
 from demorec.sim.world import World
-from demorec.tasks.grasping import grasps_beside, hand_down, raised
-from demorec.tasks.sampling import Region, Sampler
+from demorec.tasks.grasping import raised
 from demorec.tasks.script import Behaviour
-
-
-def sampler(seed: int = 0) -> Sampler:
-    return Sampler(np.random.default_rng(seed))
-
-
-def test_a_full_table_is_a_scene_error() -> None:
-    with pytest.raises(SceneError, match=r"the tenth cube.*1000 tries"):
-        sampler().point(
-            Region(x=(0.4, 0.5), y=(0.0, 0.1)), away_from=[(0.45, 0.05)], min_distance=0.2, what="the tenth cube"
-        )
 
 
 def body(size: tuple[float, ...], symmetry: int = 1, kind: ShapeKind = "box") -> Body:
@@ -178,29 +164,6 @@ def test_several_objects_are_missed_once() -> None:
     assert outcome.success
     assert [event.name for frame in frames for event in frame.events].count("miss") == 1
     assert len({event.message for frame in frames for event in frame.events if event.name == "place"}) >= 2
-
-
-def cube_at(x: float, y: float, *, side: float = 0.04, yaw: float = 0.0) -> tuple[Body, Pose]:
-    return body((side, side, side)), Pose.from_yaw([x, y, side / 2], yaw)
-
-
-def test_a_miss_goes_to_the_free_side() -> None:
-    cube, pose = cube_at(0.5, 0.1)
-    grasp = hand_down((0.503, 0.1, 0.02), 0.0)  # shifted: the miss is counted from the cube
-
-    def sides(*others: tuple[Body, Pose]) -> list[float]:
-        found = grasps_beside(grasp, cube, pose, x=-0.05, y=0.0, others=others, robot=PANDA)
-        return [round(float(miss.position[0]) - 0.5, 6) for miss in found]
-
-    assert sides() == [-0.05, 0.05]  # the wanted side first
-    assert sides(cube_at(0.43, 0.1)) == [0.05]
-    assert sides(cube_at(0.43, 0.1), cube_at(0.57, 0.1)) == []
-    assert sides(cube_at(0.43, 0.205), cube_at(0.57, -0.005)) == [-0.05, 0.05]  # beyond the fingers
-    assert sides(cube_at(0.43, 0.205, side=0.06)) == [0.05]  # as high as the palm, which is longer
-    below = Pose.from_yaw([0.5, 0.1, 0.0], 0.0)
-    assert sides((body((0.3, 0.3, 0.02)), below)) == [-0.05, 0.05]  # ends under the finger tips
-    assert sides((body((0.3, 0.3, 0.03)), below)) == []
-    assert sides((dataclasses.replace(body((0.3, 0.3, 0.03)), collides=False), below)) == [-0.05, 0.05]
 
 
 def test_perception_error_shifts_the_grasp() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -149,35 +147,3 @@ def test_broken_model_file_is_a_scene_error(
     )
     with pytest.raises(SceneError, match="'b'"):
         world.reset(with_bodies(scene, body))
-
-
-def test_a_client_that_nobody_refers_to_is_freed() -> None:
-    client = connect()
-    is_connected = client.isConnected
-    assert is_connected()
-    del client
-    assert not is_connected()
-
-
-def test_a_disconnected_client_does_not_reach_the_next_one() -> None:
-    """PyBullet gives the number of a client to the next one."""
-    client = connect()
-    assert client.isConnected()
-    client.disconnect()
-    client.disconnect()
-    other = connect()
-    assert not client.isConnected()
-    assert other.isConnected()
-    other.disconnect()
-
-
-def test_a_world_that_nobody_closed_is_silent_at_the_end() -> None:
-    """The later a module is cleared away, the longer it keeps what it holds: this one longer than PyBullet."""
-    program = """
-import os
-from demorec.robots.panda import PANDA
-from demorec.sim.world import World
-os.kept = World(PANDA)
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -90,7 +90,7 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
             report = replace(report, versions=_unlike_here(info, allowed))
             again = Path(folder) / "again.mcap"
             remake(recording, again, simulators, allowed)
-            differences = tuple(_differences(recording, again, simulators, allowed))
+            differences = tuple(_differences(recording, again, simulators))
             if not report.is_derived and any(not d.is_coding and d.field != "image" for d in differences):
                 report = replace(report, replay=_replayed(recording, simulators, allowed))
             return replace(report, differences=differences)
@@ -195,9 +195,7 @@ def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter |
     return view_painter(renderer, recorded_view(info), info.config)
 
 
-def _differences(
-    recording: Recording, again: Path, simulators: SimulatorCache, allowed: Sequence[str]
-) -> Iterator[Difference]:
+def _differences(recording: Recording, again: Path, simulators: SimulatorCache) -> Iterator[Difference]:
     """Ordered by the first frame."""
     found, made = Contents.of(recording.path), Contents.of(again)
     with open_recording(again, simulated=True) as remade:
