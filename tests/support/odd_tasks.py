@@ -11,11 +11,11 @@ import numpy as np
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
-from demorec.tasks.grasping import raised
+from demorec.tasks.grasping import hand_down, raised
 from demorec.tasks.pick import PickPlace
 from demorec.tasks.placing import Layout, on_table, random_cube
 from demorec.tasks.sampling import Region, Sampler
-from demorec.tasks.script import Step
+from demorec.tasks.script import Step, steady_width
 from demorec.tasks.skills import Expert
 
 _CALLS = itertools.count()
@@ -93,6 +93,18 @@ class Idle(PickPlace):
 
     def script(self, expert: Expert) -> Iterator[Step]:
         yield from expert.move(raised(expert.tcp(), 0.02), speed=0.3)
+
+
+class HeavyHanded(PickPlace):
+    """Presses down on the cube with shut fingers."""
+
+    def script(self, expert: Expert) -> Iterator[Step]:
+        (cube,) = expert.world.scene.movable
+        expert.phase = "press"
+        yield from expert.set_gripper(0.0, max_seconds=1.0, done=steady_width(expert.world))
+        on_it = hand_down(expert.world.pose(cube.name).position, 0.0)
+        yield from expert.move(raised(on_it, 0.1), speed=0.3)
+        yield from expert.move(on_it, speed=0.1)
 
 
 class Moody(PickPlace):
