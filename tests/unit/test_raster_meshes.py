@@ -9,14 +9,11 @@ import pytest
 import trimesh
 from support import render as scenes
 
-import demorec
 from demorec.core.errors import RenderError
 from demorec.render.raster import RasterRenderer
 from demorec.render.raster.decimate import decimate
 from demorec.render.raster.mesh import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
-
-SO101_MESHES = Path(demorec.__file__).parent / "sim" / "assets" / "so101"
 
 
 def test_stl_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
