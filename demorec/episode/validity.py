@@ -22,26 +22,11 @@ from demorec.episode.scene import Body, Scene, SceneCamera, Shape
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
 
-MAX_DESCRIPTION_BYTES = 1 << 20
-"""Of one description as JSON: the longest of 720 that the generator made, with all cameras, has 13 kB, 700 values."""
-_MAX_VALUES = 20_000
-"""In one description: 255 bodies have about 12,000."""
 _MOST = {"bodies": 255, "goals": 255, "cameras": 64, "arm joints": 64, "gripper joints": 64}
 """Segmentation images tell 255 bodies apart; the others are far beyond any scene that was ever made."""
 _SIZE_LENGTH = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3, "urdf": 3}
 _MAX_METRES = 1e4
 _MAX_LISTED = 5
-
-
-def from_description[T](text: str, cls: type[T]) -> T:
-    """`from_json` of a text whose size is bounded first.
-
-    Raises:
-        ValueError: It is too large, or not what `cls` needs.
-    """
-    if len(text) > MAX_DESCRIPTION_BYTES or text.count(",") > _MAX_VALUES:
-        raise ValueError(f"a description of {len(text):,} characters and {text.count(','):,} values or more")
-    return from_json(text, cls)
 
 
 def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
@@ -54,7 +39,7 @@ def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
     Raises:
         ValueError: One line that says what is wrong with it.
     """
-    info = from_description(text, EpisodeInfo)
+    info = from_json(text, EpisodeInfo)
     if simulated and info.simulation is None:
         raise ValueError("it describes no simulated episode")
     wrong = find_problems(info)

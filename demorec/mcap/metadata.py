@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from demorec.core.errors import RecordingError, describe_error
-from demorec.core.plain import to_json
+from demorec.core.plain import from_json, to_json
 from demorec.episode.episode import Outcome
 from demorec.episode.info import FORMAT_VERSION, EpisodeInfo
-from demorec.episode.validity import from_description, read_episode_info
+from demorec.episode.validity import read_episode_info
 from demorec.mcap.video import VideoSettings
 
 EPISODE = "demorec.episode"
@@ -84,7 +84,7 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
         )
     try:
         info = read_episode_info(metadata["info"], simulated=False)
-        cameras = from_description(metadata["cameras"], dict[str, CameraStreams])
+        cameras = from_json(metadata["cameras"], dict[str, CameraStreams])
         _check_cameras(info, cameras)
         return info, cameras, metadata["urdf_sha256"]
     except (KeyError, ValueError) as error:
@@ -114,7 +114,7 @@ def read_outcome_metadata(metadata: Mapping[str, str], info: EpisodeInfo) -> Out
     """Inverse of `outcome_metadata`. Raises RecordingError if the record is damaged."""
     check_seal(OUTCOME, metadata)
     try:
-        outcome = from_description(metadata["outcome"], Outcome)
+        outcome = from_json(metadata["outcome"], Outcome)
         if info.simulation is not None and outcome.success is None:
             raise ValueError("it does not say whether the episode succeeded")
         if min(outcome.num_frames, outcome.num_retries, *outcome.drops.values(), 0) < 0:
