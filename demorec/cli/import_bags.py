@@ -93,9 +93,10 @@ class Import:
         if self.suggest:
             from demorec.sources.suggest import suggested_mapping
 
+            lines = tuple(suggested_mapping(bags_in(self.bags[0])[0], tell))
             if find(self.bags[0]).kind == "recording":
                 tell(f"Note: demorec made this recording, and reads it as it is, without an import: {self.bags[0]}")
-            say(*suggested_mapping(bags_in(self.bags[0])[0], tell))
+            say(*lines)
             return 0
         if self.mapping is None or self.out is None:
             open_bag(bags_in(self.bags[0])[0])  # first of all says what it is, if it is no bag
