@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +18,14 @@ import pytest
 from demorec.core import limited
 from demorec.core.limited import Limits
 
+# The peak is told by a small program between: a child that Python starts by vfork inherits the peak of the process that
+# starts it, which is pytest's own.
+MEASURE = """
+import resource, subprocess, sys
+code = subprocess.run(sys.argv[2:]).returncode
+open(sys.argv[1], "w").write(str(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss))
+raise SystemExit(code if code >= 0 else 128 - code)
+"""
 START = """
 import os, signal, sys, time
 from demorec.core import limited
@@ -55,18 +64,15 @@ class Ended(NamedTuple):
 
 def run(work: str, *words: object, environment: Mapping[str, str] | None = None) -> Ended:
     """Run some lines in a limited child."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", START + work, *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=os.environ | (environment or {}),
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    output, errors = process.stdout.read().decode(), process.stderr.read().decode()
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    return Ended(process.returncode, output, errors, 1024 * used.ru_maxrss)
+    with tempfile.NamedTemporaryFile("r") as peak_kb:
+        ended = subprocess.run(
+            [sys.executable, "-c", MEASURE, peak_kb.name, sys.executable, "-c", START + work, *map(str, words)],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=os.environ | (environment or {}),
+        )
+        return Ended(ended.returncode, ended.stdout, ended.stderr, 1024 * int(peak_kb.read()))
 
 
 def started(work: str, *words: object) -> tuple[subprocess.Popen[str], psutil.Process]:
